@@ -1,0 +1,1 @@
+"""Offline analyser of session files: frequency response and fractional damping models."""

@@ -1,0 +1,327 @@
+"""Command `analyze`: parses options, runs the analysis file by file, prints and writes results."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from pathlib import Path  # noqa: TC003 - typer reads the annotations
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rich.console import Console
+
+    from analysis.welch_route import WelchAnalysis, WelchSettings
+
+_MAX_NFFT = 2**22
+"""Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
+
+_EPILOG = """\
+Example: analyze session.mcap --types III,VI --json fits.json
+
+Writes figures, tables and JSON into session.report/ beside the file (session.report-2/ if that
+exists). Exit code: 0 done, 1 a file could not be analysed, 2 wrong use, 130 stopped by Ctrl-C."""
+
+
+class Method(Enum):
+    """Ways from a record to models."""
+
+    WELCH = "welch"
+    ALL = "all"
+
+
+class Frf(Enum):
+    """Estimators of the frequency response."""
+
+    H1 = "h1"
+    H2 = "h2"
+    HV = "hv"
+    FFT = "fft"
+
+
+# Plain messages of one or two sentences, not boxes: they end up in logs.
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app()
+
+
+@app.command(epilog=_EPILOG)
+def analyze(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Session files (.mcap).")],
+    method: Annotated[
+        Method, typer.Option(help="welch: the paper's; all: every method there is.")
+    ] = Method.ALL,
+    types: Annotated[
+        str, typer.Option(metavar="LIST", help="Model types, of I to VII, comma-separated.")
+    ] = "I,II,III,IV,V,VI",
+    weights: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Weightings of the cost: const, omega (1/omega), omega^K for any power K.",
+        ),
+    ] = "const,omega",
+    band: Annotated[
+        str, typer.Option(metavar="F0,F1", help="Band that is fitted, in Hz, ends included.")
+    ] = "0.5875,50",
+    frf: Annotated[
+        Frf,
+        typer.Option(
+            help="Estimate that is fitted: Welch's H1, H2 or Hv, or one FFT of the whole record."
+        ),
+    ] = Frf.H1,
+    segment: Annotated[
+        int | None,
+        typer.Option(min=2, help="Welch segment, samples.  [default: 17.266 s, the paper's]"),
+    ] = None,
+    overlap: Annotated[
+        int | None,
+        typer.Option(min=0, help="Overlap, samples.  [default: 15 % of the segment]"),
+    ] = None,
+    nfft: Annotated[
+        int | None,
+        typer.Option(
+            min=2, max=_MAX_NFFT, help="Length of the transform, samples.  [default: 160 s]"
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the report, new or empty; of several files, one folder each in it.",
+        ),
+    ] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="New file for all results as JSON; - for stdout."),
+    ] = None,
+) -> None:
+    """Identify the damping of a slewing beam from recorded sessions.
+
+    Estimates the frequency response from motor angle to coupling torque, fits the fractional
+    damping models to it, and prints and draws the results.
+    """
+    del method  # There is one so far, so both choices come to the same.
+    from analysis.report.folder import OutputError, OutputExistsError, check_new_file
+
+    settings = _settings(types, weights, band, frf, segment, overlap, nfft)
+    try:
+        to_stdout = json is not None and str(json) == "-"
+        if json is not None and not to_stdout:
+            check_new_file(json, "--json")
+        code = _run(files, settings, report, json)
+    except OutputExistsError as error:
+        _complain(str(error))
+        code = 2
+    except OutputError as error:
+        _complain(str(error))
+        code = 1
+    except KeyboardInterrupt:
+        _complain("Stopped.")
+        code = 130
+    raise typer.Exit(code)
+
+
+def _run(
+    files: Sequence[Path], settings: WelchSettings, report: Path | None, json: Path | None
+) -> int:
+    """Analyse the files one after the other and return the exit code."""
+    from rich.console import Console
+
+    from analysis.report.document import document, document_text
+    from analysis.report.folder import report_folders, write_new
+    from analysis.report.tables import analysis_tables, summary_table
+
+    folders = report_folders(files, report)
+    analyses, errors, code = _analyse_all(files, folders, settings)
+    if not analyses:
+        return code
+    to_stdout = json is not None and str(json) == "-"
+    console = Console(stderr=to_stdout, highlight=False)
+    if not console.is_terminal:
+        console = Console(stderr=to_stdout, highlight=False, width=120)
+    if len(files) == 1:
+        console.print(analysis_tables(analyses[0]))
+    else:
+        console.print(summary_table(analyses))
+    _say(console, "")
+    for file, folder in zip(files, folders, strict=True):
+        if str(file) not in errors:
+            _say(console, f"Report of {file}: {folder}")
+    if json is not None:
+        text = document_text(document(analyses, errors))
+        if to_stdout:
+            typer.echo(text, nl=False)
+        else:
+            write_new(json, text)
+            _say(console, f"All results as JSON: {json}")
+    return code
+
+
+def _analyse_all(
+    files: Sequence[Path], folders: Sequence[Path], settings: WelchSettings
+) -> tuple[list[WelchAnalysis], dict[str, str], int]:
+    """Analyse and report every file; return results, message by failed file, and exit code."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from analysis.record import RecordError
+    from analysis.report.folder import OutputError
+    from analysis.welch_route import RouteError, SettingsError
+    from rigd.session import SessionError
+
+    analyses: list[WelchAnalysis] = []
+    errors: dict[str, str] = {}
+    code = 0
+    terminal = _standard_error()
+    with Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=terminal,
+        transient=True,
+        disable=not terminal.is_terminal,
+    ) as progress:
+        task = progress.add_task("", total=len(files) * _steps(settings))
+        for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
+
+            def on_step(done: str, name: str = file.name) -> None:
+                weight = _FIGURE_STEPS if done.startswith("figure") else 1
+                progress.update(task, advance=weight, description=f"{name}: {done}")
+
+            try:
+                analyses.append(_analyse_file(file, folder, settings, on_step))
+            except (SessionError, RecordError, RouteError, OutputError) as error:
+                code = max(code, 2 if isinstance(error, SettingsError) else 1)
+                errors[str(file)] = str(error)
+                progress.update(task, completed=number * _steps(settings))
+                terminal.print(f"Error: {error}", markup=False, highlight=False, soft_wrap=True)
+    return analyses, errors, code
+
+
+_FIGURE_STEPS = 4
+"""How many times longer a figure takes than another step, roughly."""
+
+
+def _steps(settings: WelchSettings) -> int:
+    from analysis.report.write import FIGURES
+
+    return 2 + len(settings.types) + _FIGURE_STEPS * len(FIGURES)
+
+
+def _analyse_file(
+    file: Path, folder: Path, settings: WelchSettings, on_step: Callable[[str], None]
+) -> WelchAnalysis:
+    from analysis.record import load_record
+    from analysis.report.folder import new_folder
+    from analysis.report.write import write_report
+    from analysis.welch_route import analyse
+
+    record = load_record(file)
+    on_step("read")
+    analysis = analyse(record, settings, on_step)
+    with new_folder(folder) as part:
+        write_report(analysis, part, on_step)
+    return analysis
+
+
+def _settings(
+    types: str,
+    weights: str,
+    band: str,
+    frf: Frf,
+    segment: int | None,
+    overlap: int | None,
+    nfft: int | None,
+) -> WelchSettings:
+    """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2)."""
+    from analysis.welch_route import WelchSettings
+
+    if segment is not None and overlap is not None and overlap >= segment:
+        raise typer.BadParameter(
+            f"{overlap} samples must be fewer than those of a segment, {segment}.",
+            param_hint="--overlap",
+        )
+    if segment is not None and nfft is not None and nfft < segment:
+        raise typer.BadParameter(
+            f"{nfft} samples must be no fewer than those of a segment, {segment}.",
+            param_hint="--nfft",
+        )
+    return WelchSettings(
+        estimator=frf.value,
+        segment_length=segment,
+        overlap=overlap,
+        nfft=nfft,
+        band_hz=_band(band),
+        types=_types(types),
+        weightings=_weightings(weights),
+    )
+
+
+def _band(text: str) -> tuple[float, float]:
+    try:
+        first_hz, last_hz = (float(part) for part in text.split(","))
+    except ValueError:
+        first_hz = last_hz = math.nan
+    if not 0.0 < first_hz < last_hz < math.inf:
+        raise typer.BadParameter(
+            f"'{text}' is not two frequencies in Hz with 0 < F0 < F1, such as 0.5875,50.",
+            param_hint="--band",
+        )
+    return first_hz, last_hz
+
+
+def _types(text: str) -> tuple[str, ...]:
+    from analysis.structures import STRUCTURES
+
+    names = _listed(text.upper())
+    unknown = [name for name in names if name not in STRUCTURES]
+    if unknown or not names:
+        raise typer.BadParameter(
+            f"there is no model type '{(unknown or [text])[0]}'; "
+            f"choose from {', '.join(STRUCTURES)}.",
+            param_hint="--types",
+        )
+    return names
+
+
+def _weightings(text: str) -> tuple[str, ...]:
+    from analysis.weights import WeightingError, weighting_name
+
+    try:
+        names = tuple(weighting_name(name) for name in _listed(text))
+    except WeightingError as error:
+        raise typer.BadParameter(str(error), param_hint="--weights") from error
+    if not names:
+        raise typer.BadParameter(
+            "no weighting was named; choose from const, omega, omega^K.", param_hint="--weights"
+        )
+    return names
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    """Names of a comma-separated list, each once, in the order given."""
+    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+
+
+def _standard_error() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _complain(message: str) -> None:
+    typer.echo(f"Error: {message}" if message != "Stopped." else message, err=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""The results as one JSON document, without NaN: what is not known is null."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import rigd
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from analysis.welch_route import FittedModel, WelchAnalysis
+
+
+def document(
+    analyses: Sequence[WelchAnalysis],
+    errors: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """Collect the results of all files.
+
+    Parameters
+    ----------
+    analyses : sequence of WelchAnalysis
+    errors : mapping of str to str, optional
+        Message for each file that could not be analysed.
+
+    Returns
+    -------
+    dict
+        ``versions``, ``files`` (what was read and how it was estimated), ``fits``, ``modes``,
+        ``peaks``, ``errors``: lists of flat objects that name their file. Finite numbers only.
+    """
+    content: dict[str, Any] = _finite(
+        {
+            "versions": {
+                "rigd": rigd.__version__,
+                "python": platform.python_version(),
+                "numpy": np.__version__,
+            },
+            "files": [_file(analysis) for analysis in analyses],
+            "fits": [_fit(analysis, model) for analysis in analyses for model in analysis.models],
+            "modes": [
+                mode
+                for analysis in analyses
+                for model in analysis.models
+                for mode in _modes(analysis, model)
+            ],
+            "peaks": [
+                {
+                    "file": str(analysis.record.path),
+                    "mode": number,
+                    "frequency_hz": None if peak is None else peak.frequency_hz,
+                    "magnitude_db": None if peak is None else peak.magnitude_db,
+                }
+                for analysis in analyses
+                for number, peak in enumerate(analysis.peaks, start=1)
+            ],
+            "errors": [
+                {"file": file, "message": message} for file, message in (errors or {}).items()
+            ],
+        }
+    )
+    return content
+
+
+def document_text(content: Mapping[str, Any]) -> str:
+    """Write a document as JSON, with a newline at its end."""
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _file(analysis: WelchAnalysis) -> dict[str, Any]:
+    record, settings, response = analysis.record, analysis.settings, analysis.response
+    return {
+        "file": str(record.path),
+        "outcome": record.outcome,
+        "rate_hz": record.rate_hz,
+        "samples": len(record.time_s),
+        "sweep_first": record.sweep.start,
+        "sweep_end": record.sweep.stop,
+        "beam_length_m": record.beam.length_m,
+        "beam_density_kg_per_m": record.beam.density_kg_per_m,
+        "beam_bending_stiffness_n_m2": record.beam.bending_stiffness_n_m2,
+        "tool_inertia_kg_m2": record.tool_inertia_kg_m2,
+        "angle_delay_s": record.angle_delay_s,
+        "torque_delay_s": record.torque_delay_s,
+        "gaps": asdict(record.gaps),
+        "flags": dict(record.flags),
+        "warnings": list(analysis.warnings),
+        "settings": {
+            **asdict(settings),
+            "band_hz": list(settings.band_hz),
+            "types": list(settings.types),
+            "weightings": list(settings.weightings),
+            "segments": response.segments,
+            "bins": len(response.frequency_hz),
+        },
+    }
+
+
+def _fit(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
+    fit = model.fit
+    return {
+        **_name(analysis, model),
+        "frf": analysis.settings.estimator,
+        "free": list(fit.structure.free),
+        "parameters": dict(fit.parameters),
+        "std": None if fit.std is None else dict(fit.std),
+        "cost": fit.cost,
+        "at_bounds": list(fit.at_bounds),
+        "indices": asdict(model.indices),
+    }
+
+
+def _modes(analysis: WelchAnalysis, model: FittedModel) -> list[dict[str, Any]]:
+    """Modes from the poles, each beside the peak it makes and that peak's deviation."""
+    found = []
+    for number, (peak, deviation) in enumerate(
+        zip(model.peaks, model.deviations, strict=True), start=1
+    ):
+        mode = model.modes[number - 1] if model.modes else None
+        found.append(
+            {
+                **_name(analysis, model),
+                "mode": number,
+                "frequency_hz": None if mode is None else mode.frequency_hz,
+                "natural_frequency_rad_s": None if mode is None else mode.natural_frequency_rad_s,
+                "damping_ratio": None if mode is None else mode.damping_ratio,
+                "peak_frequency_hz": None if peak is None else peak.frequency_hz,
+                "peak_magnitude_db": None if peak is None else peak.magnitude_db,
+                "peak_frequency_deviation_rad_s": (
+                    None if deviation is None else deviation.frequency_rad_s
+                ),
+                "peak_magnitude_deviation_db": (
+                    None if deviation is None else deviation.magnitude_db
+                ),
+            }
+        )
+    return found
+
+
+def _name(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
+    return {
+        "file": str(analysis.record.path),
+        "estimator": "welch",
+        "type": model.fit.structure.name,
+        "weighting": model.fit.weighting,
+    }
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+    """Copy a JSON value with null for numbers that are not finite and plain numbers for numpy's."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

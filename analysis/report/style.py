@@ -1,0 +1,156 @@
+"""How figures look: palette, fonts, axes, and lines decimated to what a pixel can show.
+
+The palette is Okabe and Ito's, told apart by readers with any common colour blindness; lines that
+lie on each other differ in dash as well as in colour.
+"""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+BLUE: Final = "#0072B2"
+VERMILION: Final = "#D55E00"
+GREEN: Final = "#009E73"
+PURPLE: Final = "#CC79A7"
+ORANGE: Final = "#E69F00"
+INK: Final = "#222222"
+GREY: Final = "#808080"
+FAINT: Final = "#D2D2D2"
+SHADE: Final = "#F0E9D8"
+
+DPI: Final = 150
+COLUMNS: Final = 1400
+"""Columns into which a line is decimated: about one for each pixel of a full-width panel."""
+
+_FREQUENCY_TICKS_HZ: Final = tuple(
+    digit * 10.0**decade for decade in range(-4, 5) for digit in (1, 2, 5)
+)
+_RC: Final[dict[Any, Any]] = {
+    "font.size": 8.5,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#9A9A9A",
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E8E8E8",
+    "grid.linewidth": 0.6,
+    "xtick.color": "#606060",
+    "ytick.color": "#606060",
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "lines.linewidth": 1.1,
+    "lines.solid_joinstyle": "round",
+    "legend.frameon": False,
+    "legend.handlelength": 2.4,
+    "path.simplify_threshold": 0.25,
+    "agg.path.chunksize": 20000,
+}
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Context in which figures are made and saved in this style."""
+    with rc_context(_RC), warnings.catch_warnings():
+        # A file name may hold characters that the font lacks; a box in a title harms nobody.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        yield
+
+
+def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> Figure:
+    """Figure on the Agg canvas with a bold title and a grey line under it."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
+    # A file name may hold dollar signs, which are not mathematics.
+    common: dict[str, Any] = {"va": "top", "parse_math": False}
+    figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **common)
+    figure.text(left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **common)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG; an existing file is not overwritten (FileExistsError)."""
+    with path.open("xb") as stream:
+        figure.savefig(stream, format="png", dpi=DPI)
+
+
+def envelope(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    columns: int = COLUMNS,
+    *,
+    logarithmic: bool = False,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Decimate a line to the minimum and maximum in each of `columns` equal parts of its axis.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Increasing; positive if `logarithmic`.
+    y : ndarray, shape (n,)
+    columns : int
+    logarithmic : bool
+        Whether the axis of x is.
+
+    Returns
+    -------
+    x, y : ndarray, shape (m,)
+        The line itself if it has no more than two points a column.
+    """
+    if len(x) <= 2 * columns:
+        return x, y
+    position = np.log(x) if logarithmic else x
+    edges = np.linspace(position[0], position[-1], columns, endpoint=False)
+    starts = np.unique(np.searchsorted(position, edges))
+    pairs = np.empty((len(starts), 2))
+    pairs[:, 0] = np.minimum.reduceat(y, starts)
+    pairs[:, 1] = np.maximum.reduceat(y, starts)
+    return np.repeat(x[starts], 2), pairs.ravel()
+
+
+def spread(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
+    """Pick at most `count` points of a positive, increasing x, evenly over its logarithm."""
+    targets = np.geomspace(x[0], x[-1], count)
+    return np.unique(np.clip(np.searchsorted(x, targets), 0, len(x) - 1))
+
+
+def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = True) -> None:
+    """Logarithmic frequency axis over a band, with plain numbers at 1, 2 and 5."""
+    axes.set_xscale("log")
+    axes.set_xlim(band_hz)
+    axes.xaxis.set_major_locator(
+        FixedLocator([f for f in _FREQUENCY_TICKS_HZ if band_hz[0] <= f <= band_hz[1]])
+    )
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(
+        FuncFormatter(lambda f, _position: f"{f:g}") if labels else NullFormatter()
+    )
+    axes.tick_params(axis="x", which="both", labelbottom=labels)
+
+
+def limits(*values: NDArray[np.float64], margin: float = 0.06) -> tuple[float, float]:
+    """Axis limits round all values with a margin on either side, never empty."""
+    low = min(float(v.min()) for v in values)
+    high = max(float(v.max()) for v in values)
+    pad = margin * (high - low) or max(abs(high), 1e-12)
+    return low - pad, high + pad

@@ -1,0 +1,176 @@
+"""Tables of an analysis for the terminal and for text files."""
+
+from __future__ import annotations
+
+import math
+from statistics import fmean, stdev
+from typing import TYPE_CHECKING, Final
+
+from rich import box
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import RenderableType
+
+    from analysis.indices import Peak
+    from analysis.welch_route import FittedModel, WelchAnalysis
+
+_COLUMNS: Final = (("zeta", "ζ (1e-5)", 1e5), ("alpha", "α", 1.0), ("gamma", "γ (1e-2)", 1e2),
+                   ("lambda", "λ", 1.0))  # fmt: skip
+"""Parameter, heading and factor: the powers of ten of the paper's Table 5."""
+_COEFFICIENT: Final = {"zeta": "zeta", "alpha": "zeta", "gamma": "gamma", "lambda": "gamma"}
+_ABSENT: Final = "–"
+
+
+def analysis_tables(analysis: WelchAnalysis) -> RenderableType:
+    """Return the fits, the resonant peaks and the modes of one record, with its warnings."""
+    parts: list[RenderableType] = [fits_table(analysis), "", peaks_table(analysis), ""]
+    if any(model.modes for model in analysis.models):
+        parts.extend((modes_table(analysis), ""))
+    notes = [
+        "± is one standard deviation from the scatter of the measured response about the model; "
+        "the bias of the estimate itself (leakage of the window) is not in it."
+    ]
+    if any(model.fit.at_bounds for model in analysis.models):
+        notes.append("* rests on the edge of the range searched: the data do not determine it.")
+    parts.append(Text("\n".join(notes), style="dim"))
+    parts.extend(Text(f"Warning: {warning}", style="yellow") for warning in analysis.warnings)
+    return Group(*parts)
+
+
+def fits_table(analysis: WelchAnalysis) -> Table:
+    """Parameters with standard deviation, and the indices of fit."""
+    table = _table(f"{analysis.record.path.name}: fits", ["type", "weights"])
+    for _parameter, heading, _factor in _COLUMNS:
+        table.add_column(heading, justify="right")
+    for heading in ("MSE", "WMSE", "MD"):
+        table.add_column(heading, justify="right")
+    for model in analysis.models:
+        indices = model.indices
+        table.add_row(
+            *_names(model),
+            *(_parameter_text(model, name, factor) for name, _heading, factor in _COLUMNS),
+            *(f"{value:.4g}" for value in (indices.mse, indices.wmse, indices.md)),
+            end_section=_is_last_of_type(model, analysis.models),
+        )
+    table.caption = "MSE and WMSE in (N·m/rad)², MD in N·m/rad"
+    return table
+
+
+def peaks_table(analysis: WelchAnalysis) -> Table:
+    """Measured resonant peaks, and how far each model's lie from them, as the paper's Table 4."""
+    table = _table(f"{analysis.record.path.name}: resonant peaks", ["type", "weights"])
+    for quantity in ("ω{} (rad/s)", "M{} (dB)"):
+        for number in range(1, len(analysis.peaks) + 1):
+            table.add_column(quantity.format(number), justify="right")
+    table.add_row(
+        "measured", "",
+        *(_peak_text(peak, frequency=True) for peak in analysis.peaks),
+        *(_peak_text(peak, frequency=False) for peak in analysis.peaks),
+        style="bold", end_section=True,
+    )  # fmt: skip
+    for model in analysis.models:
+        table.add_row(
+            *_names(model),
+            *(_ABSENT if d is None else f"{d.frequency_rad_s:.3f}" for d in model.deviations),
+            *(_ABSENT if d is None else f"{d.magnitude_db:.3f}" for d in model.deviations),
+            end_section=_is_last_of_type(model, analysis.models),
+        )
+    table.caption = "rows below the measured peaks: absolute deviation of the model's from them"
+    return table
+
+
+def modes_table(analysis: WelchAnalysis) -> Table:
+    """Frequencies and damping ratios of the modes from each model's poles."""
+    table = _table(f"{analysis.record.path.name}: modes", ["type", "weights"])
+    count = max(len(model.modes) for model in analysis.models)
+    for quantity in ("f{} (Hz)", "ξ{} (%)"):
+        for number in range(1, count + 1):
+            table.add_column(quantity.format(number), justify="right")
+    for model in analysis.models:
+        blank = [_ABSENT] * (0 if model.modes else count)
+        table.add_row(
+            *_names(model),
+            *(blank or [f"{mode.frequency_hz:.4f}" for mode in model.modes]),
+            *(blank or [f"{100 * mode.damping_ratio:.4g}" for mode in model.modes]),
+            end_section=_is_last_of_type(model, analysis.models),
+        )
+    table.caption = "from the poles of the fitted model; ξ is the damping ratio"
+    return table
+
+
+def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
+    """Mean and standard deviation over the files of each fit's parameters and indices."""
+    table = _table(f"mean ± standard deviation over {len(analyses)} files", ["type", "weights"])
+    for _parameter, heading, _factor in _COLUMNS:
+        table.add_column(heading, justify="right")
+    for heading in ("MSE", "WMSE", "MD"):
+        table.add_column(heading, justify="right")
+    for models in zip(*(analysis.models for analysis in analyses), strict=True):
+        table.add_row(
+            *_names(models[0]),
+            *(
+                _mean_text([factor * model.fit.parameters[name] for model in models])
+                if name in models[0].fit.structure.free
+                else _parameter_text(models[0], name, factor)
+                for name, _heading, factor in _COLUMNS
+            ),
+            _mean_text([model.indices.mse for model in models]),
+            _mean_text([model.indices.wmse for model in models]),
+            _mean_text([model.indices.md for model in models]),
+            end_section=_is_last_of_type(models[0], analyses[0].models),
+        )
+    table.caption = "MSE and WMSE in (N·m/rad)², MD in N·m/rad"
+    return table
+
+
+def with_spread(value: float, std: float | None) -> str:
+    """Write a value with its standard deviation, both to the latter's second digit."""
+    if std is None or not math.isfinite(std) or std <= 0.0:
+        return f"{value:.5g}"
+    decimals = max(1 - math.floor(math.log10(std)), 0)
+    if decimals > 6:
+        return f"{value:.5g} ± {std:.1e}"
+    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
+def _table(title: str, leading: list[str]) -> Table:
+    table = Table(
+        title=Text(title, style="bold"), title_justify="left", caption_justify="left",
+        box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold",
+    )  # fmt: skip
+    for heading in leading:
+        table.add_column(heading, no_wrap=True)
+    return table
+
+
+def _names(model: FittedModel) -> tuple[str, str]:
+    return model.fit.structure.name, model.fit.weighting
+
+
+def _is_last_of_type(model: FittedModel, models: Sequence[FittedModel]) -> bool:
+    same = [other for other in models if other.fit.structure.name == model.fit.structure.name]
+    return same[-1].fit.weighting == model.fit.weighting
+
+
+def _parameter_text(model: FittedModel, name: str, factor: float) -> str:
+    fit = model.fit
+    value = factor * fit.parameters[name]
+    if name not in fit.structure.free:
+        return f"{value:g}" if _COEFFICIENT[name] in fit.structure.free else _ABSENT
+    std = None if fit.std is None else factor * fit.std[name]
+    return with_spread(value, std) + ("*" if name in fit.at_bounds else "")
+
+
+def _mean_text(values: list[float]) -> str:
+    return with_spread(fmean(values), stdev(values) if len(values) > 1 else None)
+
+
+def _peak_text(peak: Peak | None, *, frequency: bool) -> str:
+    if peak is None:
+        return _ABSENT
+    return f"{2 * math.pi * peak.frequency_hz:.3f}" if frequency else f"{peak.magnitude_db:.3f}"

@@ -1,0 +1,68 @@
+"""One record's report: a folder with figures, tables as text, and the JSON document."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from analysis.report.document import document, document_text
+from analysis.report.folder import OutputError, write_new
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from analysis.welch_route import WelchAnalysis
+
+FIGURES: Final = ("signals", "frf", "torque")
+TEXT_WIDTH: Final = 120
+
+
+def write_report(
+    analysis: WelchAnalysis,
+    folder: Path,
+    on_step: Callable[[str], None] = lambda _done: None,
+) -> None:
+    """Write ``signals.png``, ``frf.png``, ``torque.png``, ``tables.txt`` and ``analysis.json``.
+
+    Parameters
+    ----------
+    analysis : WelchAnalysis
+    folder : Path
+        An existing folder without these files.
+    on_step : callable, optional
+        Called with a few words after each figure.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    from analysis.report import style
+    from analysis.report.frf_figure import frf_figure
+    from analysis.report.signals_figure import signals_figure
+    from analysis.report.torque_figure import torque_figure
+
+    for name, draw in zip(FIGURES, (signals_figure, frf_figure, torque_figure), strict=True):
+        with style.styled():
+            figure = draw(analysis)
+            try:
+                style.save(figure, folder / f"{name}.png")
+            except OSError as error:
+                raise OutputError(
+                    f"{folder / name}.png cannot be written: {error.strerror or error}."
+                ) from error
+        on_step(f"figure {name}")
+    write_new(folder / "tables.txt", tables_text(analysis))
+    write_new(folder / "analysis.json", document_text(document([analysis])))
+
+
+def tables_text(analysis: WelchAnalysis) -> str:
+    """Return the tables as plain text."""
+    from rich.console import Console
+
+    from analysis.report.tables import analysis_tables
+
+    console = Console(width=TEXT_WIDTH, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(analysis_tables(analysis))
+    return capture.get()

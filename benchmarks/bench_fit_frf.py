@@ -1,0 +1,155 @@
+"""All fits of one session: times, and minima against other searches on the same cost.
+
+Peers, on every point: fifty random starts of scipy.optimize.least_squares with analytic
+derivatives, scipy.optimize.differential_evolution (type VI), and a fine grid round the minimum.
+A ratio of costs below 1 - 1e-9 in the column "lowest / ours" would be a minimum we missed.
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import differential_evolution, least_squares
+
+from analysis.fit_frf import FrfFit, fit_frf, fit_many
+from analysis.structures import STRUCTURES, Structure
+from rigd.beam import Beam, Damping, TransferGrid, transfer
+from rigd.spectral import FrequencyResponse, welch_response
+
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+PLANT = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
+ORDERS = ("alpha", "lambda")
+STARTS = 50
+GRID_STEPS = {1: 201, 2: 41, 3: 13, 4: 7}  # points an axis, by the number of unknowns
+
+
+def session(seed: int) -> FrequencyResponse:
+    """Welch's estimate of the paper's chirp through the exact beam, noise and steps included."""
+    n, rate_hz = 120_000, 1000.0
+    t = np.arange(n) / rate_hz
+    chirp = 0.025 * np.sin(2 * np.pi * (0.05 * t + 49.95 * t**2 / 240))
+    s = 2j * np.pi * np.fft.rfftfreq(2 * n, 1 / rate_hz)
+    angle_spectrum = np.fft.rfft(chirp, 2 * n) / (1 + s / 80) ** 2
+    angle = np.fft.irfft(angle_spectrum)[:n]
+    torque = np.fft.irfft(angle_spectrum * transfer(s, LINK, PLANT))[:n]
+    torque += np.random.default_rng(seed).normal(scale=5e-3, size=n)
+    angle, torque = np.round(angle / 7e-5) * 7e-5, np.round(torque / 1.25e-4) * 1.25e-4
+    return welch_response(angle, torque, rate_hz).band(0.5875, 50.0)
+
+
+class Peer:
+    """The cost in ln zeta, alpha, ln gamma and lambda, for one structure and weighting."""
+
+    def __init__(self, frf: FrequencyResponse, structure: Structure, weighting: str) -> None:
+        omega = 2 * np.pi * frf.frequency_hz
+        p = np.ones_like(omega) if weighting == "const" else 1 / omega
+        self.weights = p / p.sum()
+        self.measured = frf.response
+        self.grid = TransferGrid(1j * omega)
+        self.structure = structure
+        self.low = np.array([0.001 if name in ORDERS else -16.0 for name in structure.free])
+        self.high = np.array([1.999 if name in ORDERS else 4.0 for name in structure.free])
+
+    def damping(self, x: np.ndarray) -> Damping:
+        free = zip(self.structure.free, map(float, x), strict=True)
+        return self.structure.damping(
+            {name: v if name in ORDERS else math.exp(v) for name, v in free}
+        )
+
+    def cost(self, x: np.ndarray) -> float:
+        deviation = self.grid.evaluate(LINK, self.damping(x)) - self.measured
+        return float(self.weights @ np.abs(deviation) ** 2)
+
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        r = np.sqrt(self.weights) * (self.grid.evaluate(LINK, self.damping(x)) - self.measured)
+        return np.concatenate((r.real, r.imag))
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        _, gradient = self.grid.evaluate_with_gradient(LINK, self.damping(x), self.structure.free)
+        named = zip(self.structure.free, x, strict=True)
+        chain = np.array([1.0 if name in ORDERS else math.exp(v) for name, v in named])
+        j = (np.sqrt(self.weights) * chain[:, None] * gradient).T
+        return np.concatenate((j.real, j.imag))
+
+    def random_starts(self, rng: np.random.Generator) -> list[float]:
+        return [
+            2
+            * least_squares(
+                self.residual,
+                rng.uniform(self.low, self.high),
+                self.jacobian,
+                bounds=(self.low, self.high),
+                max_nfev=60,
+            ).cost
+            for _ in range(STARTS)
+        ]
+
+    def local_grid(self, fit: FrfFit) -> float:
+        """Lowest cost on a grid of ±5 % in size at the modes, and ±0.05 in the orders."""
+        names = self.structure.free
+        centre = [fit.parameters[n] if n in ORDERS else math.log(fit.parameters[n]) for n in names]
+        axis = np.linspace(-0.05, 0.05, GRID_STEPS[len(names)])
+        lowest = math.inf
+        for steps in itertools.product(axis, repeat=len(names)):
+            x = np.array(centre) + steps
+            for coefficient, order, rad_s in (("zeta", "alpha", 134.0), ("gamma", "lambda", 19.0)):
+                if coefficient in names and order in names:
+                    x[names.index(coefficient)] -= steps[names.index(order)] * math.log(rad_s)
+            lowest = min(lowest, self.cost(np.clip(x, self.low, self.high)))
+        return lowest
+
+
+def timed(work: Callable[[], object], repeats: int) -> float:
+    """Least wall time of several runs, in s."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def main() -> None:
+    """Print one line a fit."""
+    frf = session(seed=2_718_281)
+    six = [STRUCTURES[name] for name in ("I", "II", "III", "IV", "V", "VI")]
+    twelve = timed(lambda: fit_many(frf.frequency_hz, frf.response, LINK, six), 5)
+    print(f"Twelve fits of one session, best of 5: {twelve:.3f} s")
+    print(f"Peer: {STARTS} random starts of scipy least_squares on all points, and a local grid")
+    print("type weights       cost      ms   random ms  ratio  lowest/ours-1  reached  grid/ours-1")
+    rng = np.random.default_rng(161_803)
+    for structure in STRUCTURES.values():
+        for weighting in ("const", "omega"):
+
+            def ours(s: Structure = structure, w: str = weighting) -> FrfFit:
+                return fit_frf(frf.frequency_hz, frf.response, LINK, s, w)
+
+            fit, spent = ours(), timed(ours, 3)
+            peer = Peer(frf, structure, weighting)
+            start = time.perf_counter()
+            ends = np.array(peer.random_starts(rng))
+            random_spent = time.perf_counter() - start
+            reached = np.mean(ends < fit.cost * (1 + 1e-4))
+            print(
+                f"{structure.name:4} {weighting:6} {fit.cost:12.7f} {spent * 1e3:7.1f} "
+                f"{random_spent * 1e3:11.0f} {random_spent / spent:6.0f} "
+                f"{ends.min() / fit.cost - 1:14.1e} {reached:8.0%} "
+                f"{peer.local_grid(fit) / fit.cost - 1:12.1e}"
+            )
+    for weighting in ("const", "omega"):
+        peer = Peer(frf, STRUCTURES["VI"], weighting)
+        fit = fit_frf(frf.frequency_hz, frf.response, LINK, STRUCTURES["VI"], weighting)
+        start = time.perf_counter()
+        evolved = differential_evolution(
+            peer.cost, list(zip(peer.low, peer.high, strict=True)), seed=5, maxiter=150
+        )
+        print(
+            f"VI {weighting}: differential_evolution {time.perf_counter() - start:.1f} s, "
+            f"{evolved.nfev} evaluations, cost / ours - 1 = {evolved.fun / fit.cost - 1:.1e}"
+        )
+
+
+if __name__ == "__main__":
+    main()

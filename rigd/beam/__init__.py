@@ -1,0 +1,35 @@
+"""Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
+
+from rigd.beam.coupled import CoupledModel, couple, propagator
+from rigd.beam.modes import (
+    Mode,
+    clamped_free_eigenvalues,
+    mode_shape,
+    modes,
+    participation,
+    poles,
+)
+from rigd.beam.parameters import Beam, Damping
+from rigd.beam.realisation import Realisation, RealisationError, realise
+from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
+
+__all__ = [
+    "PARAMETERS",
+    "Beam",
+    "CoupledModel",
+    "Damping",
+    "Mode",
+    "Realisation",
+    "RealisationError",
+    "TransferGrid",
+    "clamped_free_eigenvalues",
+    "couple",
+    "mode_shape",
+    "modes",
+    "participation",
+    "poles",
+    "propagator",
+    "realise",
+    "transfer",
+    "transfer_and_gradient",
+]

@@ -1,0 +1,180 @@
+"""Modes of the damped beam: clamped–free eigenvalues and shapes, complex poles, participation.
+
+G is a sum over the modes of the undamped clamped–free beam, which fractional damping does not
+couple::
+
+    G = sum_i a_i² P Q k_i⁴ / (Q k_i⁴ + P),   P = rho s² + c_v s^lambda,  Q = EI (1 + zeta s^alpha)
+
+with ``k_i = z_i / L``, ``1 + cos z_i cosh z_i = 0`` and ``a_i² = 4 L³ / z_i⁴``. Each mode's poles
+are the zeros of ``Q k_i⁴ + P`` on the principal sheet of the powers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigd.beam.parameters import Beam, Damping
+
+_HOMOTOPY_STEPS = (8, 64, 512, 4096)
+"""Steps in which damping grows, coarse first. Only near critical damping, where a path turns
+sharply, does a finer one have to be walked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One mode of the beam on a motor that stands still."""
+
+    number: int
+    """From 1, in the order of the clamped–free eigenvalues."""
+    poles_rad_s: tuple[complex, complex]
+    """A conjugate pair (positive frequency first), or two real poles, slow one first."""
+    frequency_hz: float
+    """Of the free decay, ``|Im p| / 2 pi``: 0 if over-damped."""
+    natural_frequency_rad_s: float
+    """``sqrt(p_1 p_2)``."""
+    damping_ratio: float
+    """``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``: above 1 if over-damped."""
+    participation_m3: float
+    """a_i²; times rho, the mode's share of the beam's moment of inertia."""
+
+
+def clamped_free_eigenvalues(n: int) -> NDArray[np.float64]:
+    """First `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,), to full precision."""
+    i = np.arange(1, n + 1)
+    middle = (i - 0.5) * np.pi
+    sign = np.where(i % 2 == 1, 1.0, -1.0)
+    # With z = (i - 1/2) pi + d the equation is sin d = ±sech z: no growing term, small d.
+    d = np.zeros(n)
+    for _ in range(8):
+        decay = np.exp(-(middle + d))
+        sech = 2 * decay / (1 + decay * decay)
+        tanh = (1 - decay * decay) / (1 + decay * decay)
+        d -= (np.sin(d) - sign * sech) / (np.cos(d) + sign * sech * tanh)
+    return middle + d
+
+
+def mode_shape(number: int, x_over_length: ArrayLike) -> NDArray[np.float64]:
+    """Shape of a mode (1, 2, …) at ``x / L`` in 0…1, with mean square 1 and 2 at the tip.
+
+    Written without growing exponentials, so high modes are as accurate as low ones.
+    """
+    z = float(clamped_free_eigenvalues(number)[-1])
+    x = z * np.asarray(x_over_length, dtype=np.float64)
+    cosine, sine, decay = np.cos(z), np.sin(z), np.exp(-z)
+    sum_ = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
+    one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
+    grown = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
+    sign = 1.0 if number % 2 == 1 else -1.0
+    shape: NDArray[np.float64] = sign * (
+        np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + grown
+    )
+    return shape
+
+
+def participation(beam: Beam, n: int) -> NDArray[np.float64]:
+    """First `n` factors ``a_i² = 4 L³ / z_i⁴`` in m³; all of them add up to L³/3."""
+    factors: NDArray[np.float64] = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
+    return factors
+
+
+def poles(beam: Beam, damping: Damping, n: int) -> NDArray[np.complex128]:
+    """Poles of the first `n` modes, shape (n, 2), in rad/s.
+
+    A row holds a conjugate pair (positive frequency first), or two real poles (slow one first)
+    where integer-order damping exceeds the critical one.
+
+    Raises
+    ------
+    ArithmeticError
+        If a mode has no pole: damping so strong, with one order above 1 and the other below, that
+        it leaves the principal sheet.
+    """
+    found = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
+    missing = np.flatnonzero(np.isnan(found[:, 0]))
+    if missing.size:
+        raise ArithmeticError(
+            f"Mode {missing[0] + 1} has no pole on the principal sheet with {damping}."
+        )
+    return found
+
+
+def poles_for_eigenvalues(
+    z: NDArray[np.float64], beam: Beam, damping: Damping
+) -> NDArray[np.complex128]:
+    """Both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as `poles` has them.
+
+    With the roots of ``tan z = tanh z`` in place of the clamped–free eigenvalues these are the
+    zeros of G. A row is NaN if there is no root on the principal sheet.
+    """
+    omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
+    damper = damping.gamma / beam.density_over_stiffness
+    internal_first_order = damping.zeta == 0 or damping.alpha == 1
+    external_first_order = damping.gamma == 0 or damping.lambda_ == 1
+    if internal_first_order and external_first_order:
+        return _second_order_poles(omega_squared, damper + damping.zeta * omega_squared)
+    for steps in _HOMOTOPY_STEPS:
+        upper = _continued_poles(omega_squared, damper, damping, steps)
+        if not np.isnan(upper).any():
+            break
+    return np.stack([upper, upper.conj()], axis=1)
+
+
+def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
+    """First `n` modes of the beam; raises as `poles` does."""
+    shares = participation(beam, n)
+    found = []
+    for i, (first, second) in enumerate(poles(beam, damping, n)):
+        natural = float(np.sqrt((first * second).real))
+        found.append(
+            Mode(
+                number=i + 1,
+                poles_rad_s=(complex(first), complex(second)),
+                frequency_hz=float(abs(first.imag) / (2 * np.pi)),
+                natural_frequency_rad_s=natural,
+                damping_ratio=float((-first - second).real / (2 * natural)),
+                participation_m3=float(shares[i]),
+            )
+        )
+    return tuple(found)
+
+
+def _second_order_poles(
+    omega_squared: NDArray[np.float64], rate: NDArray[np.float64]
+) -> NDArray[np.complex128]:
+    """Roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
+    half = -0.5 * rate
+    first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
+    second = first.conj()
+    over_damped = half * half > omega_squared
+    fast = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
+    second[over_damped] = fast[over_damped]
+    first[over_damped] = omega_squared[over_damped] / fast[over_damped]  # no cancellation
+    return np.stack([first, second], axis=1)
+
+
+def _continued_poles(
+    omega_squared: NDArray[np.float64], damper: float, damping: Damping, steps: int
+) -> NDArray[np.complex128]:
+    """Poles in the upper half plane, followed from the undamped ones while damping grows.
+
+    Newton's method in ln s, where a pole moves almost linearly, and where one that leaves the
+    principal sheet shows as an argument beyond pi. NaN where no pole was found.
+    """
+    log_s = 0.5 * np.log(omega_squared) + 0.5j * np.pi
+    with np.errstate(all="ignore"):  # a lost path overflows, and is recognised by its residual
+        for fraction in (np.arange(1, steps + 1) / steps) ** 2:
+            for _ in range(20):
+                inertial = np.exp(2 * log_s)
+                external = fraction * damper * np.exp(damping.lambda_ * log_s)
+                internal = fraction * damping.zeta * omega_squared * np.exp(damping.alpha * log_s)
+                residual = inertial + external + internal + omega_squared
+                step = residual / (
+                    2 * inertial + damping.lambda_ * external + damping.alpha * internal
+                )
+                log_s = log_s - step
+                if not np.max(np.abs(step)) > 1e-12:
+                    break
+        scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
+        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi)
+        return np.where((np.abs(residual) < 1e-9 * scale) & on_sheet, np.exp(log_s), np.nan)

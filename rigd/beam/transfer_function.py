@@ -1,0 +1,245 @@
+"""Exact transfer function from motor angle to coupling torque (Eq. 25), and its derivatives.
+
+With ``c = 1 + zeta s^alpha`` and ``q = (beta L)^4 = -L^4 (rho/EI s² + gamma s^lambda) / c``,
+Eq. 25 reads ``G = -(EI/L) c F(q)`` where, for ``z = q^(1/4)``::
+
+    F = z (sin z cosh z - cos z sinh z) / (1 + cos z cosh z)
+
+F is a function of q alone (it is even in z), so no branch of the fourth root matters. As written it
+cancels at low frequency and overflows at high frequency; two other forms are used instead:
+
+* ``|q| < 40``: ``F = q N(q) / D(q)`` with N and D entire, ten terms of their power series;
+* beyond: numerator and denominator divided by ``exp(z - j sg z) / 4``, ``sg = sign(Im z)``, which
+  leaves only decaying exponentials.
+
+The in-line formula of the paper for ``beta^4`` reads as if ``rho/EI`` multiplied the external
+damping too; the equation printed before it, the definition of gamma and Table 4 say otherwise.
+"""
+
+from collections.abc import Sequence
+from math import factorial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigd.beam.parameters import Beam, Damping
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+PARAMETERS = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
+"""What G may be differentiated with respect to; each derivative holds the other five constant."""
+
+_BLOCK = 2048
+"""Points evaluated at once: temporaries that stay in cache and below malloc's trimming threshold
+make 8000 points twice as fast."""
+
+_SERIES_LIMIT = 40.0
+_N = np.array([4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)])
+_D = np.array([(-4.0) ** k / factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
+_DN = _N[1:] * np.arange(1.0, 10.0)
+_DD = _D[1:] * np.arange(1.0, 10.0)
+
+
+class TransferGrid:
+    """Eq. 25 on one grid of s; what does not depend on the parameters is computed once.
+
+    Parameters
+    ----------
+    s
+        Laplace variable in rad/s, any shape. Powers are principal values (cut along the negative
+        real axis). Zero is allowed: an order above 0 gives ``0^order = 0``, so that G(0) = 0.
+    """
+
+    __slots__ = ("_is_zero", "_log_magnitude", "_log_s", "_parts", "_s_squared", "shape")
+
+    def __init__(self, s: ArrayLike) -> None:
+        points = np.asarray(s, dtype=np.complex128)
+        self.shape = points.shape
+        points = points.ravel()
+        self._is_zero = points == 0
+        nonzero = np.where(self._is_zero, 1.0, points)
+        self._s_squared = points * points
+        self._log_s = np.log(nonzero)
+        # On the imaginary axis, where fits live, s^order is a real power times one constant phase.
+        on_axis = bool(np.all((nonzero.real == 0) & (nonzero.imag > 0)))
+        self._log_magnitude = np.log(nonzero.imag) if on_axis else None
+        self._parts = [slice(i, i + _BLOCK) for i in range(0, points.size, _BLOCK)]
+
+    def evaluate(self, beam: Beam, damping: Damping) -> Complex:
+        """Coupling torque per motor angle, G(s) in N·m/rad, of the grid's shape."""
+        g = np.empty(self._s_squared.size, dtype=np.complex128)
+        for part in self._parts:
+            c = 1 + damping.zeta * self._power(damping.alpha, part)
+            s_lambda = self._power(damping.lambda_, part)
+            f = _f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
+            np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[part])
+        return g.reshape(self.shape)
+
+    def evaluate_with_gradient(
+        self, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
+    ) -> tuple[Complex, Complex]:
+        """G and its derivatives with respect to the parameters named in `wrt`.
+
+        Parameters
+        ----------
+        beam, damping
+            Where to evaluate.
+        wrt
+            Names from `PARAMETERS`. ``ln_density_over_stiffness`` is ln(rho/EI) at constant EI,
+            ``ln_stiffness`` is ln(EI) at constant rho/EI and gamma.
+
+        Returns
+        -------
+        g : complex ndarray, shape of the grid
+        gradient : complex ndarray, shape ``(len(wrt), *grid shape)``
+
+        Raises
+        ------
+        ValueError
+            If a name is not one of `PARAMETERS`.
+        """
+        unknown = set(wrt) - set(PARAMETERS)
+        if unknown:
+            raise ValueError(
+                f"{sorted(unknown)} are not parameters of G: choose from {PARAMETERS}."
+            )
+        per_length = -beam.bending_stiffness_n_m2 / beam.length_m
+        stiffness_volume = beam.bending_stiffness_n_m2 * beam.length_m**3
+        g = np.empty(self._s_squared.size, dtype=np.complex128)
+        gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
+        for part in self._parts:
+            s_alpha = self._power(damping.alpha, part)
+            s_lambda = self._power(damping.lambda_, part)
+            c = 1 + damping.zeta * s_alpha
+            q = self._fourth_power_of_z(beam, damping, c, s_lambda, part)
+            f, slope, remainder = _f_with_slope(q)
+            np.multiply(per_length * c, f, out=g[part])
+            internal = (per_length * s_alpha) * remainder
+            slope *= stiffness_volume
+            external = s_lambda * slope
+            for row, name in zip(gradient[:, part], wrt, strict=True):
+                match name:
+                    case "zeta":
+                        row[:] = internal
+                    case "alpha":
+                        np.multiply(damping.zeta * self._log_s[part], internal, out=row)
+                    case "gamma":
+                        row[:] = external
+                    case "lambda":
+                        np.multiply(damping.gamma * self._log_s[part], external, out=row)
+                    case "ln_density_over_stiffness":
+                        inertial = beam.density_over_stiffness * self._s_squared[part]
+                        np.multiply(inertial, slope, out=row)
+                    case "ln_stiffness":
+                        row[:] = g[part]
+        return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
+
+    def _power(self, order: float, part: slice) -> Complex:
+        if self._log_magnitude is None:
+            power = np.exp(order * self._log_s[part])
+        else:
+            phase = complex(np.exp(0.5j * np.pi * order))
+            power = np.exp(order * self._log_magnitude[part]) * phase
+        power[self._is_zero[part]] = 0.0 if order > 0 else 1.0
+        return power
+
+    def _fourth_power_of_z(
+        self, beam: Beam, damping: Damping, c: Complex, s_lambda: Complex, part: slice
+    ) -> Complex:
+        inertial = beam.density_over_stiffness * self._s_squared[part]
+        q: Complex = (inertial + damping.gamma * s_lambda) / c
+        q *= -(beam.length_m**4)
+        return q
+
+
+def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
+    """Coupling torque per motor angle, G(s) in N·m/rad (Eq. 25), of the shape of `s` (rad/s)."""
+    return TransferGrid(s).evaluate(beam, damping)
+
+
+def transfer_and_gradient(
+    s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
+) -> tuple[Complex, Complex]:
+    """G(s) and its derivatives: see `TransferGrid.evaluate_with_gradient`."""
+    return TransferGrid(s).evaluate_with_gradient(beam, damping, wrt)
+
+
+def _polynomial(coefficients: Real, x: Complex) -> Complex:
+    """Horner's rule, lowest power first."""
+    total = np.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total *= x
+        total += coefficient
+    return total
+
+
+def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
+    """F and ``2 z² S``, S = sin z sinh z / (1 + cos z cosh z), from decaying exponentials only."""
+    below = np.flatnonzero(q.imag < 0)
+    z_squared = _root_in_first_quadrant(q.real, np.abs(q.imag))
+    z = _root_in_first_quadrant(z_squared.real, z_squared.imag)
+    decay = np.exp(-z)
+    turn = np.exp(1j * z)
+    e = decay * turn
+    a = np.multiply(decay, decay, out=decay)
+    b = np.multiply(turn, turn, out=turn)
+    sum_, ab = a + b, a * b
+    even = 1 + ab
+    f = (1j - 1) * (1 - ab) + (1j + 1) * (a - b)
+    f *= z
+    reciprocal = np.reciprocal(4 * e + (even + sum_))
+    f *= reciprocal
+    s = (even - sum_) * 2j
+    s *= z_squared
+    s *= reciprocal
+    # F and S are real functions of q: what was computed for Im q >= 0 serves the other half.
+    f[below] = f[below].conj()
+    s[below] = s[below].conj()
+    return f, s
+
+
+def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
+    """Square root for ``imag >= 0``; as accurate as numpy's and three times as fast."""
+    root = np.empty(real.shape, dtype=np.complex128)
+    root.real, root.imag = real, imag
+    larger = np.sqrt(0.5 * (np.abs(root) + np.abs(real)))
+    smaller = 0.5 * imag / larger
+    right = real >= 0
+    root.real = np.where(right, larger, smaller)
+    root.imag = np.where(right, smaller, larger)
+    return root
+
+
+def _f(q: Complex) -> Complex:
+    """F(q)."""
+    f = np.empty_like(q)
+    series = np.abs(q) < _SERIES_LIMIT
+    if series.any():
+        low = q[series]
+        f[series] = low * _polynomial(_N, low) / _polynomial(_D, low)
+    beyond = ~series
+    f[beyond] = _scaled_form(q[beyond])[0]
+    return f
+
+
+def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
+    """F, dF/dq and ``F - q dF/dq`` (which the series gives without the cancellation)."""
+    f, slope, remainder = np.empty((3, q.size), dtype=np.complex128)
+    series = np.abs(q) < _SERIES_LIMIT
+    if series.any():
+        low = q[series]
+        n, d = _polynomial(_N, low), _polynomial(_D, low)
+        wronskian = n * _polynomial(_DD, low) - _polynomial(_DN, low) * d
+        d_squared = d * d
+        f[series] = low * n / d
+        slope[series] = (n * d - low * wronskian) / d_squared
+        remainder[series] = low * low * wronskian / d_squared
+    beyond = ~series
+    high = q[beyond]
+    f_high, s_high = _scaled_form(high)
+    q_slope = 0.25 * (f_high * (1 + f_high) + s_high)
+    f[beyond] = f_high
+    slope[beyond] = q_slope / high
+    remainder[beyond] = f_high - q_slope
+    return f, slope, remainder

@@ -1,0 +1,24 @@
+"""The motor's controller: design by pole placement, discrete step, and its closed loop."""
+
+from rigd.control.closed_loop import (
+    ClosedLoop,
+    LoopModel,
+    LoopResponse,
+    check_stability,
+    close_loop,
+)
+from rigd.control.design import ControlDesignError, ControlSettings, PidGains, design_pid
+from rigd.control.pid import PidController
+
+__all__ = [
+    "ClosedLoop",
+    "ControlDesignError",
+    "ControlSettings",
+    "LoopModel",
+    "LoopResponse",
+    "PidController",
+    "PidGains",
+    "check_stability",
+    "close_loop",
+    "design_pid",
+]

@@ -1,0 +1,332 @@
+"""The supervisor: starts the processes of a session, brings them together, and ends them.
+
+It moves nothing itself. It opens the file before the drive is enabled, lets tick 0 happen when the
+recorder is ready, shows the progress, passes a stop on, and closes the file with the outcome.
+"""
+
+import json
+import platform
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rigd import __version__
+from rigd.engine.board import Phase, Stop, Word
+from rigd.engine.channels import create_channels
+from rigd.engine.control import ControlJob
+from rigd.engine.events import Event, read_events
+from rigd.engine.process import Child, ChildError, Message
+from rigd.engine.recorder import RecorderJob
+from rigd.engine.ring import Observer
+from rigd.excitation import Excitation
+from rigd.live.job import LiveJob
+from rigd.profile import Profile
+
+_POLL_S = 0.05
+_GRACE_S = 5.0
+_LIVE_GRACE_S = 2.0
+
+
+class SessionFailedError(Exception):
+    """A session could not be run or ended; the message says why, in the operator's words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What the operator asked for."""
+
+    profile: Profile
+    excitation: Excitation
+    path: Path
+    fast: bool = False
+    notes: tuple[tuple[str, str], ...] = ()
+    """Operator, specimen, note: metadata as given."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionResult:
+    """How a session ended."""
+
+    path: Path | None
+    """None: it ended before tick 0, and there is no file."""
+    outcome: str
+    reason: str
+    scheduled: int
+    recorded: int
+    missed: int
+    late: int
+    lost: int
+    interrupted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SessionProgress:
+    """Where a running session is."""
+
+    phase: Phase
+    tick: int
+    missed: int
+    late: int
+
+
+Watcher = Callable[[SessionProgress, list[Event]], None]
+
+
+class Crew:
+    """The processes of one session; leaving the context ends them all, torque first.
+
+    They are started at once, so that their imports overlap with the planning.
+
+    Parameters
+    ----------
+    rate_hz
+        Of the session, for the size of the shared memory.
+    live
+        Start the live publisher too.
+    """
+
+    def __init__(self, rate_hz: float, *, live: bool) -> None:
+        self.channels = create_channels(rate_hz)
+        fds = self.channels.specs.fds
+        self.control = Child("control", "rigd.engine.control", fds)
+        self.recorder = Child("recorder", "rigd.engine.recorder", fds)
+        self.publisher = Child("live", "rigd.live.publisher", fds) if live else None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self.channels.board[Word.STOP] == Stop.NO:
+            self.channels.board[Word.STOP] = Stop.OPERATOR
+        self.control.stop(_GRACE_S)
+        self.recorder.stop(_GRACE_S)
+        if self.publisher is not None:
+            self.publisher.stop(_LIVE_GRACE_S)
+        self.channels.close()
+
+    def start_live(self, order: Order) -> str:
+        """Hand the publisher its job and return the address of the view, or why there is none."""
+        assert self.publisher is not None
+        specs = self.channels.specs
+        self.publisher.start(
+            LiveJob(
+                samples=specs.samples,
+                board_fd=specs.board_fd,
+                name=order.path.stem,
+                rate_hz=order.profile.rig.rate_hz,
+            )
+        )
+        try:
+            answer = self.publisher.poll(_GRACE_S * 2) or {"error": "it does not answer"}
+        except ChildError as error:
+            answer = {"error": str(error)}
+        if "url" in answer:
+            return f"Live view: {answer['url']}"
+        return f"No live view: {answer['error']} The session goes on without it."
+
+
+def run_session(order: Order, crew: Crew, watcher: Watcher) -> SessionResult:
+    """Run one session in the processes of `crew`.
+
+    Parameters
+    ----------
+    order
+        What to run, already checked against the profile's limits.
+    crew
+        Freshly started processes; they serve one session only.
+    watcher
+        Called some twenty times a second with the progress and the events since the last call.
+
+    Returns
+    -------
+    SessionResult
+
+    Raises
+    ------
+    SessionFailedError
+        If the file cannot be opened or written, or a process died; the drive is then disabled.
+    """
+    session = _Session(order, crew, watcher)
+    with _stop_on_signal(session.stop):
+        try:
+            return session.run()
+        except ChildError as error:
+            raise SessionFailedError(f"{error} The drive is disabled.") from None
+
+
+class _Session:
+    def __init__(self, order: Order, crew: Crew, watcher: Watcher) -> None:
+        self._order = order
+        self._crew = crew
+        self._board = crew.channels.board
+        self._events = Observer(crew.channels.events)
+        self._watcher = watcher
+        self._interrupted = False
+
+    def stop(self) -> None:
+        self._interrupted = True
+        self._board[Word.STOP] = Stop.OPERATOR
+
+    def run(self) -> SessionResult:
+        order, crew = self._order, self._crew
+        crew.recorder.start(RecorderJob(order.path, crew.channels.specs))
+        self._ask_recorder("opened")
+        crew.control.start(
+            ControlJob(order.profile, order.excitation, crew.channels.specs, order.fast)
+        )
+        answer = self._listen_to_control()
+        if "ready" in answer:
+            crew.recorder.send(begin=self._header(answer))
+            self._ask_recorder("armed")
+            self._board[Word.GO] = 1
+            answer = self._listen_to_control()
+        return self._close(answer)
+
+    def _listen_to_control(self) -> Message:
+        """Wait for the control process's next message, watching the others meanwhile."""
+        recorder_lost: str | None = None
+        while True:
+            answer = self._crew.control.poll(_POLL_S)
+            self._report()
+            if answer is not None:
+                if recorder_lost is not None:
+                    raise SessionFailedError(recorder_lost)
+                return answer
+            if recorder_lost is None:
+                recorder_lost = self._recorder_trouble()
+                if recorder_lost is not None:
+                    self._board[Word.STOP] = Stop.NO_RECORDER
+
+    def _recorder_trouble(self) -> str | None:
+        try:
+            message = self._crew.recorder.poll(0.0)
+        except ChildError as error:
+            return str(error)
+        return None if message is None else str(message.get("error", message))
+
+    def _ask_recorder(self, expected: str) -> Message:
+        message = self._crew.recorder.poll(_GRACE_S)
+        if message is None:
+            raise SessionFailedError(f"The recorder process does not answer within {_GRACE_S:g} s.")
+        if "error" in message:
+            raise SessionFailedError(message["error"])
+        if expected not in message:
+            raise SessionFailedError(f"The recorder process answers {message}.")
+        return message
+
+    def _report(self) -> None:
+        board = self._board
+        progress = SessionProgress(
+            Phase(board[Word.PHASE]), board[Word.SCHEDULED], board[Word.MISSED], board[Word.LATE]
+        )
+        self._watcher(progress, read_events(self._events.take(16)))
+
+    def _header(self, ready: Message) -> Message:
+        order = self._order
+        rig = order.profile.rig
+        metadata = {
+            "id": order.path.stem,
+            "rate_hz": repr(rig.rate_hz),
+            "excitation": order.excitation.kind,
+            **{name: _text(value) for name, value in order.excitation.parameters.items()},
+            "beam_length_m": repr(rig.beam.length_m),
+            "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
+            "beam_bending_stiffness_n_m2": repr(rig.beam.bending_stiffness_n_m2),
+            "tool_inertia_kg_m2": repr(rig.sensor.tool_inertia_kg_m2),
+            "angle_delay_s": repr(rig.encoder.delay_s),
+            "torque_delay_s": repr(rig.sensor.delay_s),
+            "profile": order.profile.name,
+            "software": f"rigd {__version__}",
+            "host": platform.node(),
+            **{f"realtime_{name}": value for name, value in ready["realtime"].items()},
+            **ready["ready"],
+            **dict(order.notes),
+        }
+        if rig.simulation is not None:
+            metadata["simulation_seed"] = str(rig.simulation.seed)
+        return {
+            "metadata": metadata,
+            "segments": order.excitation.segments,
+            "attachments": {
+                "profile.toml": order.profile.text,
+                "calibration.json": json.dumps(ready["calibration"], indent=1),
+            },
+        }
+
+    def _close(self, finished: Message) -> SessionResult:
+        self._report()
+        counts = finished["counts"]
+        outcome = {
+            "outcome": finished["finished"],
+            "reason": finished["reason"],
+            **{name: str(count) for name, count in counts.items()},
+            **finished["results"],
+        }
+        self._crew.recorder.send(close=outcome)
+        closed = self._crew.recorder.poll(_GRACE_S * 2)
+        if closed is None:
+            raise SessionFailedError("The recorder process does not close the file.")
+        if "error" in closed:
+            raise SessionFailedError(closed["error"])
+        recorded = int(closed.get("recorded", 0))
+        scheduled, missed = counts.get("scheduled", 0), counts.get("missed", 0)
+        return SessionResult(
+            path=Path(closed["closed"]) if "closed" in closed else None,
+            outcome=finished["finished"],
+            reason=finished["reason"],
+            scheduled=scheduled,
+            recorded=recorded,
+            missed=missed,
+            late=counts.get("late", 0),
+            lost=scheduled - missed - recorded,
+            interrupted=self._interrupted,
+        )
+
+
+def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
+    """Name a new session file: time, excitation, and its number in a series.
+
+    Nothing is created; the recorder refuses a name that is taken.
+    """
+    stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
+    if number is not None:
+        stem += f"-{number:02d}"
+    path, extra = folder / f"{stem}.mcap", 1
+    while path.exists() or path.with_name(path.name + ".part").exists():
+        extra += 1
+        path = folder / f"{stem}_{extra}.mcap"
+    return path
+
+
+def with_seed(profile: Profile, seed: int) -> Profile:
+    """Return the profile of a simulated rig with another seed for its noise."""
+    assert profile.rig.simulation is not None
+    simulation = replace(profile.rig.simulation, seed=seed)
+    return replace(profile, rig=replace(profile.rig, simulation=simulation))
+
+
+def _text(value: float | str) -> str:
+    return value if isinstance(value, str) else repr(value)
+
+
+@contextmanager
+def _stop_on_signal(stop: Callable[[], None]) -> Iterator[None]:
+    previous = {
+        number: signal.signal(number, lambda *_: stop())
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

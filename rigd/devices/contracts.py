@@ -1,0 +1,100 @@
+"""What the 1 kHz cycle asks of a drive and of a force-torque sensor.
+
+Real and simulated devices stand behind the same two contracts, and one conformance suite runs on
+every implementation. Constructors touch no hardware; ``connect`` does.
+
+In every tick the cycle calls, in this order: ``drive.latch``, ``sensor.request``,
+``drive.read_angle``, ``sensor.read_wrench``, ``drive.command``. A driver that has no fresh value
+returns the last one and says so in ``angle_stale`` or ``wrench_stale``; it never blocks longer
+than the deadline its profile gives.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+Wrench = tuple[float, float, float, float, float, float]
+"""fx, fy, fz in N and tx, ty, tz in N·m, in the sensor's frame, as read (not tared)."""
+
+
+class DeviceError(Exception):
+    """A device did not do what it was asked: the message names device, expectation and reply."""
+
+
+class Drive(Protocol):
+    """A torque-controlled drive with a position encoder, at the output shaft of its gear."""
+
+    angle_stale: bool
+    """The last angle read is not the one of the last latch."""
+
+    def connect(self) -> None:
+        """Open the line and verify identity and configuration; no torque.
+
+        Raises
+        ------
+        DeviceError
+            If the drive is absent or not what the profile says.
+        """
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled, at zero torque.
+
+        Raises
+        ------
+        DeviceError
+            If it does not get there.
+        """
+
+    def latch(self, t_ns: int) -> None:
+        """Ask for the angle as it is now; ``t_ns`` is the tick's scheduled time."""
+
+    def read_angle(self) -> float:
+        """Return the latched angle in rad, at the output shaft."""
+
+    def command(self, torque_nm: float) -> None:
+        """Set the torque in N·m at the output shaft, held until the next command."""
+
+    def disable(self) -> None:
+        """Zero the torque and disable the drive. Works in every state and never raises."""
+
+    def close(self) -> None:
+        """Release the line; disables first."""
+
+
+class WrenchSensor(Protocol):
+    """A six-axis force-torque sensor."""
+
+    wrench_stale: bool
+    """The last wrench read is not the answer to the last request."""
+    wrench_saturated: bool
+    """An axis of the last wrench is at the end of its range."""
+
+    def connect(self) -> None:
+        """Open the line and read identity and calibration.
+
+        Raises
+        ------
+        DeviceError
+            If the sensor is absent or not what the profile says.
+        """
+
+    def calibration(self) -> dict[str, object]:
+        """Return identity and calibration as read from the sensor, for the session file."""
+
+    def request(self, t_ns: int) -> None:
+        """Ask for the wrench as it is now; ``t_ns`` is the tick's scheduled time."""
+
+    def read_wrench(self) -> Wrench:
+        """Return the wrench that was asked for."""
+
+    def close(self) -> None:
+        """Release the line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """The devices of one rig."""
+
+    drive: Drive
+    sensor: WrenchSensor
+    simulated: bool
+    """No motor moves: the rig may run under the virtual clock."""

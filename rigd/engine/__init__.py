@@ -1,0 +1,1 @@
+"""The control process and the recorder process, and the shared memory between them."""

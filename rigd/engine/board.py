@@ -1,0 +1,77 @@
+"""The board: a few shared words by which processes tell each other where they are.
+
+Every word has one writer. Reading or writing one takes a fraction of a microsecond and never
+blocks, which is why the control loop may do so.
+"""
+
+import mmap
+from enum import IntEnum
+from typing import Self
+
+from rigd.engine.ring import shared_memory_fd
+
+
+class Phase(IntEnum):
+    """Where the control process is in a session."""
+
+    PREPARING = 0
+    SETTLING = 1
+    """Drive enabled, the motor held where it stands."""
+    TARING = 2
+    READY = 3
+    """Waiting for the recorder before tick 0."""
+    RUNNING = 4
+    RETURNING = 5
+    OFF = 6
+    """Torque is zero and the drive is disabled."""
+
+
+class Stop(IntEnum):
+    """Why the supervisor asks for a stop: the values of :attr:`Word.STOP`."""
+
+    NO = 0
+    OPERATOR = 1
+    NO_RECORDER = 2
+
+
+class Word(IntEnum):
+    """The words of the board."""
+
+    # Written by the supervisor
+    STOP = 0
+    GO = 1
+    # Written by the control process
+    PHASE = 2
+    START_UTC_NS = 3
+    SCHEDULED = 4
+    MISSED = 5
+    LATE = 6
+    LOST = 7
+    PUBLISHED = 8
+    # Written by the live publisher
+    LIVE_DROPPED = 9
+
+
+class Board:
+    """Array of signed 64-bit words, indexed by :class:`Word`."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+        self._memory = mmap.mmap(fd, 8 * len(Word))
+        self._words = memoryview(self._memory).cast("q")
+
+    @classmethod
+    def create(cls) -> Self:
+        """Make a board of zeros; its descriptor may be passed on to child processes."""
+        return cls(shared_memory_fd(8 * len(Word)))
+
+    def __getitem__(self, word: Word) -> int:
+        return self._words[word]
+
+    def __setitem__(self, word: Word, value: int) -> None:
+        self._words[word] = value
+
+    def close(self) -> None:
+        """Unmap the memory; the descriptor stays open for whoever else inherited it."""
+        self._words.release()
+        self._memory.close()

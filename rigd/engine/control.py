@@ -1,0 +1,112 @@
+"""The control process: it alone talks to the devices, and it never leaves the torque on."""
+
+import signal
+from dataclasses import asdict, dataclass
+
+from rigd.control import PidController, design_pid
+from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.registry import open_devices
+from rigd.engine.board import Phase, Word
+from rigd.engine.channels import Channels, ChannelSpecs, attach_channels
+from rigd.engine.clocks import Clock, RealClock, VirtualClock
+from rigd.engine.cycle import Cycle
+from rigd.engine.procedure import Procedure, SessionEnd
+from rigd.engine.process import Parent
+from rigd.engine.realtime import collect_no_garbage, obtain
+from rigd.excitation import Excitation
+from rigd.profile import Profile
+from rigd.safety import LimitWatch
+
+
+@dataclass(frozen=True, slots=True)
+class ControlJob:
+    """What the control process is told at its start."""
+
+    profile: Profile
+    excitation: Excitation
+    channels: ChannelSpecs
+    fast: bool
+    """Run under the virtual clock."""
+
+
+def main() -> None:
+    """Run as ``python -m rigd.engine.control``."""
+    parent = Parent()
+    job: ControlJob = parent.receive_job()
+    channels = attach_channels(job.channels)
+    realtime = job.profile.realtime
+    if job.fast:
+        obtained = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+    else:
+        obtained = {"clock": "real"} | obtain(priority=realtime.priority, cpu=realtime.cpu)
+    devices = open_devices(job.profile.rig)
+    clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
+    try:
+        _run(job, devices, clock, channels, parent, obtained)
+    finally:
+        _switch_off(devices, channels)
+
+
+def _run(
+    job: ControlJob,
+    devices: Devices,
+    clock: Clock,
+    channels: Channels,
+    parent: Parent,
+    obtained: dict[str, str],
+) -> None:
+    rig = job.profile.rig
+    cycle = Cycle(
+        devices,
+        rig.sensor.projection,
+        _controller(job.profile),
+        LimitWatch(job.profile.limits, rig.sensor.range, rig.rate_hz),
+    )
+    outcome, reason = "complete", ""
+    recorded = False
+    procedure: Procedure | None = None
+    try:
+        devices.drive.connect()
+        devices.sensor.connect()
+        calibration = devices.sensor.calibration()
+        procedure = Procedure(job.profile, job.excitation, cycle, clock, channels, parent)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: procedure.interrupt())
+        tare = procedure.tare()
+        devices.drive.enable()
+        procedure.hold()
+        parent.send(ready=tare, calibration=calibration, realtime=obtained)
+        procedure.wait_for_go()
+        procedure.record()
+        recorded = True
+        procedure.go_back()
+        cycle.torque_off()
+        procedure.check_tare()
+    except SessionEnd as end:
+        outcome, reason = end.outcome, end.reason
+    except DeviceError as error:
+        outcome, reason = "fault", str(error)
+    if recorded and reason:
+        # What happens after the last tick does not make the record any less complete.
+        outcome, reason = "complete", f"After the record: {reason}"
+    _switch_off(devices, channels)
+    counts = asdict(procedure.counts) if procedure is not None else {}
+    results = procedure.results if procedure is not None else {}
+    parent.send(finished=outcome, reason=reason, counts=counts, results=results)
+
+
+def _controller(profile: Profile) -> PidController:
+    motor = profile.rig.motor
+    gains = design_pid(
+        motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s
+    )
+    return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
+
+
+def _switch_off(devices: Devices, channels: Channels) -> None:
+    devices.drive.disable()
+    channels.board[Word.PHASE] = Phase.OFF
+
+
+if __name__ == "__main__":
+    main()

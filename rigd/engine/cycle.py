@@ -1,0 +1,104 @@
+"""One tick: read the devices, check the limits, control, command."""
+
+from rigd.control import PidController
+from rigd.devices.contracts import Devices, Wrench
+from rigd.safety import LimitWatch, Violation
+from rigd.session.format import Status
+
+_ANGLE_STALE = int(Status.ANGLE_STALE)
+_WRENCH_STALE = int(Status.WRENCH_STALE)
+_WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
+_TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
+_LIMIT_WARNING = int(Status.LIMIT_WARNING)
+_TORQUE_OFF = int(Status.TORQUE_OFF)
+
+
+class Cycle:
+    """The work of a tick, and what it left behind.
+
+    Parameters
+    ----------
+    devices
+        Connected drive and sensor.
+    projection
+        Coupling torque about the motor's axis = projection · wrench.
+    controller, watch
+        Ready to step; the watch sees every reading before the controller does.
+
+    Attributes
+    ----------
+    angle_rad, raw_wrench, wrench, coupling_torque_nm
+        The last readings; wrench and torque are tared, the raw wrench is not.
+    torque_command_nm
+        The torque that stands, after the limits.
+    flags
+        Status bits of the last tick.
+    """
+
+    def __init__(
+        self,
+        devices: Devices,
+        projection: Wrench,
+        controller: PidController,
+        watch: LimitWatch,
+    ) -> None:
+        self._drive = devices.drive
+        self._sensor = devices.sensor
+        self._projection = projection
+        self.controller = controller
+        self.watch = watch
+        self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.angle_rad = 0.0
+        self.raw_wrench: Wrench = self.tare
+        self.wrench: Wrench = self.tare
+        self.coupling_torque_nm = 0.0
+        self.torque_command_nm = 0.0
+        self.flags = _TORQUE_OFF
+
+    def observe(self, t_ns: int) -> None:
+        """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
+        drive, sensor = self._drive, self._sensor
+        drive.latch(t_ns)
+        sensor.request(t_ns)
+        self.angle_rad = drive.read_angle()
+        self.raw_wrench = fx, fy, fz, tx, ty, tz = sensor.read_wrench()
+        bx, by, bz, ox, oy, oz = self.tare
+        px, py, pz, qx, qy, qz = self._projection
+        self.wrench = (fx := fx - bx, fy := fy - by, fz := fz - bz,
+                       tx := tx - ox, ty := ty - oy, tz := tz - oz)  # fmt: skip
+        self.coupling_torque_nm = px * fx + py * fy + pz * fz + qx * tx + qy * ty + qz * tz
+        flags = 0
+        if drive.angle_stale:
+            flags |= _ANGLE_STALE
+        if sensor.wrench_stale:
+            flags |= _WRENCH_STALE
+        if sensor.wrench_saturated:
+            flags |= _WRENCH_SATURATED
+        if self.torque_command_nm == 0.0:
+            flags |= _TORQUE_OFF
+        self.flags = flags
+
+    def step(self, t_ns: int, reference_rad: float) -> Violation | None:
+        """Do a whole tick; where a limit is violated the torque is off when this returns."""
+        self.observe(t_ns)
+        flags = self.flags & ~_TORQUE_OFF
+        violation = self.watch.check(reference_rad, self.angle_rad, self.raw_wrench)
+        if violation is not None:
+            self.torque_off()
+            return violation
+        if self.watch.warning:
+            flags |= _LIMIT_WARNING
+        controller = self.controller
+        torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
+        self._drive.command(torque_nm)
+        self.torque_command_nm = torque_nm
+        if controller.saturated:
+            flags |= _TORQUE_SATURATED
+        self.flags = flags
+        return None
+
+    def torque_off(self) -> None:
+        """Zero the torque and disable the drive, whatever state it is in."""
+        self._drive.disable()
+        self.torque_command_nm = 0.0
+        self.flags |= _TORQUE_OFF

@@ -1,0 +1,364 @@
+"""A session from rest to rest: tare, enable, hold, record, return, disable, check the tare.
+
+The record is what lies between tick 0 and the last tick of the excitation; everything else runs
+through the same cycle and leaves its results in the metadata.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigd.devices.contracts import Wrench
+from rigd.engine.board import Phase, Stop, Word
+from rigd.engine.channels import CONTROL_DECIMATION, Channels
+from rigd.engine.clocks import Clock
+from rigd.engine.cycle import Cycle
+from rigd.engine.events import Event, Level, write_event
+from rigd.engine.metronome import Metronome
+from rigd.engine.process import Parent
+from rigd.excitation import Excitation
+from rigd.profile import Profile
+from rigd.session.format import Status, pack_control_into, pack_sample_into
+
+_AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+_SETTLE_S = 0.5
+_ALIVE_EVERY = 128
+"""Ticks between two looks at whether the supervisor still runs."""
+_ROOM_PATIENCE_S = 5.0
+_ROOM_POLL_S = 0.0002
+
+
+class SessionEnd(Exception):
+    """A session ends before its time; carries the outcome and the reason."""
+
+    def __init__(self, outcome: str, reason: str) -> None:
+        super().__init__(reason)
+        self.outcome = outcome
+        self.reason = reason
+
+
+@dataclass(slots=True)
+class Counts:
+    """The bookkeeping of a record: scheduled = published + missed + lost."""
+
+    scheduled: int = 0
+    missed: int = 0
+    late: int = 0
+    lost: int = 0
+
+
+class Procedure:
+    """One session on connected devices.
+
+    Parameters
+    ----------
+    profile, excitation
+        What the operator chose; the excitation's reference is relative to the angle at the start.
+    cycle, clock
+        What a tick does, and when.
+    channels
+        Where samples, the controller's terms and events go.
+    parent
+        The supervisor.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        excitation: Excitation,
+        cycle: Cycle,
+        clock: Clock,
+        channels: Channels,
+        parent: Parent,
+    ) -> None:
+        self._profile = profile
+        self._excitation = excitation
+        self._cycle = cycle
+        self._clock = clock
+        self._channels = channels
+        self._board = channels.board
+        self._parent = parent
+        self._rate_hz = profile.rig.rate_hz
+        self._late_ns = int(profile.realtime.late_us * 1000)
+        self._metronome = Metronome(clock, self._rate_hz)
+        self._start_angle_rad = 0.0
+        self._interrupted = False
+        self.counts = Counts()
+        self.results: dict[str, str] = {}
+        """What the record's outcome has to tell beside the counts."""
+
+    def interrupt(self) -> None:
+        """Ask for a stop at the next tick; safe in a signal handler."""
+        self._interrupted = True
+
+    def tare(self) -> dict[str, str]:
+        """Average the sensor at rest, before the drive is enabled.
+
+        Returns
+        -------
+        dict
+            Metadata: mean and standard deviation of each axis, N and N·m.
+
+        Raises
+        ------
+        SessionEnd
+            If the motor moves, or stands outside the limits.
+        """
+        self._board[Word.PHASE] = Phase.TARING
+        settings = self._profile.session
+        wrenches, angles = self._rest(settings.tare_s)
+        speed_rad_s = float(np.ptp(angles)) / settings.tare_s
+        if speed_rad_s > settings.rest_velocity_rad_s:
+            raise SessionEnd(
+                "fault",
+                f"The motor is not at rest: it moves by {speed_rad_s:.2g} rad/s, more than "
+                f"session.rest_velocity_rad_s = {settings.rest_velocity_rad_s:g} rad/s. "
+                "Wait until it stands still and start again.",
+            )
+        self._start_angle_rad = float(np.mean(angles))
+        limit_rad = self._profile.limits.angle_rad
+        if abs(self._start_angle_rad) > limit_rad:
+            raise SessionEnd(
+                "fault",
+                f"The motor stands at {self._start_angle_rad:.4g} rad, outside "
+                f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
+            )
+        mean = [float(value) for value in wrenches.mean(axis=0)]
+        spread = [float(value) for value in wrenches.std(axis=0, ddof=1)]
+        self._cycle.tare = (mean[0], mean[1], mean[2], mean[3], mean[4], mean[5])
+        return {"tare_s": repr(settings.tare_s), "start_angle_rad": repr(self._start_angle_rad)} | {
+            f"tare_{what}_{axis}": repr(value)
+            for what, values in (("mean", mean), ("std", spread))
+            for axis, value in zip(_AXES, values, strict=True)
+        }
+
+    def hold(self) -> None:
+        """Hold the motor where it stands; the drive has just been enabled."""
+        self._board[Word.PHASE] = Phase.SETTLING
+        # The angle of the last reading, not the mean: the controller must start without a step.
+        self._start_angle_rad = self._cycle.angle_rad
+        self._cycle.controller.reset(self._start_angle_rad)
+        self._cycle.watch.reset(self._start_angle_rad)
+        for _ in range(round(_SETTLE_S * self._rate_hz)):
+            self._tick(self._start_angle_rad)
+
+    def wait_for_go(self) -> None:
+        """Go on holding until the recorder is ready; virtual time stands still meanwhile."""
+        self._board[Word.PHASE] = Phase.READY
+        while not self._board[Word.GO]:
+            if self._clock.virtual:
+                self._check_stop()
+                time.sleep(_ROOM_POLL_S)
+            else:
+                self._tick(self._start_angle_rad)
+
+    def record(self) -> None:
+        """Run the excitation; every tick is recorded, missed or lost.
+
+        Raises
+        ------
+        SessionEnd
+            If it ends early. The last sample is then one with the torque off.
+        """
+        reference = (self._start_angle_rad + self._excitation.reference_rad).tolist()
+        metronome, cycle, board = self._metronome, self._cycle, self._board
+        counts = self.counts
+        metronome.restart()
+        wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
+        # Under the real clock tick 0 is still ahead, or up to one period behind.
+        ahead_ns = 0 if self._clock.virtual else metronome.start_ns - before_ns
+        board[Word.START_UTC_NS] = wall_ns + ahead_ns
+        board[Word.PHASE] = Phase.RUNNING
+        self._say("info", f"Record starts: {len(reference)} ticks at {self._rate_hz:g} Hz.")
+        last = -1
+        first_ns = last_ns = 0
+        end: SessionEnd | None = None
+        while end is None:
+            missed = metronome.wait()
+            tick = min(metronome.tick, len(reference))
+            if missed:
+                counts.missed += tick - last - 1
+                board[Word.MISSED] = counts.missed
+            if tick == len(reference):
+                counts.scheduled = tick
+                break
+            end = self._stop_reason(tick) or self._missed_too_many(missed, tick)
+            t_ns = metronome.time_of(tick)
+            last_ns = t_ns + metronome.lateness_ns
+            if last < 0:
+                first_ns = last_ns
+            if end is None:
+                violation = cycle.step(t_ns, reference[tick])
+                if violation is not None:
+                    end = SessionEnd("fault", str(violation))
+            else:
+                cycle.observe(t_ns)
+                cycle.torque_off()
+            counts.scheduled = tick + 1
+            lost = self._publish(tick, t_ns, reference[tick], missed, wait=end is not None)
+            if lost and end is None:
+                # A record with lost samples can never be complete: no reason to move on.
+                end = SessionEnd("fault", "The recorder cannot keep up: a sample was lost.")
+                cycle.torque_off()
+            board[Word.SCHEDULED] = tick + 1
+            last = tick
+        else:
+            if not cycle.flags & Status.TORQUE_OFF:
+                raise AssertionError("a session ended early with the torque on")
+        self._take_stock(wall_ns, before_ns, last_ns - first_ns)
+        if end is not None:
+            raise end
+
+    def go_back(self) -> None:
+        """Return to the start angle on a minimum-jerk path."""
+        self._board[Word.PHASE] = Phase.RETURNING
+        distance_rad = float(self._excitation.reference_rad[-1])
+        n = round(self._profile.session.return_s * self._rate_hz)
+        u = np.arange(1, n + 1) / n
+        path = self._start_angle_rad + distance_rad * (1 - u**3 * (10 - 15 * u + 6 * u**2))
+        for reference_rad in path.tolist():
+            self._tick(reference_rad)
+
+    def check_tare(self) -> None:
+        """Average the sensor again, the drive disabled, to see how far its zero has moved."""
+        self._rest(_SETTLE_S)
+        wrenches, _ = self._rest(self._profile.session.tare_s)
+        drift = wrenches.mean(axis=0) - np.array(self._cycle.tare)
+        drift_nm = float(drift @ np.array(self._profile.rig.sensor.projection))
+        self.results["tare_drift_nm"] = repr(drift_nm)
+        limit_nm = self._profile.session.tare_drift_nm
+        if abs(drift_nm) > limit_nm:
+            self._say(
+                "warning",
+                f"The zero of the coupling torque moved by {drift_nm:.2g} N·m during the session, "
+                f"more than session.tare_drift_nm = {limit_nm:g} N·m.",
+            )
+
+    def _tick(self, reference_rad: float) -> None:
+        """One tick outside the record."""
+        self._metronome.wait()
+        self._check_stop()
+        t_ns = self._metronome.time_of(self._metronome.tick)
+        violation = self._cycle.step(t_ns, reference_rad)
+        if violation is not None:
+            raise SessionEnd("fault", str(violation))
+
+    def _rest(self, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Read without torque; raw wrenches (n, 6) and angles (n,)."""
+        cycle, metronome = self._cycle, self._metronome
+        wrenches: list[Wrench] = []
+        angles: list[float] = []
+        for _ in range(round(duration_s * self._rate_hz)):
+            metronome.wait()
+            self._check_stop()
+            cycle.observe(metronome.time_of(metronome.tick))
+            wrenches.append(cycle.raw_wrench)
+            angles.append(cycle.angle_rad)
+        return np.array(wrenches), np.array(angles)
+
+    def _publish(
+        self, tick: int, t_ns: int, reference_rad: float, missed: int, *, wait: bool
+    ) -> bool:
+        """Put the tick's sample into the ring; say whether it was lost."""
+        cycle, ring, counts = self._cycle, self._channels.samples, self.counts
+        metronome = self._metronome
+        flags = cycle.flags
+        if missed:
+            flags |= Status.AFTER_MISSED
+        if counts.lost:
+            flags |= Status.AFTER_LOST
+        if metronome.lateness_ns > self._late_ns:
+            flags |= Status.LATE
+            counts.late += 1
+            self._board[Word.LATE] = counts.late
+        offset = ring.slot()
+        if offset < 0:
+            offset = self._wait_for_room() if wait or self._clock.virtual else -1
+            if offset < 0:
+                counts.lost += 1
+                self._board[Word.LOST] = counts.lost
+                return True
+        start_ns = metronome.start_ns + t_ns + metronome.lateness_ns
+        pack_sample_into(
+            ring.buffer,
+            offset,
+            t_ns,
+            tick,
+            reference_rad,
+            cycle.angle_rad,
+            cycle.torque_command_nm,
+            cycle.coupling_torque_nm,
+            *cycle.wrench,
+            flags,
+            metronome.lateness_ns,
+            self._clock.now_ns() - start_ns,
+        )
+        ring.publish()
+        if tick % CONTROL_DECIMATION == 0:
+            self._publish_terms(tick, t_ns)
+        return False
+
+    def _publish_terms(self, tick: int, t_ns: int) -> None:
+        ring, terms = self._channels.controls, self._cycle.controller
+        offset = ring.slot()
+        if offset < 0:
+            return  # The terms explain a record; they are not what it stands on.
+        pack_control_into(
+            ring.buffer,
+            offset,
+            t_ns,
+            tick,
+            terms.proportional_nm,
+            terms.integral_nm,
+            terms.derivative_nm,
+            terms.feedforward_nm,
+            terms.friction_nm,
+            terms.unlimited_torque_nm,
+        )
+        ring.publish()
+
+    def _wait_for_room(self) -> int:
+        ring = self._channels.samples
+        deadline = time.monotonic() + _ROOM_PATIENCE_S
+        while (offset := ring.slot()) < 0 and time.monotonic() < deadline:
+            time.sleep(_ROOM_POLL_S)
+        return offset
+
+    def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
+        if not missed:
+            return None
+        reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
+        return None if reason is None else SessionEnd("fault", str(reason))
+
+    def _stop_reason(self, tick: int) -> SessionEnd | None:
+        stop = self._board[Word.STOP]
+        if self._interrupted or stop == Stop.OPERATOR:
+            return SessionEnd("stopped", "Stopped by the operator.")
+        if stop == Stop.NO_RECORDER:
+            return SessionEnd("fault", "The recorder process ended during the session.")
+        if tick % _ALIVE_EVERY == 0 and not self._parent.alive():
+            return SessionEnd("fault", "The supervising process ended during the session.")
+        return None
+
+    def _check_stop(self) -> None:
+        end = self._stop_reason(self._metronome.tick)
+        if end is not None:
+            self._cycle.torque_off()
+            raise end
+
+    def _take_stock(self, wall_ns: int, before_ns: int, executed_ns: int) -> None:
+        """Compare the two clocks over the record, and the rate with what it should have been."""
+        now_ns = time.time_ns()
+        self.results["end_utc_ns"] = str(now_ns)
+        if self._clock.virtual:
+            return
+        elapsed_ns = time.monotonic_ns() - before_ns
+        self.results["wall_clock_drift_ppm"] = repr(((now_ns - wall_ns) / elapsed_ns - 1) * 1e6)
+        intervals = self.counts.scheduled - self.counts.missed - 1
+        if executed_ns > 0:
+            self.results["true_rate_hz"] = repr(intervals / (executed_ns * 1e-9))
+
+    def _say(self, level: Level, message: str) -> None:
+        t_ns = self._clock.now_ns() - self._metronome.start_ns
+        write_event(self._channels.events, Event(t_ns, level, message))

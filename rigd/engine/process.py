@@ -1,0 +1,172 @@
+"""How a supervisor talks to the processes it starts: one job in, a few JSON lines each way.
+
+A child is ``python -m MODULE``. Its standard input brings one pickled job and then JSON lines; the
+end of standard input means that the supervisor is gone. Its standard output brings JSON lines,
+few and short, so that they fit into a pipe's buffer and no child ever waits for its supervisor.
+"""
+
+import contextlib
+import json
+import os
+import pickle
+import select
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_SIZE = struct.Struct("<Q")
+
+Message = dict[str, Any]
+
+
+class ChildError(Exception):
+    """A child process ended, or answered something else than it was asked."""
+
+
+class Child:
+    """A process started by the supervisor.
+
+    Parameters
+    ----------
+    name
+        What messages to the operator call it.
+    module
+        Run as ``python -m module``; it starts importing at once and waits for its job.
+    fds
+        Descriptors it inherits.
+    """
+
+    def __init__(self, name: str, module: str, fds: Sequence[int]) -> None:
+        self.name = name
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=fds,
+            # A library that starts threads for its matrices would disturb the loop.
+            env=os.environ | dict.fromkeys(_THREADS, "1"),
+        )
+        self._lines = LineReader(self._stdout_fd)
+
+    def start(self, job: object) -> None:
+        """Hand over its job."""
+        data = pickle.dumps(job)
+        self._write(_SIZE.pack(len(data)) + data)
+
+    def send(self, **message: object) -> None:
+        """Send one message; a child that is gone is noticed when it is next listened to."""
+        self._write(json.dumps(message).encode() + b"\n")
+
+    def poll(self, timeout_s: float) -> Message | None:
+        """Return its next message, or None if none comes in time.
+
+        Raises
+        ------
+        ChildError
+            If the child has ended.
+        """
+        try:
+            return self._lines.next(timeout_s)
+        except EOFError:
+            code = self._process.wait()
+            how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+            raise ChildError(f"The {self.name} process was {how}.") from None
+
+    def stop(self, grace_s: float) -> None:
+        """End it: close its input and wait; then terminate; then kill."""
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            with contextlib.suppress(BrokenPipeError):  # it was gone already
+                self._process.stdin.close()
+        for end in (self._process.terminate, self._process.kill):
+            try:
+                self._process.wait(grace_s)
+                break
+            except subprocess.TimeoutExpired:
+                end()
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    @property
+    def _stdout_fd(self) -> int:
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    def _write(self, data: bytes) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # poll() tells how it ended
+            self._process.stdin.write(data)
+            self._process.stdin.flush()
+
+
+class LineReader:
+    """JSON lines from a descriptor, without ever blocking longer than asked."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._pending = b""
+
+    def next(self, timeout_s: float) -> Message | None:
+        """Return the next message, or None if none is complete in time.
+
+        Raises
+        ------
+        EOFError
+            If the other end is gone and nothing is left to read.
+        """
+        while b"\n" not in self._pending:
+            if not select.select([self._fd], [], [], timeout_s)[0]:
+                return None
+            data = os.read(self._fd, 65536)
+            if not data:
+                raise EOFError
+            self._pending += data
+        line, self._pending = self._pending.split(b"\n", 1)
+        message: Message = json.loads(line)
+        return message
+
+
+class Parent:
+    """The supervisor, as a child sees it."""
+
+    def __init__(self) -> None:
+        # Read without a buffer: what follows the job must stay in the pipe for select to see it.
+        self._fd = sys.stdin.fileno()
+        self._lines = LineReader(self._fd)
+        self._pid = os.getppid()
+
+    def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
+        """Wait for the job; ends the process quietly if the supervisor ends without one."""
+        (size,) = _SIZE.unpack(self._read(_SIZE.size))
+        return pickle.loads(self._read(size))
+
+    def _read(self, size: int) -> bytes:
+        data = b""
+        while len(data) < size:
+            part = os.read(self._fd, size - len(data))
+            if not part:
+                sys.exit(0)
+            data += part
+        return data
+
+    def poll(self, timeout_s: float) -> Message | None:
+        """Return the next message, or None; raises EOFError if the supervisor is gone."""
+        return self._lines.next(timeout_s)
+
+    def send(self, **message: object) -> None:
+        """Send one short message."""
+        sys.stdout.write(json.dumps(message) + "\n")
+        sys.stdout.flush()
+
+    def alive(self) -> bool:
+        """Whether the supervisor still runs; cheap enough for the loop."""
+        return os.getppid() == self._pid
+
+
+def ignore_interrupt() -> None:
+    """Ctrl-C reaches every process of the terminal; the supervisor alone decides what it means."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,141 @@
+"""The recorder process: ring → session file.
+
+It opens the file before anything moves, takes what the loop publishes as fast as the disk lets
+it, and closes the file with the outcome. If the supervisor dies it waits until the loop has
+stopped, and closes the file itself.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigd.engine.board import Phase, Word
+from rigd.engine.channels import Channels, ChannelSpecs, attach_channels
+from rigd.engine.events import EVENT_SIZE, read_events
+from rigd.engine.process import Message, Parent, ignore_interrupt
+from rigd.session import SessionError, SessionWriter
+from rigd.session.format import SAMPLE_SIZE
+
+_BLOCK = 250
+_IDLE_S = 0.002
+_ORPHAN_PATIENCE_S = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderJob:
+    """What the recorder is told at its start."""
+
+    path: Path
+    channels: ChannelSpecs
+
+
+def main() -> None:
+    """Run as ``python -m rigd.engine.recorder``."""
+    ignore_interrupt()
+    parent = Parent()
+    job: RecorderJob = parent.receive_job()
+    channels = attach_channels(job.channels)
+    try:
+        writer = SessionWriter(job.path)
+    except SessionError as error:
+        parent.send(error=str(error))
+        raise SystemExit(1) from None
+    parent.send(opened=str(job.path))
+    try:
+        _record(parent, channels, writer)
+    except SessionError as error:
+        # Disk full, device gone: what reached the disk stays there under its .part name.
+        writer.abandon()
+        parent.send(error=str(error))
+        raise SystemExit(1) from None
+
+
+def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
+    recorder = _Recorder(channels, writer)
+    header: Message | None = None
+    while True:
+        if header is not None and not recorder.begun and channels.board[Word.START_UTC_NS]:
+            recorder.begin(header)
+        moved = recorder.begun and recorder.transfer()
+        try:
+            message = parent.poll(0.0 if moved else _IDLE_S)
+        except EOFError:
+            recorder.finish_orphaned()
+            return
+        if message is None:
+            continue
+        if "begin" in message:
+            header = message["begin"]
+            parent.send(armed=True)
+        elif "close" in message:
+            if not recorder.begun:
+                writer.discard()
+                parent.send(discarded=True)
+            else:
+                path, recorded = recorder.close(message["close"])
+                parent.send(closed=str(path), recorded=recorded)
+            return
+
+
+class _Recorder:
+    def __init__(self, channels: Channels, writer: SessionWriter) -> None:
+        self._channels = channels
+        self._writer = writer
+        self._recorded = 0
+        self.begun = False
+
+    def begin(self, header: Message) -> None:
+        segments = {name: (first, end) for name, (first, end) in header["segments"].items()}
+        attachments = {name: text.encode() for name, text in header["attachments"].items()}
+        self._writer.begin(
+            self._channels.board[Word.START_UTC_NS], header["metadata"], segments, attachments
+        )
+        self.begun = True
+
+    def transfer(self) -> bool:
+        """Move what is there into the file; say whether there was anything."""
+        events = self._channels.events.take(16)
+        for event in read_events(events):
+            self._writer.log(event.t_ns, event.level, event.message)
+        controls = self._channels.controls.take(_BLOCK)
+        if controls:
+            self._writer.write_controls(controls)
+        samples = self._channels.samples.take(_BLOCK)
+        if samples:
+            self._writer.write_samples(samples)
+            self._recorded += len(samples) // SAMPLE_SIZE
+        return bool(samples or controls or len(events) >= 16 * EVENT_SIZE)
+
+    def close(self, outcome: Mapping[str, str]) -> tuple[Path, int]:
+        while self.transfer():
+            pass
+        counted = {**outcome, "recorded": str(self._recorded)}
+        missing = int(outcome["scheduled"]) - int(outcome["missed"]) - self._recorded
+        counted["lost"] = str(missing)
+        return self._writer.close(counted), self._recorded
+
+    def finish_orphaned(self) -> None:
+        """Close what there is once the loop has stopped, the supervisor being gone."""
+        board = self._channels.board
+        deadline = time.monotonic() + _ORPHAN_PATIENCE_S
+        while board[Word.PHASE] != Phase.OFF and time.monotonic() < deadline:
+            if self.begun and self.transfer():
+                deadline = time.monotonic() + _ORPHAN_PATIENCE_S
+            time.sleep(_IDLE_S)
+        if not self.begun:
+            self._writer.discard()
+            return
+        self.close(
+            {
+                "outcome": "fault",
+                "reason": "The supervising process ended during the session.",
+                "scheduled": str(board[Word.SCHEDULED]),
+                "missed": str(board[Word.MISSED]),
+                "late": str(board[Word.LATE]),
+            }
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,442 @@
+"""Reference trajectories of a session: chirp, hold, step, random-phase multisine, from a file.
+
+A reference is relative to the angle at which the session starts. Every excitation has the same
+three segments: rest (reference zero), sweep, ring-down (the sweep's last value held).
+"""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite, pi
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+MAX_TICKS = 7_200_000
+"""Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
+
+SAMPLES_PER_PERIOD = 4
+"""Fewest samples in a period of the reference: with less it is no sine any more."""
+
+
+class ExcitationError(ValueError):
+    """An option of an excitation is absurd; the message names option, value, unit and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """A reference, tick by tick.
+
+    Attributes
+    ----------
+    kind
+        ``chirp``, ``hold``, ``step``, ``multisine`` or ``file``.
+    parameters
+        The options it was made from, and what follows from them, with units in the names.
+    rate_hz
+        Ticks a second.
+    reference_rad
+        Shape (n,), relative to the start angle; read-only.
+    segments
+        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive).
+    """
+
+    kind: str
+    parameters: Mapping[str, float | int | str]
+    rate_hz: float
+    reference_rad: FloatArray
+    segments: Mapping[str, tuple[int, int]]
+
+
+def chirp(
+    *,
+    rate_hz: float,
+    amplitude_rad: float = 0.025,
+    start_hz: float = 0.05,
+    stop_hz: float = 50.0,
+    duration_s: float = 120.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+    taper_s: float = 0.0,
+) -> Excitation:
+    """Linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from the sweep's first tick.
+
+    The defaults are the paper's experiment (Section 5).
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    amplitude_rad
+        Amplitude A.
+    start_hz, stop_hz
+        Frequencies f0 at the sweep's first tick and f1 at its end; f1 < f0 sweeps downwards.
+    duration_s
+        Length T of the sweep.
+    rest_s, ring_down_s
+        Time before and after the sweep.
+    taper_s
+        Raised-cosine fade at both ends of the sweep; 0, as in the paper, leaves it as it is.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite, out of range, or does not fit the rate.
+    """
+    _positive("amplitude_rad", amplitude_rad, "rad")
+    _frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    _frequency("stop_hz", stop_hz, rate_hz)
+    segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
+    t = _sweep_time(segments, rate_hz)
+    phase = 2.0 * pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2.0 * duration_s))
+    sweep = amplitude_rad * np.sin(phase) * _taper(t, duration_s, taper_s)
+    parameters = {
+        "amplitude_rad": amplitude_rad,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "taper_s": taper_s,
+    }
+    return _assemble("chirp", parameters, rate_hz, segments, sweep)
+
+
+def hold(
+    *, rate_hz: float, duration_s: float = 10.0, rest_s: float = 1.0, ring_down_s: float = 0.0
+) -> Excitation:
+    """Hold the start angle, for noise and drift.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite or out of range.
+    """
+    segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
+    parameters = {"duration_s": duration_s, "rest_s": rest_s, "ring_down_s": ring_down_s}
+    sweep = np.zeros(segments["sweep"][1] - segments["sweep"][0])
+    return _assemble("hold", parameters, rate_hz, segments, sweep)
+
+
+def step(
+    *,
+    rate_hz: float,
+    amplitude_rad: float = 0.025,
+    duration_s: float = 10.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+) -> Excitation:
+    """Step by ``amplitude_rad`` (either sign) at the sweep's first tick.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite or out of range.
+    """
+    _finite("amplitude_rad", amplitude_rad, "rad")
+    if amplitude_rad == 0.0:
+        raise ExcitationError(
+            "amplitude_rad = 0 rad is no step; give an angle other than zero, or use hold."
+        )
+    segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
+    parameters = {
+        "amplitude_rad": amplitude_rad,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+    }
+    sweep = np.full(segments["sweep"][1] - segments["sweep"][0], amplitude_rad)
+    return _assemble("step", parameters, rate_hz, segments, sweep)
+
+
+def multisine(
+    *,
+    rate_hz: float,
+    amplitude_rad: float = 0.025,
+    start_hz: float = 0.05,
+    stop_hz: float = 50.0,
+    period_s: float = 20.0,
+    duration_s: float = 120.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+    taper_s: float = 0.0,
+    seed: int = 0,
+) -> Excitation:
+    """Random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
+
+    The period is turned so that it begins at its smallest magnitude (a shift in time: the
+    spectrum's magnitude stays flat), and scaled to the peak ``amplitude_rad``. The crest factor
+    reached, peak over rms, is reported in ``parameters["crest_factor"]``.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    amplitude_rad
+        Largest magnitude of the reference.
+    start_hz, stop_hz
+        The band.
+    period_s
+        Period; a whole number of ticks, and of it a whole number makes ``duration_s``.
+    duration_s
+        Length of the sweep segment.
+    rest_s, ring_down_s
+        Time before and after it.
+    taper_s
+        Raised-cosine fade at both ends of the whole sweep; the periods in it are then not equal.
+    seed
+        Of the phases: equal seeds give equal references.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite, out of range, or does not fit the others.
+    """
+    _positive("amplitude_rad", amplitude_rad, "rad")
+    _frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    _frequency("stop_hz", stop_hz, rate_hz)
+    _positive("period_s", period_s, "s")
+    if seed < 0:
+        raise ExcitationError(f"seed = {seed} is negative; give a whole number from 0 on.")
+    segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
+    ticks = _whole_ticks("period_s", period_s, rate_hz)
+    periods = round(duration_s / period_s)
+    if periods < 1 or abs(periods * period_s - duration_s) > 1e-9 * duration_s:
+        raise ExcitationError(
+            f"duration_s = {duration_s:g} s is not a whole number of periods of "
+            f"period_s = {period_s:g} s; choose for example {max(periods, 1) * period_s:g} s."
+        )
+    harmonics = np.arange(1, ticks // 2)
+    tolerance = 1e-9 * stop_hz
+    harmonics = harmonics[
+        (harmonics / period_s >= start_hz - tolerance)
+        & (harmonics / period_s <= stop_hz + tolerance)
+    ]
+    if harmonics.size == 0:
+        raise ExcitationError(
+            f"No harmonic of period_s = {period_s:g} s lies between start_hz = {start_hz:g} Hz and "
+            f"stop_hz = {stop_hz:g} Hz; take a longer period or a wider band."
+        )
+    spectrum = np.zeros(ticks // 2 + 1, dtype=complex)
+    random = np.random.default_rng(seed)
+    spectrum[harmonics] = np.exp(2j * pi * random.random(harmonics.size))
+    period = np.fft.irfft(spectrum, ticks)
+    period = np.roll(period, -int(np.argmin(np.abs(period))))
+    period *= amplitude_rad / np.max(np.abs(period))
+    crest_factor = amplitude_rad / float(np.sqrt(np.mean(period**2)))
+    t = _sweep_time(segments, rate_hz)
+    sweep = np.tile(period, periods) * _taper(t, duration_s, taper_s)
+    parameters = {
+        "amplitude_rad": amplitude_rad,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "period_s": period_s,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "taper_s": taper_s,
+        "seed": seed,
+        "crest_factor": crest_factor,
+    }
+    return _assemble("multisine", parameters, rate_hz, segments, sweep)
+
+
+def from_csv(
+    path: str | Path, *, rate_hz: float, rest_s: float = 1.0, ring_down_s: float = 15.0
+) -> Excitation:
+    """Read a reference from a CSV file.
+
+    Parameters
+    ----------
+    path
+        Either columns ``time_s`` and ``angle_rad`` (named in the first line, more columns are
+        ignored; angles are interpolated linearly to the ticks, times counted from the first), or
+        a single column of angles in rad, one a tick, with or without the heading ``angle_rad``.
+    rate_hz
+        Ticks a second.
+    rest_s, ring_down_s
+        Time before and after the trajectory.
+
+    Raises
+    ------
+    ExcitationError
+        If the file cannot be read, or a line of it is not what it should be.
+    """
+    path = Path(path)
+    times, angles = _read_csv(path)
+    if times is None:
+        ticks = len(angles)
+        sweep = np.asarray(angles)
+    else:
+        time_s = np.asarray(times) - times[0]
+        # The last row is reached exactly; rounding must not lose its tick.
+        ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
+        _check_ticks("the file's duration", ticks, rate_hz)
+        sweep = np.interp(np.arange(ticks) / rate_hz, time_s, angles)
+    duration_s = ticks / rate_hz
+    segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
+    parameters: dict[str, float | int | str] = {
+        "file": path.name,
+        "amplitude_rad": float(np.max(np.abs(sweep))),
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+    }
+    return _assemble("file", parameters, rate_hz, segments, sweep)
+
+
+def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
+    except OSError as error:
+        raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error}).") from error
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    if "angle_rad" in header:
+        angle_column = header.index("angle_rad")
+        time_column = header.index("time_s") if "time_s" in header else None
+        if time_column is None and len(header) > 1:
+            raise ExcitationError(
+                f"{path}: has the columns {', '.join(header)} but no time_s; name the column of "
+                "times in seconds so, or leave angle_rad alone."
+            )
+        rows = rows[1:]
+    elif len(header) == 1:
+        angle_column, time_column = 0, None
+    else:
+        raise ExcitationError(
+            f"{path}: line 1 must name the columns time_s (s) and angle_rad (rad), or the file "
+            "must be one column of angles in rad."
+        )
+    angles: list[float] = []
+    times: list[float] = []
+    for number, row in rows:
+        angles.append(_cell(path, number, row, angle_column, "angle_rad"))
+        if time_column is not None:
+            times.append(_cell(path, number, row, time_column, "time_s"))
+            if len(times) > 1 and times[-1] <= times[-2]:
+                raise ExcitationError(
+                    f"{path}: line {number}: time_s = {times[-1]:g} s does not come after the "
+                    f"{times[-2]:g} s before it; times must increase."
+                )
+    if len(angles) < 2:
+        raise ExcitationError(f"{path}: has {len(angles)} angles; a reference needs at least two.")
+    return (times if time_column is not None else None), angles
+
+
+def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> float:
+    if column >= len(row):
+        raise ExcitationError(f"{path}: line {line} has no value in the column {name}.")
+    try:
+        value = float(row[column])
+    except ValueError:
+        value = float("nan")
+    if not isfinite(value):
+        raise ExcitationError(
+            f"{path}: line {line}: {name} = '{row[column].strip()}' is not a finite number."
+        )
+    return value
+
+
+def _segments(
+    rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
+) -> dict[str, tuple[int, int]]:
+    """Rest, sweep and ring-down in ticks; the ring-down absorbs what rounding leaves."""
+    _not_negative("rest_s", rest_s)
+    _positive("duration_s", duration_s, "s")
+    _not_negative("ring_down_s", ring_down_s)
+    _check_ticks("the session", (rest_s + duration_s + ring_down_s) * rate_hz, rate_hz)
+    first = round(rate_hz * rest_s)
+    end = first + round(rate_hz * duration_s)
+    last = max(end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
+    if end - first < 2:
+        raise ExcitationError(
+            f"duration_s = {duration_s:g} s is less than two ticks at {rate_hz:g} Hz; choose at "
+            f"least {2 / rate_hz:g} s."
+        )
+    return {"rest": (0, first), "sweep": (first, end), "ring_down": (end, last)}
+
+
+def _check_ticks(what: str, ticks: float, rate_hz: float) -> None:
+    if ticks > MAX_TICKS:
+        raise ExcitationError(
+            f"{what} would take {ticks / rate_hz:g} s; {MAX_TICKS / rate_hz:g} s is the most at "
+            f"{rate_hz:g} Hz: shorten it or run several sessions."
+        )
+
+
+def _assemble(
+    kind: str,
+    parameters: Mapping[str, float | int | str],
+    rate_hz: float,
+    segments: Mapping[str, tuple[int, int]],
+    sweep: FloatArray,
+) -> Excitation:
+    reference = np.zeros(segments["ring_down"][1])
+    reference[slice(*segments["sweep"])] = sweep
+    reference[slice(*segments["ring_down"])] = sweep[-1]
+    reference.flags.writeable = False
+    return Excitation(kind, parameters, rate_hz, reference, segments)
+
+
+def _sweep_time(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
+    first, end = segments["sweep"]
+    return np.arange(end - first) / rate_hz
+
+
+def _taper(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
+    _not_negative("taper_s", taper_s)
+    if taper_s == 0.0:
+        return 1.0
+    if 2.0 * taper_s > duration_s:
+        raise ExcitationError(
+            f"taper_s = {taper_s:g} s at both ends does not fit into duration_s = "
+            f"{duration_s:g} s; choose at most {duration_s / 2:g} s."
+        )
+    edge = np.minimum(t, duration_s - t) / taper_s
+    return 0.5 - 0.5 * np.cos(pi * np.minimum(edge, 1.0))
+
+
+def _whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
+    ticks = round(value_s * rate_hz)
+    if ticks < 2 or abs(ticks / rate_hz - value_s) > 1e-9 * value_s:
+        raise ExcitationError(
+            f"{option} = {value_s:g} s is not a whole number of ticks at {rate_hz:g} Hz; choose "
+            f"for example {max(ticks, 2) / rate_hz:g} s."
+        )
+    return ticks
+
+
+def _finite(option: str, value: float, unit: str) -> None:
+    if not isfinite(value):
+        raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
+
+
+def _positive(option: str, value: float, unit: str) -> None:
+    _finite(option, value, unit)
+    if value <= 0.0:
+        raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
+
+
+def _not_negative(option: str, value: float) -> None:
+    _finite(option, value, "s")
+    if value < 0.0:
+        raise ExcitationError(f"{option} = {value:g} s must not be negative.")
+
+
+def _frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
+    _finite(option, value, "Hz")
+    highest = rate_hz / SAMPLES_PER_PERIOD
+    if not (value > 0.0 or (zero_allowed and value == 0.0)):
+        bound = "must not be negative" if zero_allowed else "must be more than 0 Hz"
+        raise ExcitationError(f"{option} = {value:g} Hz {bound}.")
+    if value > highest:
+        raise ExcitationError(
+            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples a period at "
+            f"{rate_hz:g} Hz; choose at most {highest:g} Hz."
+        )

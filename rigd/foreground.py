@@ -1,0 +1,212 @@
+"""Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from rigd.beam import RealisationError
+from rigd.control import ControlDesignError
+from rigd.daemon import (
+    Crew,
+    Order,
+    SessionFailedError,
+    SessionProgress,
+    SessionResult,
+    choose_path,
+    run_session,
+    with_seed,
+)
+from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
+from rigd.engine.board import Phase
+from rigd.engine.events import Event
+from rigd.excitation import Excitation, ExcitationError
+from rigd.planning import Plan, RefusedError, plan_session
+from rigd.profile import Profile, ProfileError, load_profile
+
+_PHASES = {
+    Phase.PREPARING: "preparing",
+    Phase.SETTLING: "settling",
+    Phase.TARING: "taring",
+    Phase.READY: "ready",
+    Phase.RUNNING: "recording",
+    Phase.RETURNING: "returning",
+    Phase.OFF: "drive off",
+}
+
+
+class ForegroundError(Exception):
+    """No session, or no further one; the message is for the operator."""
+
+    def __init__(self, message: str, *, wrong_use: bool) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
+
+
+def run_in_foreground(
+    build: Callable[[float], Excitation],
+    *,
+    profile_name: str,
+    folder: Path,
+    repeat: int,
+    seed: int | None,
+    notes: Mapping[str, str],
+    fast: bool,
+    live: bool,
+    force: bool,
+    quiet_stdout: bool,
+) -> list[SessionResult]:
+    """Run `repeat` sessions, up to the first that does not end well.
+
+    Parameters
+    ----------
+    build
+        Makes the excitation for a rate in Hz.
+    profile_name
+        Name or path of the profile.
+    folder
+        Where the files go; made if it does not exist.
+    repeat, seed, notes, fast, live, force
+        As on the command line. Each session of a series has its own seed, counted up.
+    quiet_stdout
+        Tell the operator on standard error, because standard output is for a document.
+
+    Raises
+    ------
+    ForegroundError
+        If a session is refused (wrong use) or cannot be run.
+    """
+    console = Console(stderr=quiet_stdout, highlight=False, soft_wrap=True)
+    results: list[SessionResult] = []
+    try:
+        profile = _load(profile_name, fast=fast, seed=seed)
+        excitation: Excitation | None = None
+        for number in range(repeat):
+            # The processes import while this one plans.
+            with Crew(profile.rig.rate_hz, live=live) as crew:
+                if excitation is None:
+                    excitation = build(profile.rig.rate_hz)
+                    plan = plan_session(profile, excitation, force=force)
+                    _tell_plan(console, profile, excitation, plan)
+                    folder.mkdir(parents=True, exist_ok=True)
+                order = Order(
+                    profile=_seeded(profile, number),
+                    excitation=excitation,
+                    path=choose_path(
+                        folder, excitation.kind, number + 1 if repeat > 1 else None
+                    ),
+                    fast=fast,
+                    notes=tuple((name, text) for name, text in notes.items() if text),
+                )
+                if live:
+                    console.print(crew.start_live(order))
+                with _ProgressView(console, excitation.reference_rad.size) as view:
+                    results.append(run_session(order, crew, view.update))
+            _tell_result(console, results[-1])
+            if results[-1].outcome != "complete" or results[-1].interrupted:
+                break
+    except (
+        ProfileError,
+        UnknownDeviceError,
+        ExcitationError,
+        RefusedError,
+        ControlDesignError,
+        RealisationError,
+    ) as error:
+        raise ForegroundError(str(error), wrong_use=True) from error
+    except OSError as error:
+        raise ForegroundError(
+            f"--output {folder}: cannot be made a folder ({error.strerror}); choose another.",
+            wrong_use=True,
+        ) from error
+    except SessionFailedError as error:
+        raise ForegroundError(str(error), wrong_use=False) from error
+    return results
+
+
+def _load(name: str, *, fast: bool, seed: int | None) -> Profile:
+    profile = load_profile(name)
+    check_selection(profile.rig.devices)
+    simulated = is_simulated(profile.rig.devices)
+    if fast and not simulated:
+        raise RefusedError(
+            f"--fast: the rig of {profile.path} is real, and real time cannot be skipped; leave "
+            "the option out."
+        )
+    if seed is not None:
+        if profile.rig.simulation is None:
+            raise RefusedError(
+                f"--seed: the rig of {profile.path} is real, its noise has no seed; leave the "
+                "option out."
+            )
+        profile = with_seed(profile, seed)
+    return profile
+
+
+def _seeded(profile: Profile, number: int) -> Profile:
+    simulation = profile.rig.simulation
+    return profile if simulation is None else with_seed(profile, simulation.seed + number)
+
+
+def _tell_plan(console: Console, profile: Profile, excitation: Excitation, plan: Plan) -> None:
+    duration_s = excitation.reference_rad.size / profile.rig.rate_hz
+    predicted, limits = plan.prediction, profile.limits
+    console.print(f"{excitation.kind} on {profile.name}: {duration_s:g} s of record.")
+    console.print(
+        f"Predicted peaks: angle {predicted.peak_angle_rad:.4f} of {limits.angle_rad:g} rad, "
+        f"speed {predicted.peak_velocity_rad_s:.2f} of {limits.velocity_rad_s:g} rad/s, "
+        f"torque {predicted.peak_torque_nm:.2f} of {profile.rig.motor.peak_torque_nm:g} N·m."
+    )
+    for warning in plan.warnings:
+        console.print(f"Warning: {warning}")
+
+
+def _tell_result(console: Console, result: SessionResult) -> None:
+    counts = (
+        f"{result.scheduled} ticks scheduled = {result.recorded} recorded + {result.missed} "
+        f"missed + {result.lost} lost; {result.late} late."
+    )
+    if result.path is None:
+        console.print(f"{result.outcome}: no record. {result.reason}")
+    else:
+        console.print(f"{result.outcome}: {counts}{' ' + result.reason if result.reason else ''}")
+        console.print(str(result.path))
+
+
+class _ProgressView:
+    """One line that says how far the session is and how long it still takes."""
+
+    def __init__(self, console: Console, ticks: int) -> None:
+        self._console = console
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:3.0f} %"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[counts]}"),
+            console=Console(stderr=True),
+            transient=True,
+            auto_refresh=False,
+        )
+        self._task = self._progress.add_task("preparing", total=ticks, counts="")
+
+    def __enter__(self) -> "_ProgressView":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def update(self, state: SessionProgress, events: list[Event]) -> None:
+        """Show where the session is, and what it has to say."""
+        for event in events:
+            if event.level in ("warning", "error", "fatal"):
+                self._console.print(f"{event.level.capitalize()}: {event.message}")
+        self._progress.update(
+            self._task,
+            description=_PHASES[state.phase],
+            completed=state.tick,
+            counts=f"{state.missed} missed, {state.late} late" if state.missed else "",
+        )
+        self._progress.refresh()

@@ -1,0 +1,245 @@
+"""Byte layout of the messages of a session file: packing for the loop, decoding for the reader.
+
+Every message of ``/rig/sample`` and ``/rig/control`` is protobuf of *fixed layout*: all fields are
+``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the order below, and all are written,
+zero or not. Tags are then constant bytes and every message is equally long, so one
+``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of them, and it is still
+what any protobuf decoder understands.
+
+The control process imports this module: numpy and the standard library only.
+"""
+
+import struct
+from enum import IntFlag
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+Buffer = bytes | bytearray | memoryview
+
+SAMPLE_TYPES: Final[dict[str, str]] = {
+    "t_ns": "sfixed64",
+    "tick": "fixed32",
+    "angle_reference_rad": "double",
+    "angle_rad": "double",
+    "torque_command_nm": "double",
+    "coupling_torque_nm": "double",
+    "fx_n": "double",
+    "fy_n": "double",
+    "fz_n": "double",
+    "tx_nm": "double",
+    "ty_nm": "double",
+    "tz_nm": "double",
+    "status": "fixed32",
+    "lateness_ns": "fixed32",
+    "work_ns": "fixed32",
+}
+"""Fields of ``rigd.Sample`` with their protobuf types; the first has number 1."""
+
+CONTROL_TYPES: Final[dict[str, str]] = {
+    "t_ns": "sfixed64",
+    "tick": "fixed32",
+    "proportional_nm": "double",
+    "integral_nm": "double",
+    "derivative_nm": "double",
+    "feedforward_nm": "double",
+    "friction_nm": "double",
+    "unlimited_torque_nm": "double",
+}
+"""Fields of ``rigd.Control`` with their protobuf types; the first has number 1."""
+
+_NUMPY_TYPES: Final = {"sfixed64": "<i8", "fixed32": "<u4", "double": "<f8"}
+_WIRE_TYPES: Final = {"sfixed64": 1, "fixed32": 5, "double": 1}  # of the protobuf encoding
+
+
+class Status(IntFlag):
+    """Bits of the field ``status``; those not named here are reserved."""
+
+    TORQUE_SATURATED = 1
+    """The torque command was cut to the limit."""
+    WRENCH_SATURATED = 2
+    """At least one axis of the force-torque sensor was at the end of its range."""
+    ANGLE_STALE = 4
+    """No new angle arrived in time; the last one is repeated."""
+    WRENCH_STALE = 8
+    """No new wrench arrived in time; the last one is repeated."""
+    AFTER_MISSED = 16
+    """First sample after ticks that the loop missed."""
+    AFTER_LOST = 32
+    """First sample after samples that were taken and could not be recorded."""
+    LIMIT_WARNING = 64
+    """A limit of the profile is near or exceeded."""
+    TORQUE_OFF = 128
+    """The drive exerts no torque."""
+    LATE = 256
+    """The tick woke late."""
+
+
+def field_tag(number: int, protobuf_type: str) -> int:
+    """Return the tag byte of field `number` (1–15) of a fixed-layout message."""
+    return number << 3 | _WIRE_TYPES[protobuf_type]
+
+
+def _native_dtype(types: dict[str, str]) -> np.dtype[np.void]:
+    # Aligned: numpy's loops over a column are then as quick as over any strided array.
+    return np.dtype([(name, _NUMPY_TYPES[kind]) for name, kind in types.items()], align=True)
+
+
+def _wire_dtype(types: dict[str, str]) -> np.dtype[np.void]:
+    columns: list[tuple[str, str]] = []
+    for name, kind in types.items():
+        columns += [(f"tag_{name}", "u1"), (name, _NUMPY_TYPES[kind])]
+    return np.dtype(columns)
+
+
+SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
+SAMPLE_DTYPE: Final = _native_dtype(SAMPLE_TYPES)
+"""A decoded sample."""
+SAMPLE_WIRE_DTYPE: Final = _wire_dtype(SAMPLE_TYPES)
+"""A sample as it stands in the file: each field after its tag byte ``tag_NAME``."""
+SAMPLE_SIZE: Final = SAMPLE_WIRE_DTYPE.itemsize
+
+CONTROL_FIELDS: Final = tuple(CONTROL_TYPES)
+CONTROL_DTYPE: Final = _native_dtype(CONTROL_TYPES)
+"""A decoded message of the controller's terms."""
+CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
+"""A control message as it stands in the file: each field after its tag byte ``tag_NAME``."""
+CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
+
+_pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
+_pack_control: Final = struct.Struct("<Bq BI" + "Bd" * 6).pack_into
+
+
+def pack_sample_into(
+    buffer: bytearray | memoryview,
+    offset: int,
+    t_ns: int,
+    tick: int,
+    angle_reference_rad: float,
+    angle_rad: float,
+    torque_command_nm: float,
+    coupling_torque_nm: float,
+    fx_n: float,
+    fy_n: float,
+    fz_n: float,
+    tx_nm: float,
+    ty_nm: float,
+    tz_nm: float,
+    status: int,
+    lateness_ns: int,
+    work_ns: int,
+) -> None:
+    """Write one sample of ``SAMPLE_SIZE`` bytes into `buffer` at `offset`.
+
+    Called once a tick. `lateness_ns` and `work_ns` are clamped to 0…2³²−1 ns; any other value that
+    its field cannot hold raises ``struct.error``.
+    """
+    if not 0 <= lateness_ns <= 0xFFFFFFFF:
+        lateness_ns = 0 if lateness_ns < 0 else 0xFFFFFFFF
+    if not 0 <= work_ns <= 0xFFFFFFFF:
+        work_ns = 0 if work_ns < 0 else 0xFFFFFFFF
+    # The tags are literals because this line is a good part of the loop's own time.
+    # fmt: off
+    _pack_sample(
+        buffer, offset,
+        0x09, t_ns, 0x15, tick,
+        0x19, angle_reference_rad, 0x21, angle_rad,
+        0x29, torque_command_nm, 0x31, coupling_torque_nm,
+        0x39, fx_n, 0x41, fy_n, 0x49, fz_n, 0x51, tx_nm, 0x59, ty_nm, 0x61, tz_nm,
+        0x6D, status, 0x75, lateness_ns, 0x7D, work_ns,
+    )
+    # fmt: on
+
+
+def pack_control_into(
+    buffer: bytearray | memoryview,
+    offset: int,
+    t_ns: int,
+    tick: int,
+    proportional_nm: float,
+    integral_nm: float,
+    derivative_nm: float,
+    feedforward_nm: float,
+    friction_nm: float,
+    unlimited_torque_nm: float,
+) -> None:
+    """Write one control message of ``CONTROL_SIZE`` bytes into `buffer` at `offset`."""
+    # fmt: off
+    _pack_control(
+        buffer, offset,
+        0x09, t_ns, 0x15, tick,
+        0x19, proportional_nm, 0x21, integral_nm, 0x29, derivative_nm,
+        0x31, feedforward_nm, 0x39, friction_nm, 0x41, unlimited_torque_nm,
+    )
+    # fmt: on
+
+
+def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
+    """Tell which messages have every tag of the fixed layout in its place.
+
+    Parameters
+    ----------
+    wire : array (n,) of a wire dtype
+    types : ``SAMPLE_TYPES`` or ``CONTROL_TYPES``
+
+    Returns
+    -------
+    array (n,) of bool
+    """
+    fixed = np.ones(wire.shape, dtype=np.bool_)
+    for number, (name, kind) in enumerate(types.items(), start=1):
+        fixed &= wire[f"tag_{name}"] == field_tag(number, kind)
+    return fixed
+
+
+def to_native(
+    wire: npt.NDArray[np.void], types: dict[str, str], dtype: np.dtype[np.void]
+) -> npt.NDArray[np.void]:
+    """Copy messages (n,) of a wire dtype into an array (n,) of the decoded `dtype`."""
+    native = np.empty(wire.shape, dtype)
+    for name in types:
+        native[name] = wire[name]
+    return native
+
+
+def _decode(
+    block: Buffer,
+    types: dict[str, str],
+    wire_dtype: np.dtype[np.void],
+    dtype: np.dtype[Any],
+) -> npt.NDArray[np.void]:
+    size = memoryview(block).nbytes
+    if size % wire_dtype.itemsize:
+        raise ValueError(
+            f"a block of {size} bytes is not a whole number of {wire_dtype.itemsize}-byte messages"
+        )
+    wire = np.frombuffer(block, wire_dtype)
+    fixed = is_fixed_layout(wire, types)
+    if not fixed.all():
+        raise ValueError(f"message {int(np.argmin(fixed))} of the block is not of the fixed layout")
+    return to_native(wire, types, dtype)
+
+
+def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
+    """Decode consecutive samples of the fixed layout.
+
+    Parameters
+    ----------
+    block : bytes-like of n × ``SAMPLE_SIZE`` bytes
+
+    Returns
+    -------
+    array (n,) of ``SAMPLE_DTYPE``, a copy
+
+    Raises
+    ------
+    ValueError
+        If the length is no multiple of ``SAMPLE_SIZE`` or a tag byte is not the expected one.
+    """
+    return _decode(block, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SAMPLE_DTYPE)
+
+
+def decode_controls(block: Buffer) -> npt.NDArray[np.void]:
+    """Decode consecutive control messages of the fixed layout, as `decode_samples` does."""
+    return _decode(block, CONTROL_TYPES, CONTROL_WIRE_DTYPE, CONTROL_DTYPE)

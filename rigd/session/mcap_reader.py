@@ -1,0 +1,320 @@
+"""MCAP container, read record by record with every length checked and every checksum verified.
+
+The data section is walked from its beginning, which takes a millisecond for the chunks of a
+session. So one way of reading serves files of any chunking, with or without a summary, and tells
+for a file that was cut off how far it can be read. Messages of equal length that follow one
+another, as those of a session do, are taken as one run of bytes.
+
+Nothing in the file is believed before it is checked: what a chunk claims to decompress to is
+bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`.
+"""
+
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import Final, TypeVar
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
+
+from rigd.session.mcap_writer import MAGIC
+
+MAX_CHUNK_BYTES: Final = 256 << 20
+MAX_TOTAL_BYTES: Final = 2 << 30
+
+MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
+"""Opcode, length, channel, sequence, log time, publish time: what precedes a message's data."""
+
+_RECORD_HEAD: Final = struct.Struct("<BQ")
+_RUN_KEY: Final = struct.Struct("<BQH")  # opcode, length, channel: equal throughout a run
+_CHUNK_HEAD: Final = struct.Struct("<QQQI")
+_FOOTER: Final = struct.Struct("<BQ QQI")
+_FOOTER_CONTENT_SIZE: Final = 20
+_FIRST_STRETCH: Final = 16
+
+_Record = TypeVar("_Record")
+
+
+class McapError(Exception):
+    """The bytes are no MCAP file; the message is a predicate to the file's name."""
+
+
+@dataclass(slots=True)
+class McapContents:
+    """What was read of a file, as far as it could be."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    metadata: list[Metadata] = field(default_factory=list)
+    attachments: list[Attachment] = field(default_factory=list)
+    runs: dict[str, list[tuple[int, int, bytearray]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    """Topic → in the order of the file: channel, size of a record, records of that size."""
+    complete: bool = False
+    """Whether the file has its end."""
+    damage: str | None = None
+    """Why reading stopped, None if it did not: a sentence's predicate, with the byte."""
+
+    def count(self, topic: str) -> int:
+        """Return how many messages of a topic were read."""
+        return sum(len(records) // size for _, size, records in self.runs.get(topic, ()))
+
+
+def read_mcap(data: memoryview, topics: Collection[str]) -> McapContents:
+    """Read an MCAP file as far as it is sound.
+
+    Parameters
+    ----------
+    data : the file
+    topics : of which the messages are wanted
+
+    Returns
+    -------
+    The contents; `McapContents.damage` tells whether, where and why reading stopped.
+
+    Raises
+    ------
+    McapError
+        If the file does not begin as an MCAP file does.
+    """
+    if bytes(data[: len(MAGIC)]) != MAGIC:
+        raise McapError("is not an MCAP file")
+    reader = _Reader(data, topics)
+    reader.contents.complete = _has_end(data)
+    try:
+        reader.read()
+    except _DamageError as error:
+        reader.contents.damage = str(error)
+    except MemoryError:
+        reader.contents.damage = "does not fit into the memory of this machine"
+    return reader.contents
+
+
+class _DamageError(Exception):
+    """Something in the file contradicts the format."""
+
+
+def _has_end(data: memoryview) -> bool:
+    """Tell whether the file ends with a footer and the magic."""
+    start = len(data) - len(MAGIC) - _FOOTER.size
+    if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
+        return False
+    return _RECORD_HEAD.unpack_from(data, start) == (Opcode.FOOTER, _FOOTER_CONTENT_SIZE)
+
+
+def _record_at(data: memoryview, position: int, where: str) -> tuple[int, int, int]:
+    """Return the opcode of the record at `position`, where its content begins and where it ends."""
+    content = position + _RECORD_HEAD.size
+    if content > len(data):
+        raise _DamageError(f"ends in the middle of a record, at byte {position}{where}")
+    opcode, length = _RECORD_HEAD.unpack_from(data, position)
+    if opcode == 0:
+        raise _DamageError(f"has no record where one must be, at byte {position}{where}")
+    end = content + length
+    if end > len(data):
+        raise _DamageError(f"ends in the middle of a record, at byte {position}{where}")
+    return opcode, content, end
+
+
+class _Reader:
+    """One pass over a file."""
+
+    def __init__(self, data: memoryview, topics: Collection[str]) -> None:
+        self.contents = McapContents()
+        self._data = data
+        self._topics = topics
+        self._wanted: dict[int, str | None] = {}  # channel → its topic if wanted
+        self._counts: dict[int, int] = defaultdict(int)
+        self._uncompressed = 0
+
+    def read(self) -> None:
+        data = self._data
+        end = len(MAGIC)
+        while end < len(data):
+            start = end
+            opcode, content, end = _record_at(data, start, "")
+            if opcode == Opcode.CHUNK:
+                self._read_chunk(data[content:end], start)
+            elif opcode == Opcode.MESSAGE:
+                self._take_run(data[start:end], 1, f" at byte {start}")
+            elif opcode == Opcode.DATA_END:
+                self._check_data_end(data[content:end], start)
+                self._check_summary(end)
+                return
+            elif opcode == Opcode.FOOTER:
+                break
+            else:
+                self._read_other(opcode, data[content:end], f" at byte {start}")
+        raise _DamageError("has no end of its data section")
+
+    def _read_other(self, opcode: int, content: memoryview, where: str) -> None:
+        """Take a record that is neither chunk nor message; skip what is not needed."""
+        contents = self.contents
+        if opcode == Opcode.SCHEMA:
+            schema = _parsed(Schema.read, content, where)
+            if contents.schemas.setdefault(schema.id, schema) != schema:
+                raise _DamageError(f"declares schema {schema.id} twice, differently{where}")
+        elif opcode == Opcode.CHANNEL:
+            channel = _parsed(Channel.read, content, where)
+            if contents.channels.setdefault(channel.id, channel) != channel:
+                raise _DamageError(f"declares channel {channel.id} twice, differently{where}")
+            self._wanted[channel.id] = channel.topic if channel.topic in self._topics else None
+        elif opcode == Opcode.METADATA:
+            contents.metadata.append(_parsed(Metadata.read, content, where))
+        elif opcode == Opcode.ATTACHMENT:
+            if len(content) >= 4:
+                (crc,) = struct.unpack_from("<I", content, len(content) - 4)
+                if crc not in (0, zlib.crc32(content[:-4])):
+                    raise _DamageError(f"has an attachment with a wrong checksum{where}")
+            contents.attachments.append(_parsed(Attachment.read, content, where))
+
+    def _read_chunk(self, content: memoryview, start: int) -> None:
+        where = f" in the chunk at byte {start}"
+        try:
+            *_, size, crc = _CHUNK_HEAD.unpack_from(content)
+            name, position = _prefixed(content, _CHUNK_HEAD.size, "<I")
+            packed, _ = _prefixed(content, position, "<Q")
+        except struct.error:
+            raise _DamageError(f"has a malformed head{where}") from None
+        self._uncompressed += size
+        if size > MAX_CHUNK_BYTES or self._uncompressed > MAX_TOTAL_BYTES:
+            raise _DamageError(
+                f"claims {size} bytes{where}, which is more than the {MAX_CHUNK_BYTES >> 20} MiB "
+                f"for a chunk or the {MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
+            )
+        records = memoryview(_decompressed(bytes(name), packed, size, where))
+        if crc not in (0, zlib.crc32(records)):
+            raise _DamageError(f"has a wrong checksum{where}")
+        self._read_chunk_records(records, where)
+
+    def _read_chunk_records(self, records: memoryview, where: str) -> None:
+        end = 0
+        while end < len(records):
+            start = end
+            opcode, content, end = _record_at(records, start, where)
+            if opcode == Opcode.MESSAGE:
+                count = _run_length(records, start, end - start)
+                end = start + count * (end - start)
+                self._take_run(records[start:end], count, where)
+            else:
+                self._read_other(opcode, records[content:end], where)
+
+    def _take_run(self, run: memoryview, count: int, where: str) -> None:
+        """Take `count` message records of equal length and channel."""
+        size = len(run) // count
+        if size < MESSAGE_HEAD.size:
+            raise _DamageError(f"has a message that is too short{where}")
+        channel = MESSAGE_HEAD.unpack_from(run)[2]
+        if channel not in self._wanted:
+            raise _DamageError(f"has a message of an undeclared channel {channel}{where}")
+        self._counts[channel] += count
+        topic = self._wanted[channel]
+        if topic is None:
+            return
+        runs = self.contents.runs[topic]
+        if not runs or runs[-1][:2] != (channel, size):
+            runs.append((channel, size, bytearray()))
+        runs[-1][2].extend(run)
+
+    def _check_data_end(self, content: memoryview, start: int) -> None:
+        if len(content) < 4:
+            raise _DamageError(f"has a malformed end of its data section at byte {start}")
+        (crc,) = struct.unpack_from("<I", content)
+        if crc not in (0, zlib.crc32(self._data[:start])):
+            raise _DamageError("has a wrong checksum over its data section")
+
+    def _check_summary(self, start: int) -> None:
+        """Compare the summary, if there is one, with what was found."""
+        data = self._data
+        if not self.contents.complete:
+            raise _DamageError("ends in the middle of its summary")
+        footer = len(data) - len(MAGIC) - _FOOTER.size
+        *_, summary_start, _, crc = _FOOTER.unpack_from(data, footer)
+        if summary_start not in (0, start) or (summary_start == 0 and footer != start):
+            raise _DamageError(f"has a footer that contradicts its data section at byte {footer}")
+        if crc not in (0, zlib.crc32(data[start : footer + _FOOTER.size - 4])):
+            raise _DamageError("has a wrong checksum over its summary")
+        end = start
+        while end < footer:
+            opcode, content, end = _record_at(data[:footer], end, " of the summary")
+            if opcode != Opcode.STATISTICS:
+                continue
+            statistics = _parsed(Statistics.read, data[content:end], " in the summary")
+            counts = statistics.channel_message_counts
+            if any(self._counts[channel] != count for channel, count in counts.items()):
+                raise _DamageError("has not the messages that its statistics count")
+
+
+def _prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
+    """Return the bytes behind a length of format `prefix`, and where they end."""
+    (length,) = struct.unpack_from(prefix, content, position)
+    start = position + struct.calcsize(prefix)
+    if length > len(content) - start:
+        raise struct.error
+    return content[start : start + length], start + length
+
+
+def _parsed(read: Callable[[ReadDataStream], _Record], content: memoryview, where: str) -> _Record:
+    """Parse a record with the ``mcap`` package."""
+    try:
+        stream = ReadDataStream(BytesIO(content))
+        record = read(stream)
+    except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
+        raise _DamageError(f"has a malformed record{where}") from None
+    return record
+
+
+def _decompressed(compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
+    """Decompress a chunk to exactly `size` bytes, never allocating more."""
+    import lz4.frame
+    import zstandard
+
+    try:
+        if compression == b"":
+            records = bytes(packed)
+        elif compression == b"zstd":
+            # The frame may state a size of its own, which the decompressor would believe.
+            if zstandard.get_frame_parameters(packed).content_size not in (
+                size,
+                zstandard.CONTENTSIZE_UNKNOWN,
+            ):
+                raise _DamageError(f"states two different sizes{where}")
+            records = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        elif compression == b"lz4":
+            # One byte more than is right, so that what is too long is seen.
+            records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+        else:
+            raise _DamageError(f"uses the unknown compression {compression!r}{where}")
+    except (zstandard.ZstdError, RuntimeError, ValueError):
+        raise _DamageError(f"does not decompress{where}") from None
+    if len(records) != size:
+        raise _DamageError(f"decompresses to a wrong size{where}")
+    return records
+
+
+def _run_length(records: memoryview, start: int, size: int) -> int:
+    """Count the records of equal opcode, length and channel from `start` on.
+
+    The stretch examined at once grows, so that short runs in long chunks stay cheap.
+    """
+    key = bytes(records[start : start + _RUN_KEY.size])
+    most = (len(records) - start) // size
+    if most < 2 or bytes(records[start + size : start + size + _RUN_KEY.size]) != key:
+        return 1
+    table = np.frombuffer(records, np.uint8, most * size, start).reshape(most, size)
+    table = table[:, : _RUN_KEY.size]
+    known, stretch = 1, _FIRST_STRETCH
+    while known < most:
+        equal = (table[known : known + stretch] == table[0]).all(axis=1)
+        if not equal.all():
+            return known + int(np.argmin(equal))
+        known += len(equal)
+        stretch *= 4
+    return known

@@ -1,0 +1,137 @@
+"""Channels of a session file and their protobuf schemas, built without a protobuf compiler.
+
+An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` that holds the message
+and everything it refers to.
+"""
+
+from functools import cache
+from typing import TYPE_CHECKING, Final
+
+from rigd.session.format import CONTROL_TYPES, SAMPLE_TYPES
+
+if TYPE_CHECKING:
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto
+    from google.protobuf.message import Message
+
+FORMAT_VERSION: Final = "1"
+
+SAMPLE_TOPIC: Final = "/rig/sample"
+CONTROL_TOPIC: Final = "/rig/control"
+EVENT_TOPIC: Final = "/rig/event"
+
+SAMPLE_SCHEMA: Final = "rigd.Sample"
+CONTROL_SCHEMA: Final = "rigd.Control"
+EVENT_SCHEMA: Final = "foxglove.Log"
+
+EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
+"""Names of the values 0…5 of ``foxglove.Log.Level``."""
+
+
+def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescriptorProto":
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+
+    package, name = schema_name.split(".")
+    file = FileDescriptorProto(
+        name=f"{package}/{name.lower()}.proto", package=package, syntax="proto3"
+    )
+    message = file.message_type.add(name=name)
+    for number, (field, kind) in enumerate(types.items(), start=1):
+        message.field.add(
+            name=field,
+            number=number,
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+            type=FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}"),
+        )
+    return file
+
+
+def _event_file() -> "FileDescriptorProto":
+    """Return the part of https://github.com/foxglove/foxglove-sdk's ``foxglove.Log`` in use."""
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+
+    file = FileDescriptorProto(
+        name="foxglove/Log.proto",
+        package="foxglove",
+        syntax="proto3",
+        dependency=["google/protobuf/timestamp.proto"],
+    )
+    message = file.message_type.add(name="Log")
+    level = message.enum_type.add(name="Level")
+    for value, name in enumerate(EVENT_LEVELS):
+        level.value.add(name=name.upper(), number=value)
+    fields = (
+        ("timestamp", FieldDescriptorProto.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
+        ("level", FieldDescriptorProto.TYPE_ENUM, ".foxglove.Log.Level"),
+        ("message", FieldDescriptorProto.TYPE_STRING, None),
+        ("name", FieldDescriptorProto.TYPE_STRING, None),
+        ("file", FieldDescriptorProto.TYPE_STRING, None),
+        ("line", FieldDescriptorProto.TYPE_FIXED32, None),
+    )
+    for number, (name, kind, type_name) in enumerate(fields, start=1):
+        message.field.add(
+            name=name,
+            number=number,
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+            type=kind,
+            type_name=type_name,
+        )
+    return file
+
+
+@cache
+def schema_data(schema_name: str) -> bytes:
+    """Return the serialised ``FileDescriptorSet`` of one of the three schemas of a session file."""
+    from google.protobuf import timestamp_pb2
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+
+    if schema_name == EVENT_SCHEMA:
+        timestamp = FileDescriptorProto()
+        timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+        files = [timestamp, _event_file()]
+    else:
+        types = {SAMPLE_SCHEMA: SAMPLE_TYPES, CONTROL_SCHEMA: CONTROL_TYPES}[schema_name]
+        files = [_fixed_layout_file(schema_name, types)]
+    return FileDescriptorSet(file=files).SerializeToString(deterministic=True)
+
+
+def message_class(schema_name: str, data: bytes) -> "type[Message]":
+    """Return the class that decodes the messages of a protobuf schema.
+
+    Parameters
+    ----------
+    schema_name : full name of the message type, such as ``rigd.Sample``
+    data : serialised ``FileDescriptorSet``
+
+    Raises
+    ------
+    ValueError
+        If `data` is not a consistent ``FileDescriptorSet`` that holds `schema_name`.
+    """
+    from google.protobuf import descriptor_pool, message_factory
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.message import DecodeError
+
+    try:
+        remaining = {file.name: file for file in FileDescriptorSet.FromString(data).file}
+        pool = descriptor_pool.DescriptorPool()
+
+        def add(name: str) -> None:
+            # A file goes into the pool after those it imports, in whatever order they stand.
+            file = remaining.pop(name, None)
+            if file is not None:
+                for dependency in file.dependency:
+                    add(dependency)
+                pool.Add(file)
+
+        while remaining:
+            add(next(iter(remaining)))
+        descriptor = pool.FindMessageTypeByName(schema_name)
+    except (DecodeError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"schema {schema_name!r} is not a usable protobuf schema") from error
+    return message_factory.GetMessageClass(descriptor)
+
+
+@cache
+def event_class() -> "type[Message]":
+    """Return the message class of ``foxglove.Log`` as this package writes it."""
+    return message_class(EVENT_SCHEMA, schema_data(EVENT_SCHEMA))

@@ -1,0 +1,383 @@
+"""Recorder's side of a session file: blocks of packed messages in, a durable MCAP file out."""
+
+import contextlib
+import errno
+import os
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+import rigd
+from rigd.session.errors import SessionError, SessionExistsError
+from rigd.session.format import (
+    CONTROL_SIZE,
+    CONTROL_WIRE_DTYPE,
+    SAMPLE_SIZE,
+    SAMPLE_WIRE_DTYPE,
+    Buffer,
+)
+from rigd.session.mcap_writer import INDEX_DTYPE, McapWriter
+from rigd.session.schema import (
+    CONTROL_SCHEMA,
+    CONTROL_TOPIC,
+    EVENT_LEVELS,
+    EVENT_SCHEMA,
+    EVENT_TOPIC,
+    FORMAT_VERSION,
+    SAMPLE_SCHEMA,
+    SAMPLE_TOPIC,
+    event_class,
+    schema_data,
+)
+
+PART_SUFFIX: Final = ".part"
+
+CHUNK_SAMPLES: Final = 250
+"""Samples to a chunk: what a killed recorder loses at most."""
+SYNC_INTERVAL_S: Final = 1.0
+"""Wall time between two syncs to the disk: what a dead host loses on top."""
+
+_MESSAGE_HEAD: Final = [
+    ("opcode", "u1"),
+    ("length", "<u8"),
+    ("channel", "<u2"),
+    ("sequence", "<u4"),
+    ("log_time", "<u8"),
+    ("publish_time", "<u8"),
+]
+_MESSAGE_OPCODE: Final = 5
+_HEAD_SIZE: Final = np.dtype(_MESSAGE_HEAD).itemsize
+_RECORD_HEAD_SIZE: Final = 9  # opcode and length, which the length does not count
+
+_MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
+_URGENT: Final = ("error", "fatal")
+
+
+def _fixed_records(
+    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
+) -> npt.NDArray[np.void]:
+    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
+    records = np.empty(wire.shape, [*_MESSAGE_HEAD, ("data", wire.dtype)])
+    records["opcode"] = _MESSAGE_OPCODE
+    records["length"] = records.dtype.itemsize - _RECORD_HEAD_SIZE
+    records["channel"] = channel
+    records["sequence"] = wire["tick"]
+    records["log_time"] = wire["t_ns"] + start_utc_ns
+    records["publish_time"] = records["log_time"]
+    records["data"] = wire
+    return records
+
+
+def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
+    index = np.empty(records.shape, INDEX_DTYPE)
+    index["log_time"] = records["log_time"]
+    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
+    return index
+
+
+def _fsync_directory(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _rename_new(source: Path, target: Path) -> None:
+    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
+            raise
+        # A file system without hard links (FAT, some network shares): reserve the name, which
+        # fails if anybody has it, and replace the empty file that then is our own.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        source.replace(target)
+    else:
+        source.unlink()
+
+
+class SessionWriter:
+    """Writes one session, durably, to ``NAME.mcap.part`` and in the end to ``NAME.mcap``.
+
+    After `begin`, messages arrive in blocks; a chunk goes to the file with every 250th sample,
+    and the file to the disk once a second. Whatever happens after that, what was written stays.
+
+    Parameters
+    ----------
+    path : the final name
+
+    Raises
+    ------
+    SessionExistsError
+        If the file or its ``.part`` exists.
+    SessionError
+        If the file cannot be created.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + PART_SUFFIX)
+        self._samples = bytearray()
+        self._controls = bytearray()
+        self._events: list[tuple[int, bytes]] = []  # log_time, message
+        self._event_count = 0
+        self._start_utc_ns = 0
+        self._mcap: McapWriter | None = None
+        self._synced_at = time.monotonic()
+        self._dirty = False
+        self._failed = False
+        with self._explained():
+            try:
+                descriptor = os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+            except FileExistsError:
+                raise SessionExistsError(
+                    f"{self.part} exists: another session is being recorded to it or was cut off. "
+                    "Choose another name or move that file away; nothing is overwritten."
+                ) from None
+            self._stream = os.fdopen(descriptor, "wb")
+            # Only now, so that a writer that finishes in between is seen.
+            if os.path.lexists(path):
+                self._stream.close()
+                self.part.unlink()
+                raise SessionExistsError(
+                    f"{path} exists. Choose another name or move that file away; "
+                    "nothing is overwritten."
+                )
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._failed = True
+            raise SessionError(
+                f"{self.part} cannot be written: {error.strerror or error}. Check that the folder "
+                "exists, is writable and has space left."
+            ) from error
+
+    def begin(
+        self,
+        start_utc_ns: int,
+        metadata: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]],
+        attachments: Mapping[str, bytes],
+    ) -> None:
+        """Write what is known before the first tick.
+
+        Parameters
+        ----------
+        start_utc_ns : wall clock at tick 0, ns since the Unix epoch
+        metadata : the record ``session``; ``format_version`` and ``start_utc_ns`` are added
+        segments : name → first tick and end (exclusive): the record ``segments``
+        attachments : file name → contents
+        """
+        if self._mcap is not None:
+            raise RuntimeError("begin() was called twice")
+        self._start_utc_ns = start_utc_ns
+        with self._explained():
+            mcap = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
+            mcap.add_metadata(
+                "session",
+                {
+                    **metadata,
+                    "format_version": FORMAT_VERSION,
+                    "start_utc_ns": str(start_utc_ns),
+                },
+            )
+            mcap.add_metadata(
+                "segments", {name: f"{first},{end}" for name, (first, end) in segments.items()}
+            )
+            for name, data in attachments.items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                mcap.add_attachment(name, media_type, data, start_utc_ns)
+            self._sample_channel = mcap.add_channel(
+                SAMPLE_TOPIC, SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA)
+            )
+            self._control_channel = mcap.add_channel(
+                CONTROL_TOPIC, CONTROL_SCHEMA, schema_data(CONTROL_SCHEMA)
+            )
+            self._event_channel = mcap.add_channel(
+                EVENT_TOPIC, EVENT_SCHEMA, schema_data(EVENT_SCHEMA)
+            )
+            self._mcap = mcap
+            self._sync()
+            _fsync_directory(self.part.parent)
+
+    def write_samples(self, block: Buffer) -> None:
+        """Take n × ``SAMPLE_SIZE`` bytes of packed samples (n may be 0)."""
+        arrived = self._checked(block, SAMPLE_SIZE)
+        chunk_size = CHUNK_SAMPLES * SAMPLE_SIZE
+        with self._explained():
+            while arrived:
+                taken = chunk_size - len(self._samples)
+                self._samples += arrived[:taken]
+                arrived = arrived[taken:]
+                if len(self._samples) == chunk_size:
+                    self._write_chunk(everything=False)
+            self._sync_when_due()
+
+    def write_controls(self, block: Buffer) -> None:
+        """Take n × ``CONTROL_SIZE`` bytes of packed control messages (n may be 0).
+
+        They share a chunk with the samples of the same time if they are written before these.
+        """
+        self._controls += self._checked(block, CONTROL_SIZE)
+        with self._explained():
+            self._sync_when_due()
+
+    def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
+        """Record an event for whoever reads the file.
+
+        It is written with the chunk in progress; an error or a fatal one at once, together with
+        what that chunk has so far.
+
+        Parameters
+        ----------
+        t_ns : ns since the session start
+        level : "debug", "info", "warning", "error" or "fatal"
+        message : text for the operator
+        name : process or part that speaks
+        """
+        self._begun()
+        log_time = self._start_utc_ns + t_ns
+        seconds, nanos = divmod(log_time, 10**9)
+        event = event_class()(
+            timestamp={"seconds": seconds, "nanos": nanos},
+            level=EVENT_LEVELS.index(level),
+            message=message,
+            name=name,
+        )
+        self._events.append((log_time, event.SerializeToString()))
+        if level in _URGENT:
+            with self._explained():
+                self._write_chunk(everything=True)
+
+    def close(self, outcome: Mapping[str, str]) -> Path:
+        """Write the record ``outcome``, complete the file and give it its final name.
+
+        Returns
+        -------
+        The final name.
+
+        Raises
+        ------
+        SessionExistsError
+            If a file of that name has appeared meanwhile; the session then is complete under the
+            name with ``.part``.
+        """
+        mcap = self._begun()
+        with self._explained():
+            self._write_chunk(everything=True)
+            mcap.add_metadata("outcome", outcome)
+            mcap.finish()
+            self._sync()
+            self._stream.close()
+            try:
+                _rename_new(self.part, self.path)
+            except FileExistsError:
+                raise SessionExistsError(
+                    f"{self.path} has appeared while the session was recorded and is not "
+                    f"overwritten; the complete session is {self.part}, to be renamed."
+                ) from None
+            _fsync_directory(self.path.parent)
+        return self.path
+
+    def abandon(self) -> None:
+        """Write what has arrived and leave the ``.part`` as it is, without an end."""
+        try:
+            if not self._failed:
+                with self._explained():
+                    if self._mcap is not None:
+                        self._write_chunk(everything=True)
+                    self._sync()
+        finally:
+            with contextlib.suppress(OSError):  # the failure to write was reported already
+                self._stream.close()
+
+    def discard(self) -> None:
+        """Remove the ``.part`` of a session that was never begun."""
+        if self._mcap is not None:
+            raise RuntimeError("a session that was begun is kept")
+        self._stream.close()
+        with self._explained():
+            self.part.unlink()
+
+    def _begun(self) -> McapWriter:
+        if self._mcap is None:
+            raise RuntimeError("begin() comes first")
+        if self._failed:
+            # Part of a record may have gone to the file: behind it nothing could be read.
+            raise SessionError(f"{self.part}: writing failed before, the recording ends there.")
+        return self._mcap
+
+    def _checked(self, block: Buffer, size: int) -> memoryview:
+        self._begun()
+        view = memoryview(block).cast("B")
+        if len(view) % size:
+            raise ValueError(
+                f"a block of {len(view)} bytes is not a whole number of {size}-byte messages"
+            )
+        return view
+
+    def _write_chunk(self, *, everything: bool) -> None:
+        """Write the messages at hand as a chunk.
+
+        Controls of samples that have not arrived wait for them, unless `everything` is to go.
+        """
+        mcap = self._begun()
+        samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
+        controls = np.frombuffer(self._controls, CONTROL_WIRE_DTYPE)
+        if not everything:
+            until = int(np.searchsorted(controls["t_ns"], samples["t_ns"][-1], side="right"))
+            controls = controls[:until]
+        parts: list[bytes] = []
+        indexes: dict[int, npt.NDArray[np.void]] = {}
+        offset = 0
+        for channel, wire in ((self._sample_channel, samples), (self._control_channel, controls)):
+            if len(wire):
+                records = _fixed_records(wire, channel, self._start_utc_ns)
+                parts.append(records.tobytes())
+                indexes[channel] = _fixed_index(records, offset)
+                offset += records.nbytes
+        if self._events:
+            index = np.empty(len(self._events), INDEX_DTYPE)
+            for i, (log_time, data) in enumerate(self._events):
+                head = np.array(
+                    (
+                        _MESSAGE_OPCODE,
+                        _HEAD_SIZE - _RECORD_HEAD_SIZE + len(data),
+                        self._event_channel,
+                        self._event_count + i,
+                        log_time,
+                        log_time,
+                    ),
+                    _MESSAGE_HEAD,
+                )
+                parts += [head.tobytes(), data]
+                index[i] = (log_time, offset)
+                offset += _HEAD_SIZE + len(data)
+            indexes[self._event_channel] = index
+            self._event_count += len(self._events)
+        if indexes:
+            mcap.add_chunk(b"".join(parts), indexes)
+            self._stream.flush()
+            self._dirty = True
+        self._samples = bytearray()
+        self._controls = self._controls[controls.nbytes :]
+        self._events = []
+
+    def _sync_when_due(self) -> None:
+        if self._dirty and time.monotonic() - self._synced_at >= SYNC_INTERVAL_S:
+            self._sync()
+
+    def _sync(self) -> None:
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._synced_at = time.monotonic()
+        self._dirty = False

@@ -1,0 +1,155 @@
+"""Drive and sensor of the simulated rig: what the plant does, as the devices would show it.
+
+The first device that hears of a new tick moves the plant on to it; periods that the loop missed
+pass with the last torque held, as they do on a real rig.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigd.devices.contracts import DeviceError, Devices, Wrench
+from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
+from rigd.sim.plant import SimulatedPlant
+
+_NOISE_BLOCK = 4096
+
+
+def open_simulated_rig(rig: RigParameters) -> Devices:
+    """Make the devices of a simulated rig; a seed gives the same noise again."""
+    if rig.simulation is None:
+        raise DeviceError(
+            'The profile has no section [simulation], which drive = "sim" needs; copy it from '
+            "hw_profiles/sim.toml."
+        )
+    world = _World(SimulatedPlant(rig), rig.rate_hz)
+    return Devices(
+        drive=SimulatedDrive(world, rig.encoder.resolution_rad),
+        sensor=SimulatedSensor(world, rig.sensor, rig.simulation),
+        simulated=True,
+    )
+
+
+@dataclass(slots=True)
+class _World:
+    """The plant and the time it has reached."""
+
+    plant: SimulatedPlant
+    rate_hz: float
+    tick: int | None = None
+
+    def advance_to(self, t_ns: int) -> None:
+        tick = round(t_ns * self.rate_hz * 1e-9)
+        if self.tick is not None and tick > self.tick:
+            self.plant.advance(tick - self.tick)
+        self.tick = tick
+
+
+class SimulatedDrive:
+    """Torque-controlled drive with an incremental encoder."""
+
+    def __init__(self, world: _World, resolution_rad: float) -> None:
+        self._world = world
+        self._resolution_rad = resolution_rad
+        self.angle_stale = False
+
+    def connect(self) -> None:
+        """Nothing to connect to."""
+
+    def enable(self) -> None:
+        """Let commands through."""
+        self._world.plant.enable()
+
+    def latch(self, t_ns: int) -> None:
+        """Move the plant on to the tick at ``t_ns``."""
+        self._world.advance_to(t_ns)
+
+    def read_angle(self) -> float:
+        """Return the angle in whole encoder steps, in rad."""
+        angle_rad = self._world.plant.sensed_angle_rad
+        step_rad = self._resolution_rad
+        return round(angle_rad / step_rad) * step_rad if step_rad else angle_rad
+
+    def command(self, torque_nm: float) -> None:
+        """Set the torque in N·m; a drive that is not enabled exerts none."""
+        self._world.plant.command(torque_nm)
+
+    def disable(self) -> None:
+        """Zero the torque, and let no command through."""
+        self._world.plant.disable()
+
+    def close(self) -> None:
+        """Disable."""
+        self.disable()
+
+
+class SimulatedSensor:
+    """Six-axis sensor with white noise, offset, limited resolution and range.
+
+    The coupling torque appears as the smallest wrench whose projection it is.
+    """
+
+    def __init__(self, world: _World, sensor: WrenchSensor, simulation: Simulation) -> None:
+        self._world = world
+        self._sensor = sensor
+        self._simulation = simulation
+        projection = np.array(sensor.projection)
+        self._per_torque = (projection / (projection @ projection)).tolist()
+        # Axes that the coupling torque does not reach show noise only, which is drawn, limited
+        # and quantised by the block; the others are finished tick by tick.
+        self._active = [axis for axis in range(6) if self._per_torque[axis] != 0.0]
+        self._rows = self._noise()
+        self.wrench_stale = False
+        self.wrench_saturated = False
+
+    def connect(self) -> None:
+        """Nothing to connect to."""
+
+    def calibration(self) -> dict[str, object]:
+        """Return what a real sensor would say of itself."""
+        return {
+            "device": "simulated force-torque sensor",
+            "axes": ["fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"],
+            "range": list(self._sensor.range),
+            "resolution": list(self._sensor.resolution),
+        }
+
+    def request(self, t_ns: int) -> None:
+        """Move the plant on to the tick at ``t_ns``, if the drive has not done so."""
+        self._world.advance_to(t_ns)
+
+    def read_wrench(self) -> Wrench:
+        """Return the wrench of this tick."""
+        row = next(self._rows)
+        torque_nm = self._world.plant.sensed_torque_nm
+        saturated = False
+        for axis in self._active:
+            value = row[axis] + self._per_torque[axis] * torque_nm
+            limit = self._sensor.range[axis]
+            if not -limit < value < limit:
+                value = limit if value > 0 else -limit
+                saturated = True
+            step = self._sensor.resolution[axis]
+            row[axis] = round(value / step) * step if step else value
+        self.wrench_saturated = saturated
+        fx, fy, fz, tx, ty, tz = row
+        return fx, fy, fz, tx, ty, tz
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _noise(self) -> Iterator[list[float]]:
+        simulation = self._simulation
+        generator = np.random.default_rng(simulation.seed)
+        scale = np.array([simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3)
+        offset = np.array(simulation.offset)
+        limit = np.array(self._sensor.range)
+        step = np.array(self._sensor.resolution)
+        passive = [axis for axis in range(6) if axis not in self._active]
+        quantised = [axis for axis in passive if step[axis] > 0]
+        while True:
+            block = offset + generator.standard_normal((_NOISE_BLOCK, 6)) * scale
+            block[:, passive] = np.clip(block[:, passive], -limit[passive], limit[passive])
+            block[:, quantised] = np.round(block[:, quantised] / step[quantised]) * step[quantised]
+            yield from block.tolist()

@@ -1,0 +1,276 @@
+"""Physics of the simulated rig: motor, clamp and beam between two ticks.
+
+Motor and beam are one linear model, stepped exactly for torques that are constant between the
+instants at which commands arrive. Coulomb friction, saturation and delays stand round it. Nothing
+here quantises or adds noise: that is what the simulated devices do with the values at a tick.
+"""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import CoupledModel, couple, propagator, realise
+from rigd.devices.parameters import RigParameters
+
+Real = NDArray[np.float64]
+
+_OUTPUTS = 6
+"""Rows of a step beyond the state: angle, velocity, sensor torque, the same if the shaft did not
+accelerate, sensed angle, sensed torque."""
+
+_SAME_INSTANT_PERIODS = 1e-9
+
+
+class SimulatedPlant:
+    """The rig that `parameters` describes, at rest at angle zero, drive off.
+
+    At tick k the caller reads the attributes, gives the torque of that tick to `command`, and calls
+    `advance` to be at the next tick.
+
+    Parameters
+    ----------
+    parameters
+        Of the rig. Delays may be any non-negative times, fractions of a period included.
+
+    Attributes
+    ----------
+    angle_rad, velocity_rad_s : float
+        Of the output shaft at this instant.
+    coupling_torque_nm : float
+        What an ideal sensor between motor and clamp measures at this instant, ``Γ + J_tool θ''``.
+        It jumps with the motor's torque. At a jump the mean of both sides is given, which is where
+        a band-limited signal passes, if the torque after it is known by now (an actuation delay of
+        at least one period); else the value just before it.
+    sensed_angle_rad, sensed_torque_nm : float
+        The same angle and torque `encoder.delay_s` and `sensor.delay_s` ago: what the devices have
+        to show at this tick.
+    enabled : bool
+        Whether the drive is on.
+
+    Raises
+    ------
+    RealisationError
+        If the beam's damping cannot be realised.
+
+    Notes
+    -----
+    Coulomb friction is constant over a period and implicit: the torque, of at most T_c, that takes
+    the shaft's speed at the period's end nearest to zero. A shaft so brought to rest is locked, and
+    the beam vibrates on a fixed root, until at the start of a period the torques on it exceed T_c.
+    """
+
+    __slots__ = (
+        "_coulomb_nm",
+        "_free",
+        "_friction_effects",
+        "_friction_nm",
+        "_holding_beam_nm",
+        "_jump_gain",
+        "_locked",
+        "_peak_nm",
+        "_sensed_angles",
+        "_sensed_jump_gain",
+        "_sensed_torques",
+        "_share_before_switch",
+        "_states",
+        "_stuck",
+        "_torque_nm",
+        "_torques",
+        "_vectors",
+        "angle_rad",
+        "coupling_torque_nm",
+        "enabled",
+        "sensed_angle_rad",
+        "sensed_torque_nm",
+        "velocity_rad_s",
+    )
+
+    def __init__(self, parameters: RigParameters) -> None:
+        period = 1 / parameters.rate_hz
+        periods, switch = _split(parameters.actuation.delay_s, period)
+        angle_periods, angle_age = _split(parameters.encoder.delay_s, period)
+        torque_periods, torque_age = _split(parameters.sensor.delay_s, period)
+        instants = (switch, period - angle_age, period - torque_age)
+
+        beam = realise(parameters.beam, parameters.damping)
+        tool_inertia = parameters.sensor.tool_inertia_kg_m2
+        free = couple(
+            beam,
+            motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
+            viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
+            tool_inertia_kg_m2=tool_inertia,
+        )
+        # No torque turns an infinite inertia: the beam on a locked shaft.
+        locked = couple(beam, motor_inertia_kg_m2=np.inf, tool_inertia_kg_m2=tool_inertia)
+        n = free.b.size
+        step = _step(free, locked.sensor_torque, period, *instants)
+        locked_step = _step(locked, locked.sensor_torque, period, *instants)
+        locked_step[:, 1] = 0.0  # what rounding has left of the speed moves nothing
+
+        # A period's friction is known only after its step, from the speed reached without it. The
+        # outputs are then corrected at once, the state by a last column of the next step.
+        friction = -(step[:, n] + step[:, n + 1])
+        self._friction_effects: list[float] = friction[n:].tolist()
+        self._free = np.column_stack([step, step[:, :n] @ friction[:n]])
+        self._locked = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
+
+        # Two vectors, in turn the input [state, torque before and after the switch, friction] and
+        # the output [state, outputs] of a step; each with the views a step needs.
+        here, there = np.zeros((2, n + _OUTPUTS))
+        self._vectors = (here, here[: n + 3], here[n:]), (there, there[: n + 3], there[n:])
+        self._states = n
+
+        self._coulomb_nm = parameters.motor.coulomb_nm
+        self._peak_nm = parameters.motor.peak_torque_nm
+        self._friction_nm = 0.0
+        self._stuck = self._coulomb_nm > 0
+        self._holding_beam_nm = 0.0
+        self._share_before_switch = switch / period
+        next_is_known = switch == 0 and periods > 0
+        self._jump_gain = 0.5 * free.sensor_torque_per_torque if next_is_known else 0.0
+        self._sensed_jump_gain = self._jump_gain if torque_age == 0 else 0.0
+
+        self._torque_nm = 0.0
+        self._torques = deque([0.0] * (periods + 2), maxlen=periods + 2)
+        self._sensed_angles = deque([0.0] * (angle_periods + 1), maxlen=angle_periods + 1)
+        self._sensed_torques = deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
+        self.enabled = False
+        self.angle_rad = 0.0
+        self.velocity_rad_s = 0.0
+        self.coupling_torque_nm = 0.0
+        self.sensed_angle_rad = 0.0
+        self.sensed_torque_nm = 0.0
+
+    def enable(self) -> None:
+        """Switch the drive on; its torque is zero until the next command takes effect."""
+        self.enabled = True
+
+    def disable(self) -> None:
+        """Switch the drive off: no torque from this instant, commands on their way included."""
+        self.enabled = False
+        self._torque_nm = 0.0
+        self._torques.extend([0.0] * len(self._torques))
+
+    def command(self, torque_nm: float) -> None:
+        """Torque to exert from this tick on, after the actuation delay; limited to the peak.
+
+        Without effect while the drive is off.
+        """
+        if self.enabled:
+            self._torque_nm = min(max(torque_nm, -self._peak_nm), self._peak_nm)
+
+    def advance(self, n_periods: int = 1) -> None:
+        """Go to the tick `n_periods` from here, with the last command repeated at those between."""
+        n = self._states
+        torques = self._torques
+        for _ in range(n_periods):
+            torques.append(self._torque_nm)
+            before, after = torques[0], torques[1]
+            (vector, input_, _), (output, _, results) = self._vectors
+            vector[n] = before
+            vector[n + 1] = after
+            vector[n + 2] = self._friction_nm
+            self._vectors = self._vectors[1], self._vectors[0]
+
+            share = self._share_before_switch
+            load = share * before + (1 - share) * after - self._holding_beam_nm
+            if self._stuck and abs(load) <= self._coulomb_nm:
+                np.dot(self._locked, input_, out=output)
+                angle, _, torque, holding, sensed_angle, sensed_torque = results.tolist()
+                self._friction_nm = velocity = 0.0
+            else:
+                np.dot(self._free, input_, out=output)
+                angle, velocity, torque, holding, sensed_angle, sensed_torque = results.tolist()
+                if self._jump_gain:
+                    jump = torques[2] - after
+                    torque += self._jump_gain * jump
+                    sensed_torque += self._sensed_jump_gain * jump
+                if self._coulomb_nm:
+                    effects = self._friction_effects
+                    friction = -velocity / effects[1]
+                    self._stuck = abs(friction) <= self._coulomb_nm
+                    if self._stuck:
+                        velocity = 0.0
+                    else:
+                        friction = self._coulomb_nm if friction > 0 else -self._coulomb_nm
+                        velocity += effects[1] * friction
+                    self._friction_nm = friction
+                    angle += effects[0] * friction
+                    torque += effects[2] * friction
+                    holding += effects[3] * friction
+                    sensed_angle += effects[4] * friction
+                    sensed_torque += effects[5] * friction
+            self._holding_beam_nm = holding
+            self._sensed_angles.append(sensed_angle)
+            self._sensed_torques.append(sensed_torque)
+        if n_periods > 0:
+            self.angle_rad = angle
+            self.velocity_rad_s = velocity
+            self.coupling_torque_nm = torque
+            self.sensed_angle_rad = self._sensed_angles[0]
+            self.sensed_torque_nm = self._sensed_torques[0]
+
+
+def _split(delay_s: float, period_s: float) -> tuple[int, float]:
+    """Whole periods in a delay, and what is left of it in seconds."""
+    periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
+    rest = delay_s - periods * period_s
+    return periods, rest if rest > _SAME_INSTANT_PERIODS * period_s else 0.0
+
+
+def _step(
+    model: CoupledModel,
+    holding_torque: Real,
+    period_s: float,
+    switch_s: float,
+    angle_instant_s: float,
+    torque_instant_s: float,
+) -> Real:
+    """One period: from [state, torque before and after the switch] to [next state, outputs].
+
+    Parameters
+    ----------
+    model
+        Motor and beam.
+    holding_torque
+        (n,) row: sensor torque on a shaft that does not accelerate.
+    period_s
+        Length of the step.
+    switch_s
+        When the motor's torque changes, from the step's start.
+    angle_instant_s, torque_instant_s
+        Of which instants the sensed values are, from the step's start.
+
+    Returns
+    -------
+    (n + 6, n + 2)
+    """
+
+    def state_at(instant_s: float) -> Real:
+        phi, whole = propagator(model, instant_s)
+        after = propagator(model, max(instant_s - switch_s, 0.0))[1]
+        return np.column_stack([phi, whole - after, after])
+
+    def torque_at(instant_s: float) -> Real:
+        row = model.sensor_torque @ state_at(instant_s)
+        apart_s = instant_s - switch_s
+        if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
+            share_after = 0.5
+        else:
+            share_after = 1.0 if apart_s > 0 else 0.0
+        row[-2:] += model.sensor_torque_per_torque * np.array([1 - share_after, share_after])
+        return row
+
+    end = state_at(period_s)
+    return np.vstack(
+        [
+            end,
+            model.angle @ end,
+            model.velocity @ end,
+            torque_at(period_s),
+            holding_torque @ end,
+            model.angle @ state_at(angle_instant_s),
+            torque_at(torque_instant_s),
+        ]
+    )

@@ -1,0 +1,100 @@
+"""The descent: known minima, bounds, and scipy's answer on the same problems."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from analysis.levenberg_marquardt import NormalEquations, minimise
+
+T = np.linspace(0.0, 4.0, 200)
+
+
+def equations(residual, jacobian):
+    r, j = residual, jacobian
+    return NormalEquations(float(np.vdot(r, r).real), (j.conj() @ r).real, (j.conj() @ j.T).real)
+
+
+def decay(x):
+    """A damped rotation exp(-(a + j b) t) and its derivatives."""
+    model = np.exp(-(x[0] + 1j * x[1]) * T)
+    return model, np.array([-T * model, -1j * T * model])
+
+
+def decay_problem(measured):
+    def problem(x):
+        model, jacobian = decay(x)
+        return equations(model - measured, jacobian)
+
+    return problem
+
+
+FREE = (np.array([-50.0, -50.0]), np.array([50.0, 50.0]))
+
+
+def test_finds_what_made_the_data():
+    measured = decay([0.7, 2.0])[0]
+    found = minimise(decay_problem(measured), np.array([0.3, 1.5]), *FREE, relative_tolerance=1e-12)
+    np.testing.assert_allclose(found.x, [0.7, 2.0], rtol=1e-9)
+    assert found.cost < 1e-18
+
+
+@pytest.mark.parametrize("seed", [3, 44, 505, 6066])
+def test_agrees_with_scipy_with_residuals_left(seed):
+    rng = np.random.default_rng(seed)
+    measured = decay([0.7, 2.0])[0] + 0.3 * (rng.normal(size=200) + 1j * rng.normal(size=200))
+    found = minimise(decay_problem(measured), np.array([0.5, 1.8]), *FREE, relative_tolerance=1e-14)
+
+    def stacked(x):
+        r = decay(x)[0] - measured
+        return np.concatenate((r.real, r.imag))
+
+    peer = least_squares(stacked, [0.5, 1.8], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(found.x, peer.x, rtol=1e-5)
+    assert found.cost == pytest.approx(2 * peer.cost, rel=1e-10)
+
+
+def rosenbrock(x):
+    return equations(
+        np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
+        np.array([[-20 * x[0], -1.0], [10.0, 0.0]]),
+    )
+
+
+def test_follows_a_curved_valley():
+    found = minimise(rosenbrock, np.array([-1.2, 1.0]), *FREE, relative_tolerance=1e-14)
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-8)
+
+
+def test_rests_on_a_bound_and_moves_along_it():
+    low, high = np.array([-2.0, -2.0]), np.array([0.5, 2.0])
+    found = minimise(rosenbrock, np.array([-1.2, 1.0]), low, high, relative_tolerance=1e-14)
+    np.testing.assert_allclose(found.x, [0.5, 0.25], atol=1e-8)
+    assert found.x[0] == high[0]
+
+
+def test_start_outside_is_brought_inside():
+    low, high = np.array([0.0, 0.0]), np.array([3.0, 3.0])
+    found = minimise(rosenbrock, np.array([9.0, -9.0]), low, high, relative_tolerance=1e-14)
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-7)
+
+
+def test_unknown_without_effect_stays():
+    def problem(x):
+        return equations(np.array([x[0] - 3.0]), np.array([[1.0], [0.0]]))
+
+    found = minimise(problem, np.array([0.0, 1.25]), *FREE, relative_tolerance=1e-12)
+    np.testing.assert_allclose(found.x, [3.0, 1.25], rtol=1e-12)
+
+
+def test_never_climbs_and_stops_when_told():
+    costs = []
+
+    def problem(x):
+        costs.append(rosenbrock(x).cost)
+        return rosenbrock(x)
+
+    found = minimise(
+        problem, np.array([-1.2, 1.0]), *FREE, relative_tolerance=1e-14, max_evaluations=7
+    )
+    assert found.evaluations == len(costs) == 7
+    assert found.cost == min(costs)

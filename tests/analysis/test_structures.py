@@ -1,0 +1,38 @@
+"""The structures are the paper's Table 2."""
+
+import pytest
+
+from analysis.structures import PARAMETERS, STRUCTURES
+from rigd.beam import Damping
+
+TABLE_2 = {
+    "I": {"alpha": 1, "lambda": 0, "gamma": 0},
+    "II": {"alpha": 0, "zeta": 0, "lambda": 1},
+    "III": {"alpha": 1, "lambda": 1},
+    "IV": {"lambda": 0, "gamma": 0},
+    "V": {"alpha": 0, "zeta": 0},
+    "VI": {},
+    "VII": {"alpha": 1},
+}
+
+
+def test_every_type_is_there_in_order():
+    assert list(STRUCTURES) == list(TABLE_2)
+
+
+@pytest.mark.parametrize("name", TABLE_2)
+def test_fixed_and_free(name):
+    structure = STRUCTURES[name]
+    assert structure.name == name
+    assert dict(structure.fixed) == TABLE_2[name]
+    assert structure.free == tuple(p for p in PARAMETERS if p not in TABLE_2[name])
+    assert structure.internal == (name not in ("II", "V"))
+    assert structure.external == (name not in ("I", "IV"))
+
+
+def test_damping_takes_free_values_and_ignores_those_of_fixed_ones():
+    values = {"zeta": 2e-4, "alpha": 0.7, "gamma": 0.3, "lambda": 1.2}
+    assert STRUCTURES["VI"].damping(values) == Damping(2e-4, 0.7, 0.3, 1.2)
+    assert STRUCTURES["VII"].damping(values) == Damping(2e-4, 1.0, 0.3, 1.2)
+    assert STRUCTURES["V"].damping(values) == Damping(0.0, 0.0, 0.3, 1.2)
+    assert STRUCTURES["I"].damping({"zeta": 1e-5}) == Damping(1e-5, 1.0, 0.0, 0.0)

@@ -1,0 +1,41 @@
+"""Thinned points stand for all of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analysis.model import FrequencyResponseModel
+from analysis.thinning import thinned
+from analysis.weights import weights
+
+
+@given(n=st.integers(3, 900), count=st.integers(2, 900), seed=st.integers(0, 2**32 - 1))
+def test_weights_are_shared_out(n, count, seed):
+    rng = np.random.default_rng(seed)
+    measured = rng.normal(size=n) + 1j * rng.normal(size=n)
+    every = rng.random(n)
+    every /= every.sum()
+    index, share = thinned(measured, every, count)
+    assert index.size == share.size <= max(count, 1)
+    assert (np.diff(index) > 0).all()
+    assert share.sum() == pytest.approx(1.0)
+    assert (share > 0).all()
+    if count >= n:
+        np.testing.assert_array_equal(index, np.arange(n))
+
+
+def test_flat_zero_response_is_thinned_evenly():
+    index, _ = thinned(np.zeros(1000, dtype=complex), np.full(1000, 1e-3), 100)
+    assert np.diff(index).max() <= 11
+
+
+@pytest.mark.parametrize("weighting", ["const", "omega"])
+def test_costs_of_models_are_kept(noisy_frf, link, paper_dampings, weighting):
+    """Within 5 % of the whole cost, for all models that the paper fitted."""
+    every = weights(2 * np.pi * noisy_frf.frequency_hz, weighting)
+    index, share = thinned(noisy_frf.response, every, 800)
+    model = FrequencyResponseModel(noisy_frf.frequency_hz, link)
+    for damping in paper_dampings.values():
+        square = np.abs(model.evaluate(damping) - noisy_frf.response) ** 2
+        assert share @ square[index] == pytest.approx(every @ square, rel=0.05)

@@ -1,0 +1,84 @@
+"""Weights: Eq. (27), and Appendix A's general form."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analysis.weights import WeightingError, weighting_name, weights
+
+OMEGA = 2 * np.pi * np.arange(94, 8001) / 160
+
+
+def test_the_two_of_equation_27():
+    np.testing.assert_array_equal(weights(OMEGA, "const"), np.full(7907, 1 / 7907))
+    np.testing.assert_allclose(weights(OMEGA, "omega"), 1 / OMEGA / np.sum(1 / OMEGA), rtol=1e-12)
+
+
+def test_omega_weights_are_a_mean_over_a_logarithmic_axis():
+    """Appendix A derives them from the integral of e(omega) over d log10 omega."""
+    e = np.sin(np.log(OMEGA)) ** 2
+    x = np.log10(OMEGA)
+    mean = np.trapezoid(e, x) / (x[-1] - x[0])
+    assert weights(OMEGA, "omega") @ e == pytest.approx(mean, rel=1e-3)
+
+
+@given(power=st.floats(-100, 100))
+def test_any_power(power):
+    w = weights(OMEGA, f"omega^{power!r}")
+    assert w.sum() == pytest.approx(1.0)
+    assert (w >= 0).all()
+    # The ratio of neighbours in the middle of the band tells the power, whatever the size.
+    ratio = np.log(w[4001] / w[4000]) / np.log(OMEGA[4001] / OMEGA[4000])
+    assert ratio == pytest.approx(power, rel=1e-6, abs=1e-6)
+
+
+def test_omega_is_the_power_minus_one():
+    np.testing.assert_array_equal(weights(OMEGA, "omega"), weights(OMEGA, "omega^-1"))
+
+
+def test_a_function_of_the_users():
+    def near_the_second_mode(omega):
+        return np.exp(-(((omega - 100.0) / 20.0) ** 2))
+
+    w = weights(OMEGA, near_the_second_mode)
+    assert w.sum() == pytest.approx(1.0)
+    assert OMEGA[np.argmax(w)] == pytest.approx(100.0, abs=0.04)
+    np.testing.assert_allclose(w, weights(OMEGA, lambda o: 7.5 * near_the_second_mode(o)))
+    assert weighting_name(near_the_second_mode) == "near_the_second_mode"
+
+
+@pytest.mark.parametrize(
+    "name", ["", "const2", "omega^", "omega^x", "omega^nan", "omega^inf", "w^2"]
+)
+def test_names_that_do_not_exist(name):
+    with pytest.raises(WeightingError, match=r"no weighting .*const, omega"):
+        weights(OMEGA, name)
+    with pytest.raises(WeightingError):
+        weighting_name(name)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda omega: -np.ones_like(omega),
+        np.zeros_like,
+        lambda omega: np.full_like(omega, np.nan),
+        lambda omega: np.where(omega < 100, -1.0, 5.0),
+    ],
+)
+def test_functions_that_weigh_nothing_or_less(function):
+    with pytest.raises(WeightingError, match="not negative"):
+        weights(OMEGA, function)
+
+
+def test_function_of_the_wrong_shape():
+    with pytest.raises(WeightingError, match="shape"):
+        weights(OMEGA, lambda _omega: np.array(1.0))
+
+
+@pytest.mark.parametrize("power", ["1e6", "-1e6", "350", "-350"])
+def test_power_beyond_all_measure_weighs_the_end_of_the_band(power):
+    w = weights(OMEGA, f"omega^{power}")
+    assert w.sum() == pytest.approx(1.0)
+    assert np.argmax(w) == (0 if power.startswith("-") else OMEGA.size - 1)

@@ -1,0 +1,47 @@
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rigd.beam import Damping
+from rigd.control import LoopModel
+from rigd.profile import Profile, load_profile
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="session")
+def profile() -> Profile:
+    return load_profile("sim")
+
+
+@pytest.fixture(scope="session")
+def loop_model(profile: Profile) -> LoopModel:
+    return profile.loop_model()
+
+
+@pytest.fixture(scope="session")
+def motor_alone(loop_model: LoopModel) -> LoopModel:
+    return replace(loop_model, beam=None, actuation_delay_s=0.0)
+
+
+def table3() -> dict[str, Damping]:
+    """Mean parameters of the paper's Table 3: "VI-omega" → damping."""
+    means: dict[str, dict[str, float]] = {}
+    with (ROOT / "tests/data/paper_table3.csv").open() as file:
+        for row in csv.DictReader(file):
+            name = row["parameter"].replace("lambda", "lambda_")
+            means.setdefault(f"{row['type']}-{row['weighting']}", {})[name] = float(row["mean"])
+    return {name: Damping(**values) for name, values in means.items()}
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "paper_damping" in metafunc.fixturenames:
+        sets = table3()
+        metafunc.parametrize("paper_damping", sets.values(), ids=list(sets))
+
+
+@pytest.fixture
+def sim_toml() -> str:
+    return (ROOT / "hw_profiles/sim.toml").read_text(encoding="utf-8")

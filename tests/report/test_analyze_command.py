@@ -1,0 +1,260 @@
+"""The command as users and scripts meet it: a process with files, streams and an exit code."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+QUICK = ("--types", "I", "--weights", "const")
+
+
+def run(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "analysis.cli", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
+def refused(result, code, *words):
+    """Check a user's error: its code, its message of one or two sentences, nothing else."""
+    assert result.returncode == code, result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    for word in words:
+        assert word in result.stderr, result.stderr
+    errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(errors) == 1, result.stderr
+    return errors[0]
+
+
+@pytest.fixture
+def session(paper_file, tmp_path):
+    return shutil.copy(paper_file, tmp_path / "session.mcap")
+
+
+def test_one_session_from_end_to_end(session, tmp_path):
+    result = run(session.name, "--json", "fits.json", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    report = tmp_path / "session.report"
+    assert sorted(path.name for path in report.iterdir()) == [
+        "analysis.json", "frf.png", "signals.png", "tables.txt", "torque.png",
+    ]  # fmt: skip
+    for name in ("frf", "signals", "torque"):
+        assert np.asarray(Image.open(report / f"{name}.png").convert("L")).std() > 10
+    content = json.loads((tmp_path / "fits.json").read_text())
+    assert content == json.loads((report / "analysis.json").read_text())
+    assert len(content["fits"]) == 12
+    best = min(content["fits"], key=lambda fit: fit["indices"]["wmse"])
+    assert (best["type"], best["weighting"]) == ("VI", "omega")
+    for word in ("fits", "resonant peaks", "modes", "session.report", "fits.json"):
+        assert word in result.stdout
+    assert (report / "tables.txt").read_text().splitlines()[0] in result.stdout
+
+
+def test_a_second_report_gets_a_number_and_leaves_the_first(session, tmp_path):
+    first = tmp_path / "session.report"
+    first.mkdir()
+    (first / "frf.png").write_text("mine")
+    result = run(session.name, *QUICK, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (first / "frf.png").read_text() == "mine"
+    assert (tmp_path / "session.report-2" / "frf.png").stat().st_size > 10_000
+
+
+def test_json_on_standard_output_is_alone_there(session, tmp_path):
+    result = run(
+        session.name, "--json", "-", "--types", "vi,III", "--weights", "omega,omega^-0.5",
+        "--frf", "hv", "--band", "1,49", "--report", "out", "--method", "welch", cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    content = json.loads(result.stdout)
+    names = [(fit["type"], fit["weighting"], fit["frf"]) for fit in content["fits"]]
+    assert names == [
+        (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
+    ]  # fmt: skip
+    assert "resonant peaks" in result.stderr
+    assert (tmp_path / "out" / "signals.png").exists()
+
+
+def test_several_files_with_one_that_fails(session, write_session, paper_signals, tmp_path):
+    noisy = replace(paper_signals, torque_nm=1.1 * paper_signals.torque_nm)
+    write_session(tmp_path / "other.mcap", noisy)
+    result = run(
+        "session.mcap", "missing.mcap", "other.mcap", "--report", "out", "--json", "all.json",
+        *QUICK, cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert "missing.mcap" in result.stderr
+    content = json.loads((tmp_path / "all.json").read_text())
+    assert [fit["file"] for fit in content["fits"]] == ["session.mcap", "other.mcap"]
+    assert [error["file"] for error in content["errors"]] == ["missing.mcap"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["other", "session"]
+    assert "over 2 files" in result.stdout
+
+
+def test_a_file_with_only_what_is_required(write_session, paper_signals, tmp_path):
+    """No segments, delays, tool, outcome or excitation: rate and beam are all a reader needs."""
+    write_session(
+        tmp_path / "a.mcap", paper_signals, segments={},
+        metadata={"excitation": "", "start_hz": "", "stop_hz": ""},
+    )  # fmt: skip
+    result = run("a.mcap", *QUICK, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+
+
+def broken_file(kind, path, good):
+    data = good.read_bytes()
+    if kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "no container":
+        path.write_bytes(b"time,angle\n0,1\n" * 100)
+    elif kind == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    elif kind == "magic only":
+        path.write_bytes(data[:8])
+    elif kind == "foreign":
+        from mcap.writer import Writer
+
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            schema = writer.register_schema("x", "jsonschema", b"{}")
+            channel = writer.register_channel("/other", "json", schema)
+            writer.add_message(channel, 0, b"{}", 0)
+            writer.finish()
+    elif kind == "a folder":
+        path.mkdir()
+
+
+@pytest.mark.parametrize(
+    "kind", ["missing", "empty", "no container", "truncated", "magic only", "foreign", "a folder"]
+)
+def test_a_file_that_is_no_session_is_refused(paper_file, tmp_path, kind):
+    path = tmp_path / "bad.mcap"
+    broken_file(kind, path, paper_file)
+    before = sorted(tmp_path.iterdir())
+    result = run("bad.mcap", "--json", "fits.json", cwd=tmp_path)
+    refused(result, 1, "bad.mcap")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_session_too_short_for_the_segments_says_what_fits(
+    write_session, short_signals, tmp_path
+):
+    write_session(tmp_path / "a.mcap", short_signals)
+    message = refused(run("a.mcap", cwd=tmp_path), 1, "4000 samples", "17266")
+    words = message.replace(",", "").split()
+    options = [words[words.index(o) + i] for o in ("--segment", "--overlap") for i in (0, 1)]
+    result = run("a.mcap", *options, *QUICK, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("field", ["angle_rad", "torque_nm"])
+def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, field):
+    values = getattr(short_signals, field).copy()
+    values[77] = np.nan
+    write_session(tmp_path / "a.mcap", replace(short_signals, **{field: values}))
+    refused(run("a.mcap", cwd=tmp_path), 1, "a.mcap", field, "tick 77")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--types", "VIII"), ("VIII", "I, II, III, IV, V, VI, VII")),
+        (("--types", ","), ("--types", "I, II, III")),
+        (("--weights", "log"), ("log", "const, omega")),
+        (("--weights", "omega^nan"), ("omega^nan", "omega^K")),
+        (("--weights", "omega^1e308"), ("omega^1e308",)),
+        (("--method", "record"), ("record", "welch", "all")),
+        (("--frf", "h3"), ("h3", "h1", "fft")),
+        (("--band", "nan,50"), ("--band", "nan,50")),
+        (("--band", "50,1"), ("--band", "0 < F0 < F1")),
+        (("--band", "-1,50"), ("--band",)),
+        (("--band", "1,inf"), ("--band",)),
+        (("--band", "1"), ("--band",)),
+        (("--band", "1,2,3"), ("--band",)),
+        (("--band", "1,5000"), ("500 Hz",)),
+        (("--band", "1.0001,1.0002"), ("1.0001",)),
+        (("--segment", "0"), ("--segment",)),
+        (("--segment", "1e3"), ("--segment",)),
+        (("--overlap", "-1"), ("--overlap",)),
+        (("--segment", "100", "--overlap", "100"), ("--overlap", "100")),
+        (("--overlap", "20000"), ("--overlap", "17266")),
+        (("--nfft", "999999999999"), ("--nfft",)),
+        (("--segment", "1000", "--nfft", "999"), ("--nfft", "1000")),
+        (("--nfft", "100"), ("--nfft", "17266")),
+        (("--colour", "blue"), ("--colour",)),
+    ],
+)
+def test_wrong_options_are_refused(session, tmp_path, options, words):
+    before = sorted(tmp_path.iterdir())
+    refused(run("session.mcap", *options, cwd=tmp_path), 2, *words)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_no_file_is_wrong_use(tmp_path):
+    refused(run(cwd=tmp_path), 2, "FILE")
+
+
+def test_nothing_that_exists_is_overwritten(session, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "frf.png").write_text("mine")
+    (tmp_path / "fits.json").write_text("mine")
+    refused(run(session.name, "--report", "out", cwd=tmp_path), 2, "--report out")
+    refused(run(session.name, "--json", "fits.json", cwd=tmp_path), 2, "--json fits.json")
+    assert (tmp_path / "out" / "frf.png").read_text() == "mine"
+    assert (tmp_path / "fits.json").read_text() == "mine"
+    assert not (tmp_path / "session.report").exists()
+
+
+def test_a_report_that_cannot_be_written_is_refused(session, tmp_path):
+    (tmp_path / "file").write_text("")
+    refused(run(session.name, *QUICK, "--report", "file/out", cwd=tmp_path), 1, "file/out")
+
+
+def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "analysis.cli", *([session.name] * 40), "--report", "out"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    out = tmp_path / "out"
+    deadline = time.monotonic() + 30
+    while not (out.exists() and any(out.iterdir())) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130, stderr
+    assert "Traceback" not in stderr
+    assert "Stopped" in stderr
+    assert stdout == ""
+    for folder in out.iterdir():
+        assert not folder.name.startswith("."), "a half-written report was left"
+        assert len(list(folder.iterdir())) == 5
+
+
+def test_help_has_an_example_and_the_choices(tmp_path):
+    result = run("--help", cwd=tmp_path)
+    assert result.returncode == 0
+    for word in ("Example: analyze session.mcap", "--types", "h2", "Exit code"):
+        assert word in result.stdout
+
+
+def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
+    code = (
+        "import sys, analysis.cli; "
+        "print([m for m in ('numpy', 'scipy', 'matplotlib', 'rich', 'mcap') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,134 @@
+"""Each figure as pixels: it is there, filled, in the colours that carry its meaning."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from analysis.record import load_record
+from analysis.report import style
+from analysis.report.frf_figure import frf_figure
+from analysis.report.signals_figure import signals_figure
+from analysis.report.torque_figure import best_model, torque_figure
+from analysis.welch_route import WelchSettings, analyse
+
+
+def pixels(figure, path):
+    style.save(figure, path)
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def count(image, colour):
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+    return int((np.abs(image - wanted).max(axis=2) <= 12).sum())
+
+
+@pytest.mark.parametrize(
+    ("draw", "colours"),
+    [
+        (signals_figure, (style.ORANGE, style.BLUE, style.GREEN)),
+        (frf_figure, (style.BLUE, style.VERMILION, style.GREY)),
+        (torque_figure, (style.BLUE, style.VERMILION, style.GREY)),
+    ],
+)
+def test_a_figure_shows_its_lines(paper_analysis, tmp_path, draw, colours):
+    with style.styled():
+        image = pixels(draw(paper_analysis), tmp_path / "a.png")
+    height, width, _ = image.shape
+    assert 1000 <= width <= 3000
+    assert 600 <= height <= 2500
+    for colour in colours:
+        assert count(image, colour) > 1500, colour
+    ink = (image.min(axis=2) < 250).mean()
+    assert 0.02 < ink < 0.5
+    # Nothing is drawn over the edge.
+    assert image[[0, -1]].min() == 255
+    assert image[:, [0, -1]].min() == 255
+
+
+def test_colours_tell_what_they_show(paper_analysis, tmp_path):
+    """Without the fits with omega weights, no dashed line of their colour is left."""
+    fits = tuple(m for m in paper_analysis.models if m.fit.weighting == "const")
+    alone = replace(
+        paper_analysis,
+        models=fits,
+        settings=replace(paper_analysis.settings, weightings=("const",)),
+    )
+    with style.styled():
+        image = pixels(frf_figure(alone), tmp_path / "a.png")
+    assert count(image, style.BLUE) > 1500
+    assert count(image, style.VERMILION) == 0
+
+
+def test_one_panel_a_type(paper_analysis):
+    with style.styled():
+        figure = frf_figure(paper_analysis)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert [t.split()[1] for t in titles if t.startswith("Type")] == ["I", "III", "VI"]
+    assert titles[-1] == "Coherence"
+    lines = figure.axes[0].get_lines()
+    assert [len(line.get_xdata()) > 100 for line in lines[:4]] == [True] * 4
+
+
+@pytest.mark.parametrize(
+    ("types", "weightings", "estimator"),
+    [
+        (("VI",), ("omega^-2",), "h1"),
+        (("I", "II", "III", "IV", "V", "VI", "VII"), ("const", "omega", "omega^0.5"), "hv"),
+        (("I", "III"), ("const",), "fft"),
+    ],
+)
+def test_any_choice_of_types_and_weightings_can_be_drawn(
+    paper_file, tmp_path, types, weightings, estimator
+):
+    settings = WelchSettings(estimator=estimator, types=types, weightings=weightings)
+    with style.styled():
+        figure = frf_figure(analyse(load_record(paper_file), settings))
+    assert pixels(figure, tmp_path / "a.png").std() > 10
+    assert len(figure.legends[0].get_texts()) == len(weightings) + (1 if estimator == "fft" else 2)
+
+
+def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
+    assert best_model(paper_analysis).fit.structure.name == "VI"
+    with style.styled():
+        figure = torque_figure(paper_analysis)
+    measured, modelled = (line.get_ydata() for line in figure.axes[0].get_lines()[:2])
+    assert np.abs(measured).max() == pytest.approx(np.abs(modelled).max(), rel=0.1)
+    residual = figure.axes[1].get_lines()[0].get_ydata()
+    assert np.abs(residual).max() < 0.15 * np.abs(measured).max()
+
+
+def test_a_file_name_is_shown_as_it_is(write_session, short_signals, tmp_path):
+    path = write_session(tmp_path / "$a$_[b] 测 %s.mcap", short_signals)
+    settings = WelchSettings(segment_length=1000, types=("I",), weightings=("const",))
+    found = analyse(load_record(path), settings)
+    for number, draw in enumerate((signals_figure, frf_figure, torque_figure)):
+        with style.styled():
+            figure = draw(found)
+            style.save(figure, tmp_path / f"{number}.png")
+        assert figure.texts[0].get_text().startswith(path.name)
+
+
+def test_an_envelope_keeps_extremes_and_bounds_the_points():
+    x = np.linspace(0.0, 10.0, 100_001)
+    y = np.sin(2 * np.pi * 50 * x)
+    y[[12_345, 60_000]] = 7.0, -9.0
+    few_x, few_y = style.envelope(x, y, 500)
+    assert len(few_x) == len(few_y) == 1000
+    assert (few_y.max(), few_y.min()) == (7.0, -9.0)
+    assert abs(few_x[np.argmax(few_y)] - x[12_345]) <= 10.0 / 500
+    assert (np.diff(few_x) >= 0).all()
+    log_x, _ = style.envelope(x[1:], y[1:], 300, logarithmic=True)
+    assert len(log_x) <= 600
+    same_x, same_y = style.envelope(x[:50], y[:50], 500)
+    assert same_x is not None
+    assert len(same_y) == 50
+
+
+def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
+    target = tmp_path / "a.png"
+    target.write_bytes(b"mine")
+    with style.styled(), pytest.raises(FileExistsError):
+        style.save(style.new_figure(4, 3, "a", "b"), target)
+    assert target.read_bytes() == b"mine"

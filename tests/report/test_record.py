@@ -1,0 +1,190 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from analysis.record import MAX_FILLED_SHARE, RecordError, load_record
+from rigd.session import SessionError
+from rigd.session.format import Status
+
+
+def test_arrays_units_and_segments_come_through(tmp_path, write_session, short_signals):
+    path = write_session(
+        tmp_path / "a.mcap", short_signals,
+        metadata={"angle_delay_s": "0.001", "torque_delay_s": "-2e-4",
+                  "tool_inertia_kg_m2": "1e-5"},
+    )  # fmt: skip
+    record = load_record(path)
+    np.testing.assert_array_equal(record.angle_rad, short_signals.angle_rad)
+    np.testing.assert_array_equal(record.reference_rad, short_signals.reference_rad)
+    np.testing.assert_array_equal(record.torque_nm, short_signals.torque_nm)
+    np.testing.assert_allclose(record.time_s, np.arange(5000) / 1000, rtol=1e-15)
+    assert record.beam.length_m == 0.98
+    assert record.beam.bending_stiffness_n_m2 == pytest.approx(0.0902750)
+    assert (record.angle_delay_s, record.torque_delay_s) == (0.001, -2e-4)
+    assert record.tool_inertia_kg_m2 == 1e-5
+    assert record.sweep == slice(500, 4500)
+    assert record.sweep_samples == 4000
+    assert record.rest_angle_rad == np.median(short_signals.angle_rad[:500])
+    assert record.outcome == "complete"
+    assert record.warnings == ()
+    assert record.flags == {}
+
+
+def test_without_segments_the_whole_record_is_the_sweep(tmp_path, write_session, short_signals):
+    record = load_record(write_session(tmp_path / "a.mcap", short_signals, segments={}))
+    assert record.sweep == slice(0, 5000)
+    assert record.rest_angle_rad is None
+
+
+def test_missing_ticks_are_interpolated_and_counted(tmp_path, write_session, short_signals):
+    present = np.ones(5000, bool)
+    present[[1000, 2000, 2001, 2002, 4800]] = False  # the last one after the sweep
+    ticks = np.flatnonzero(present)
+    path = write_session(tmp_path / "a.mcap", short_signals.decimated(present), ticks=ticks)
+    record = load_record(path)
+    assert len(record.angle_rad) == 5000
+    assert record.gaps.missing_ticks == 5
+    assert record.gaps.longest_gap_ticks == 3
+    assert record.gaps.sweep_missing_ticks == 4
+    np.testing.assert_array_equal(record.angle_rad[present], short_signals.angle_rad[present])
+    before, after = short_signals.torque_nm[1999], short_signals.torque_nm[2003]
+    np.testing.assert_allclose(
+        record.torque_nm[2000:2003], before + (after - before) * np.array([1, 2, 3]) / 4
+    )
+    assert any("4 missing ticks" in warning for warning in record.warnings)
+
+
+def test_stale_values_are_interpolated_in_their_channel_only(
+    tmp_path, write_session, short_signals
+):
+    status = np.zeros(5000, int)
+    status[3000] = Status.ANGLE_STALE
+    status[3100:3102] = Status.WRENCH_STALE
+    angle, torque = short_signals.angle_rad.copy(), short_signals.torque_nm.copy()
+    angle[3000], torque[3100:3102] = 9.0, 9.0
+    held = replace(short_signals, angle_rad=angle, torque_nm=torque)
+    record = load_record(write_session(tmp_path / "a.mcap", held, status=status))
+    assert record.gaps.sweep_stale_angles == 1
+    assert record.gaps.sweep_stale_torques == 2
+    assert record.angle_rad[3000] == pytest.approx((angle[2999] + angle[3001]) / 2)
+    assert record.torque_nm[3000] == torque[3000]
+    assert record.torque_nm.max() < 1.0
+    assert record.flags == {"angle stale": 1, "wrench stale": 2}
+
+
+def test_flags_in_the_sweep_are_counted_and_warned_of(tmp_path, write_session, short_signals):
+    status = np.zeros(5000, int)
+    status[:10] = Status.TORQUE_OFF  # before the sweep: nobody's concern
+    status[600:603] = Status.WRENCH_SATURATED | Status.LATE
+    record = load_record(write_session(tmp_path / "a.mcap", short_signals, status=status))
+    assert record.flags == {"wrench saturated": 3, "late tick": 3}
+    assert any("clipped" in warning for warning in record.warnings)
+
+
+def test_a_stopped_sweep_is_cut_to_what_was_recorded(tmp_path, write_session, short_signals):
+    present = np.arange(5000) < 3000
+    path = write_session(tmp_path / "a.mcap", short_signals.decimated(present), outcome="stopped")
+    record = load_record(path)
+    assert record.sweep == slice(500, 3000)
+    assert record.outcome == "stopped"
+    assert any("1.5 s were not" in warning for warning in record.warnings)
+
+
+def test_a_session_stopped_before_its_sweep_is_refused(tmp_path, write_session, short_signals):
+    present = np.arange(5000) < 400
+    path = write_session(tmp_path / "a.mcap", short_signals.decimated(present))
+    with pytest.raises(RecordError, match=r"a\.mcap.*'sweep'.*500.*399"):
+        load_record(path)
+
+
+def test_too_many_missing_ticks_are_refused(tmp_path, write_session, short_signals):
+    present = np.ones(5000, bool)
+    present[1000:3000:40] = False  # 50 of 4000, 1.25 %
+    path = write_session(
+        tmp_path / "a.mcap", short_signals.decimated(present), ticks=np.flatnonzero(present)
+    )
+    with pytest.raises(RecordError, match=r"50 of 4000 .* angle .* 1 %"):
+        load_record(path)
+
+
+def test_a_long_gap_is_refused_even_if_few_ticks_are_missing(tmp_path, write_session, signals_of):
+    n = 40_000
+    wave = 0.01 * np.sin(np.arange(n) / 100)
+    present = np.ones(n, bool)
+    present[10_000:10_101] = False
+    signals = signals_of(wave, wave, wave, {}).decimated(present)
+    path = write_session(tmp_path / "a.mcap", signals, ticks=np.flatnonzero(present))
+    assert 101 / n < MAX_FILLED_SHARE
+    with pytest.raises(RecordError, match=r"101 ticks .* from tick 10000 .*100 ms"):
+        load_record(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "name"),
+    [("angle_rad", "angle_rad"), ("torque_nm", "coupling_torque_nm"),
+     ("reference_rad", "angle_reference_rad")],
+)  # fmt: skip
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_refused_by_field_and_tick(
+    tmp_path, write_session, short_signals, field, name, value
+):
+    values = getattr(short_signals, field).copy()
+    values[[1234, 2000]] = value
+    path = write_session(tmp_path / "a.mcap", replace(short_signals, **{field: values}))
+    with pytest.raises(RecordError, match=rf"a\.mcap: {name} .* tick 1234 .* 2 of 5000"):
+        load_record(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("rate_hz", "0"), ("rate_hz", "-1000"), ("beam_length_m", "0"),
+     ("beam_density_kg_per_m", "-1"), ("tool_inertia_kg_m2", "-1e-5"), ("rate_hz", "nan"),
+     ("beam_bending_stiffness_n_m2", "stiff")],
+)  # fmt: skip
+def test_absurd_metadata_is_refused_by_key(tmp_path, write_session, short_signals, key, value):
+    path = write_session(tmp_path / "a.mcap", short_signals, metadata={key: value})
+    with pytest.raises((RecordError, SessionError), match=key):
+        load_record(path)
+
+
+def test_a_rate_that_the_time_stamps_contradict_is_refused(tmp_path, write_session, short_signals):
+    path = write_session(tmp_path / "a.mcap", short_signals, metadata={"rate_hz": "500"})
+    with pytest.raises(RecordError, match=r"500 Hz.*1000 ticks per second"):
+        load_record(path)
+
+
+def test_ticks_out_of_order_are_refused(tmp_path, write_session, short_signals):
+    ticks = np.arange(5000)
+    ticks[2000] = 1999
+    path = write_session(tmp_path / "a.mcap", short_signals, ticks=ticks)
+    with pytest.raises(SessionError, match="1999"):
+        load_record(path)
+
+
+def test_a_session_without_samples_is_refused(tmp_path, write_session, short_signals):
+    path = write_session(tmp_path / "a.mcap", short_signals.decimated(slice(0, 0)))
+    with pytest.raises((RecordError, SessionError), match=r"a\.mcap"):
+        load_record(path)
+
+
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(missing=st.sets(st.integers(1, 3998), max_size=30))
+def test_what_was_recorded_is_kept_whatever_is_missing(
+    tmp_path_factory, write_session, signals_of, missing
+):
+    n = 4000
+    line = 1e-3 * np.arange(n)
+    present = np.ones(n, bool)
+    present[list(missing)] = False
+    signals = signals_of(line, line, -line, {}).decimated(present)
+    folder = tmp_path_factory.mktemp("gaps")
+    record = load_record(write_session(folder / "a.mcap", signals, ticks=np.flatnonzero(present)))
+    # A straight line is its own interpolation.
+    np.testing.assert_allclose(record.angle_rad, line, atol=1e-12)
+    np.testing.assert_allclose(record.torque_nm, -line, atol=1e-12)
+    assert record.gaps.missing_ticks == len(missing)

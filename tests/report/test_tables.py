@@ -1,0 +1,74 @@
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from analysis.report.tables import summary_table, with_spread
+from analysis.report.write import tables_text
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (8.5023, 0.6679, "8.50 ± 0.67"),
+        (0.9718662, 0.0138, "0.972 ± 0.014"),
+        (95.2, 42.6, "95 ± 43"),
+        (1234.5, 300.0, "1234 ± 300"),
+        (1.0, 0.0, "1"),
+        (0.123456789, None, "0.12346"),
+        (2.0, 1e-9, "2 ± 1.0e-09"),
+        (3.0, float("nan"), "3"),
+    ],
+)
+def test_a_value_shows_the_digits_its_spread_leaves(value, std, text):
+    assert with_spread(value, std) == text
+
+
+def rows(text, *starts):
+    return [
+        line.split() for line in text.splitlines() if tuple(line.split()[: len(starts)]) == starts
+    ]
+
+
+def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis):
+    text = tables_text(paper_analysis)
+    for model in paper_analysis.models:
+        fits, peaks, modes = rows(text, model.fit.structure.name, model.fit.weighting)
+        assert fits[-3:] == [
+            f"{x:.4g}" for x in (model.indices.mse, model.indices.wmse, model.indices.md)
+        ]
+        assert peaks[2] == f"{model.deviations[0].frequency_rad_s:.3f}"
+        assert modes[2] == f"{model.modes[0].frequency_hz:.4f}"
+    (measured,) = rows(text, "measured")
+    assert float(measured[1]) == pytest.approx(16.15, abs=0.1)
+    assert "standard deviation" in text
+
+
+def test_absent_and_fixed_parameters_are_told_apart(paper_analysis):
+    text = tables_text(paper_analysis)
+    internal_only = rows(text, "I", "const")[0]
+    assert internal_only[2:8] == [*internal_only[2:5], "1", "–", "–"]
+
+
+def test_warnings_and_parameters_on_the_edge_are_shown(paper_analysis):
+    model = paper_analysis.models[0]
+    edge = replace(model, fit=replace(model.fit, std=None, at_bounds=("zeta",)))
+    text = tables_text(
+        replace(paper_analysis, models=(edge,), warnings=("Mind the gap [b]of[/b] 3 ticks.",))
+    )
+    assert "* rests on the edge" in text
+    assert "Warning: Mind the gap [b]of[/b] 3 ticks." in text
+
+
+def test_the_summary_is_mean_and_standard_deviation(paper_analysis):
+    model = paper_analysis.models[0]
+    others = []
+    for zeta in (1e-4, 2e-4, 3e-4):
+        fit = replace(model.fit, parameters={**model.fit.parameters, "zeta": zeta})
+        others.append(replace(paper_analysis, models=(replace(model, fit=fit),)))
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(summary_table(others))
+    assert "over 3 files" in capture.get()
+    (row,) = rows(capture.get(), "I", "const")
+    assert row[2:5] == ["20", "±", "10"]
