@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigd.beam import Beam
-from rigd.session import Session, read_session
-from rigd.session.format import Status
+from rigd.session import Session, Status, read_session
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

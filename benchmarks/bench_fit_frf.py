@@ -53,20 +53,24 @@ class Peer:
         self.high = np.array([1.999 if name in ORDERS else 4.0 for name in structure.free])
 
     def damping(self, x: np.ndarray) -> Damping:
+        """Damping at `x`."""
         free = zip(self.structure.free, map(float, x), strict=True)
         return self.structure.damping(
             {name: v if name in ORDERS else math.exp(v) for name, v in free}
         )
 
     def cost(self, x: np.ndarray) -> float:
+        """Eq. (26) on all points."""
         deviation = self.grid.evaluate(LINK, self.damping(x)) - self.measured
         return float(self.weights @ np.abs(deviation) ** 2)
 
     def residual(self, x: np.ndarray) -> np.ndarray:
+        """Weighted deviations, real parts before imaginary ones."""
         r = np.sqrt(self.weights) * (self.grid.evaluate(LINK, self.damping(x)) - self.measured)
         return np.concatenate((r.real, r.imag))
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Differentiate `residual` by `x`."""
         _, gradient = self.grid.evaluate_with_gradient(LINK, self.damping(x), self.structure.free)
         named = zip(self.structure.free, x, strict=True)
         chain = np.array([1.0 if name in ORDERS else math.exp(v) for name, v in named])
@@ -74,6 +78,7 @@ class Peer:
         return np.concatenate((j.real, j.imag))
 
     def random_starts(self, rng: np.random.Generator) -> list[float]:
+        """Costs where descents from random starts end."""
         return [
             2
             * least_squares(

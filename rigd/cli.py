@@ -79,9 +79,9 @@ def run_sessions(
     profile: Annotated[
         str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
     ] = "sim",
-    output: Annotated[
-        Path, typer.Option("--output", help="Folder for the session files.")
-    ] = Path("sessions"),
+    output: Annotated[Path, typer.Option("--output", help="Folder for the session files.")] = Path(
+        "sessions"
+    ),
     repeat: Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")] = 1,
     seed: Annotated[
         int | None,
@@ -165,9 +165,7 @@ def hold(
     """
     from rigd import excitation
 
-    return excitation.hold(
-        rate_hz=rate_hz, duration_s=duration, rest_s=rest, ring_down_s=ring_down
-    )
+    return excitation.hold(rate_hz=rate_hz, duration_s=duration, rest_s=rest, ring_down_s=ring_down)
 
 
 @excitation_command

@@ -196,7 +196,10 @@ class _Session:
         """Wait for the control process's next message, watching the others meanwhile."""
         recorder_lost: str | None = None
         while True:
-            answer = self._crew.control.poll(_POLL_S)
+            try:
+                answer = self._crew.control.poll(_POLL_S)
+            except ChildError as error:
+                return self._control_died(error)
             self._report()
             if answer is not None:
                 if recorder_lost is not None:
@@ -206,6 +209,16 @@ class _Session:
                 recorder_lost = self._recorder_trouble()
                 if recorder_lost is not None:
                     self._board[Word.STOP] = Stop.NO_RECORDER
+
+    def _control_died(self, error: ChildError) -> Message:
+        """Say what the control process would have said, as far as the board tells."""
+        board = self._board
+        counts = {
+            "scheduled": board[Word.SCHEDULED],
+            "missed": board[Word.MISSED],
+            "late": board[Word.LATE],
+        }
+        return {"finished": "fault", "reason": str(error), "counts": counts, "results": {}}
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -278,17 +291,17 @@ class _Session:
             raise SessionFailedError("The recorder process does not close the file.")
         if "error" in closed:
             raise SessionFailedError(closed["error"])
-        recorded = int(closed.get("recorded", 0))
-        scheduled, missed = counts.get("scheduled", 0), counts.get("missed", 0)
+        # What the recorder counted in the file has the last word.
+        counts = {"scheduled": 0, "missed": 0, "late": 0} | counts | closed.get("counts", {})
         return SessionResult(
             path=Path(closed["closed"]) if "closed" in closed else None,
             outcome=finished["finished"],
             reason=finished["reason"],
-            scheduled=scheduled,
-            recorded=recorded,
-            missed=missed,
-            late=counts.get("late", 0),
-            lost=scheduled - missed - recorded,
+            scheduled=counts["scheduled"],
+            recorded=counts.get("recorded", 0),
+            missed=counts["missed"],
+            late=counts["late"],
+            lost=counts.get("lost", 0),
             interrupted=self._interrupted,
         )
 

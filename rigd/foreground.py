@@ -93,9 +93,7 @@ def run_in_foreground(
                 order = Order(
                     profile=_seeded(profile, number),
                     excitation=excitation,
-                    path=choose_path(
-                        folder, excitation.kind, number + 1 if repeat > 1 else None
-                    ),
+                    path=choose_path(folder, excitation.kind, number + 1 if repeat > 1 else None),
                     fast=fast,
                     notes=tuple((name, text) for name, text in notes.items() if text),
                 )

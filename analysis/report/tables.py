@@ -129,13 +129,16 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
 
 
 def with_spread(value: float, std: float | None) -> str:
-    """Write a value with its standard deviation, both to the latter's second digit."""
+    """Write a value with its standard deviation, both to the latter's second digit.
+
+    A narrow terminal may break the line before the ±, not after it: a non-breaking space follows.
+    """
     if std is None or not math.isfinite(std) or std <= 0.0:
         return f"{value:.5g}"
     decimals = max(1 - math.floor(math.log10(std)), 0)
     if decimals > 6:
-        return f"{value:.5g} ± {std:.1e}"
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+        return f"{value:.5g} ±\N{NO-BREAK SPACE}{std:.1e}"
+    return f"{value:.{decimals}f} ±\N{NO-BREAK SPACE}{std:.{decimals}f}"
 
 
 def _table(title: str, leading: list[str]) -> Table:

@@ -33,6 +33,9 @@ MAX_GROWTH_PER_S = 1e-2
 undamped beam, whose poles lie on the imaginary axis but for rounding and the fit's error."""
 
 _MODES_UP_TO_HZ = 1200.0
+_HEAVY_DAMPING = 0.8
+"""Damping ratio from which a pair beyond the band is left out: with the real poles next to it, it
+would only offer huge residues that cancel in the band."""
 _CUT_POLES = -(10.0 ** (np.arange(-6, 14) / 3.0))
 _FIT_BAND_HZ = (0.02, 500.0)
 _TAIL_HZ = (1e-4, 1080.0)
@@ -146,6 +149,8 @@ def _poles(beam: Beam, damping: Damping) -> Complex:
     pairs = pairs[~np.isnan(pairs[:, 0])]
     oscillating = pairs[:, 0].imag > 0
     upper = pairs[oscillating, 0]
+    in_band = np.abs(upper) < 2 * np.pi * _FIT_BAND_HZ[1]
+    upper = upper[in_band | (-upper.real < _HEAVY_DAMPING * np.abs(upper))]
     beyond = np.flatnonzero(upper.imag > 2 * np.pi * _MODES_UP_TO_HZ)
     upper = upper[: beyond[0] + 1] if beyond.size else upper
     over_damped = pairs[~oscillating].ravel()

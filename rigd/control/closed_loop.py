@@ -14,10 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Damping
-from rigd.beam.coupled import CoupledModel, couple, propagator
-from rigd.beam.modes import clamped_free_eigenvalues
-from rigd.beam.realisation import Realisation, realise
+from rigd.beam import (
+    Beam,
+    CoupledModel,
+    Damping,
+    Realisation,
+    clamped_free_eigenvalues,
+    couple,
+    propagator,
+    realise,
+)
 from rigd.control.design import ControlDesignError, ControlSettings, design_pid
 from rigd.control.pid import derivative_coefficients, lowpass_coefficients
 

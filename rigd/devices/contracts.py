@@ -6,7 +6,8 @@ every implementation. Constructors touch no hardware; ``connect`` does.
 In every tick the cycle calls, in this order: ``drive.latch``, ``sensor.request``,
 ``drive.read_angle``, ``sensor.read_wrench``, ``drive.command``. A driver that has no fresh value
 returns the last one and says so in ``angle_stale`` or ``wrench_stale``; it never blocks longer
-than the deadline its profile gives.
+than the deadline its profile gives. ``due_ns`` is the tick's scheduled time on the engine's clock;
+it grows by one period a tick, and by more where ticks were missed.
 """
 
 from dataclasses import dataclass
@@ -44,8 +45,8 @@ class Drive(Protocol):
             If it does not get there.
         """
 
-    def latch(self, t_ns: int) -> None:
-        """Ask for the angle as it is now; ``t_ns`` is the tick's scheduled time."""
+    def latch(self, due_ns: int) -> None:
+        """Ask for the angle as it is now; ``due_ns`` is when the tick was due."""
 
     def read_angle(self) -> float:
         """Return the latched angle in rad, at the output shaft."""
@@ -80,8 +81,8 @@ class WrenchSensor(Protocol):
     def calibration(self) -> dict[str, object]:
         """Return identity and calibration as read from the sensor, for the session file."""
 
-    def request(self, t_ns: int) -> None:
-        """Ask for the wrench as it is now; ``t_ns`` is the tick's scheduled time."""
+    def request(self, due_ns: int) -> None:
+        """Ask for the wrench as it is now; ``due_ns`` is when the tick was due."""
 
     def read_wrench(self) -> Wrench:
         """Return the wrench that was asked for."""

@@ -42,9 +42,7 @@ class Channels:
     @property
     def specs(self) -> ChannelSpecs:
         """What to hand to a child process."""
-        return ChannelSpecs(
-            self.samples.spec, self.controls.spec, self.events.spec, self.board.fd
-        )
+        return ChannelSpecs(self.samples.spec, self.controls.spec, self.events.spec, self.board.fd)
 
     def close(self) -> None:
         """Unmap the memory and close the descriptors of this process."""

@@ -41,13 +41,10 @@ def main() -> None:
         obtained = {"clock": "real"} | obtain(priority=realtime.priority, cpu=realtime.cpu)
     devices = open_devices(job.profile.rig)
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    try:
-        _run(job, devices, clock, channels, parent, obtained)
-    finally:
-        _switch_off(devices, channels)
+    conduct(job, devices, clock, channels, parent, obtained)
 
 
-def _run(
+def conduct(
     job: ControlJob,
     devices: Devices,
     clock: Clock,
@@ -55,6 +52,19 @@ def _run(
     parent: Parent,
     obtained: dict[str, str],
 ) -> None:
+    """Run one session on `devices`, whatever happens, to a disabled drive and a final message.
+
+    Parameters
+    ----------
+    job
+        What to run.
+    devices
+        Not yet connected.
+    clock, channels, parent
+        As for :class:`rigd.engine.procedure.Procedure`.
+    obtained
+        The real-time settings that were granted, for the file.
+    """
     rig = job.profile.rig
     cycle = Cycle(
         devices,
@@ -86,10 +96,12 @@ def _run(
         outcome, reason = end.outcome, end.reason
     except DeviceError as error:
         outcome, reason = "fault", str(error)
+    finally:
+        devices.drive.disable()
+        channels.board[Word.PHASE] = Phase.OFF
     if recorded and reason:
         # What happens after the last tick does not make the record any less complete.
         outcome, reason = "complete", f"After the record: {reason}"
-    _switch_off(devices, channels)
     counts = asdict(procedure.counts) if procedure is not None else {}
     results = procedure.results if procedure is not None else {}
     parent.send(finished=outcome, reason=reason, counts=counts, results=results)
@@ -97,15 +109,8 @@ def _run(
 
 def _controller(profile: Profile) -> PidController:
     motor = profile.rig.motor
-    gains = design_pid(
-        motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s
-    )
+    gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
-
-
-def _switch_off(devices: Devices, channels: Channels) -> None:
-    devices.drive.disable()
-    channels.board[Word.PHASE] = Phase.OFF
 
 
 if __name__ == "__main__":

@@ -55,11 +55,11 @@ class Cycle:
         self.torque_command_nm = 0.0
         self.flags = _TORQUE_OFF
 
-    def observe(self, t_ns: int) -> None:
+    def observe(self, due_ns: int) -> None:
         """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
         drive, sensor = self._drive, self._sensor
-        drive.latch(t_ns)
-        sensor.request(t_ns)
+        drive.latch(due_ns)
+        sensor.request(due_ns)
         self.angle_rad = drive.read_angle()
         self.raw_wrench = fx, fy, fz, tx, ty, tz = sensor.read_wrench()
         bx, by, bz, ox, oy, oz = self.tare
@@ -78,9 +78,9 @@ class Cycle:
             flags |= _TORQUE_OFF
         self.flags = flags
 
-    def step(self, t_ns: int, reference_rad: float) -> Violation | None:
+    def step(self, due_ns: int, reference_rad: float) -> Violation | None:
         """Do a whole tick; where a limit is violated the torque is off when this returns."""
-        self.observe(t_ns)
+        self.observe(due_ns)
         flags = self.flags & ~_TORQUE_OFF
         violation = self.watch.check(reference_rad, self.angle_rad, self.raw_wrench)
         if violation is not None:
@@ -102,3 +102,8 @@ class Cycle:
         self._drive.disable()
         self.torque_command_nm = 0.0
         self.flags |= _TORQUE_OFF
+
+    def lose_readings(self) -> None:
+        """Switch off because a device failed: what was read last stands, and is marked so."""
+        self.torque_off()
+        self.flags |= _ANGLE_STALE | _WRENCH_STALE

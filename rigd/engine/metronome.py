@@ -10,6 +10,10 @@ class Metronome:
     ----------
     tick
         Index of the current tick, counted from the last :meth:`restart`.
+    t_ns
+        Scheduled time of the current tick, since tick 0.
+    due_ns
+        The same on the clock: it goes on evenly through a restart.
     lateness_ns
         By how much its deadline was missed: less than a period.
     """
@@ -19,6 +23,8 @@ class Metronome:
         self._period_ns = 1e9 / rate_hz
         self._start_ns = clock.now_ns()
         self.tick = 0
+        self.t_ns = 0
+        self.due_ns = self._start_ns
         self.lateness_ns = 0
 
     @property
@@ -26,13 +32,9 @@ class Metronome:
         """Clock time of tick 0."""
         return self._start_ns
 
-    def time_of(self, tick: int) -> int:
-        """Scheduled time of a tick, in ns since tick 0."""
-        return round(tick * self._period_ns)
-
     def restart(self) -> None:
         """Make the next tick tick 0; it is due where it would have been due anyway."""
-        self._start_ns += self.time_of(self.tick + 1)
+        self._start_ns += round((self.tick + 1) * self._period_ns)
         self.tick = -1
 
     def wait(self) -> int:
@@ -42,11 +44,18 @@ class Metronome:
         then the last one whose deadline has passed.
         """
         tick = self.tick + 1
-        late_ns = self._clock.wait_until(self._start_ns + round(tick * self._period_ns))
+        t_ns = round(tick * self._period_ns)
+        due_ns = self._start_ns + t_ns
+        late_ns = self._clock.wait_until(due_ns)
         missed = 0
         if late_ns >= self._period_ns:
             missed = int(late_ns / self._period_ns)
-            late_ns -= round(missed * self._period_ns)
-        self.tick = tick + missed
-        self.lateness_ns = max(0, late_ns)
+            tick += missed
+            t_ns = round(tick * self._period_ns)
+            late_ns = max(0, late_ns + due_ns - self._start_ns - t_ns)
+            due_ns = self._start_ns + t_ns
+        self.tick = tick
+        self.t_ns = t_ns
+        self.due_ns = due_ns
+        self.lateness_ns = late_ns
         return missed

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigd.devices.contracts import Wrench
+from rigd.devices.contracts import DeviceError, Wrench
 from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.channels import CONTROL_DECIMATION, Channels
 from rigd.engine.clocks import Clock
@@ -184,16 +184,14 @@ class Procedure:
                 counts.scheduled = tick
                 break
             end = self._stop_reason(tick) or self._missed_too_many(missed, tick)
-            t_ns = metronome.time_of(tick)
+            t_ns = metronome.t_ns
             last_ns = t_ns + metronome.lateness_ns
             if last < 0:
                 first_ns = last_ns
             if end is None:
-                violation = cycle.step(t_ns, reference[tick])
-                if violation is not None:
-                    end = SessionEnd("fault", str(violation))
+                end = self._step(reference[tick])
             else:
-                cycle.observe(t_ns)
+                cycle.observe(metronome.due_ns)
                 cycle.torque_off()
             counts.scheduled = tick + 1
             lost = self._publish(tick, t_ns, reference[tick], missed, wait=end is not None)
@@ -239,10 +237,18 @@ class Procedure:
         """One tick outside the record."""
         self._metronome.wait()
         self._check_stop()
-        t_ns = self._metronome.time_of(self._metronome.tick)
-        violation = self._cycle.step(t_ns, reference_rad)
-        if violation is not None:
-            raise SessionEnd("fault", str(violation))
+        end = self._step(reference_rad)
+        if end is not None:
+            raise end
+
+    def _step(self, reference_rad: float) -> SessionEnd | None:
+        """Control one tick; where that ends the session, the torque is off."""
+        try:
+            violation = self._cycle.step(self._metronome.due_ns, reference_rad)
+        except DeviceError as error:
+            self._cycle.lose_readings()
+            return SessionEnd("fault", str(error))
+        return None if violation is None else SessionEnd("fault", str(violation))
 
     def _rest(self, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Read without torque; raw wrenches (n, 6) and angles (n,)."""
@@ -252,7 +258,7 @@ class Procedure:
         for _ in range(round(duration_s * self._rate_hz)):
             metronome.wait()
             self._check_stop()
-            cycle.observe(metronome.time_of(metronome.tick))
+            cycle.observe(metronome.due_ns)
             wrenches.append(cycle.raw_wrench)
             angles.append(cycle.angle_rad)
         return np.array(wrenches), np.array(angles)

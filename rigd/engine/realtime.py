@@ -17,7 +17,7 @@ def collect_no_garbage() -> str:
     return "off"
 
 
-def obtain(*, priority: int, cpu: int | None) -> dict[str, str]:
+def obtain(*, priority: int, cpu: int) -> dict[str, str]:
     """Ask the system for what a 1 kHz loop wants, and report what it granted.
 
     Parameters
@@ -25,7 +25,7 @@ def obtain(*, priority: int, cpu: int | None) -> dict[str, str]:
     priority
         Of SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
     cpu
-        The one core to run on, or None for any.
+        The one core to run on; -1 for the last one this process may use.
 
     Returns
     -------
@@ -37,9 +37,8 @@ def obtain(*, priority: int, cpu: int | None) -> dict[str, str]:
         "memory": lambda: _lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
+        "cpu": lambda: _pin(cpu),
     }
-    if cpu is not None:
-        wanted["cpu"] = lambda: _pin(cpu)
     if priority > 0:
         wanted["scheduling"] = lambda: _schedule(priority)
     return {name: _attempt(setting) for name, setting in wanted.items()}
@@ -63,6 +62,8 @@ def _set_timer_slack(libc: ctypes.CDLL) -> str:
 
 
 def _pin(cpu: int) -> str:
+    if cpu < 0:
+        cpu = max(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpu})
     return str(cpu)
 

@@ -73,8 +73,8 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
                 writer.discard()
                 parent.send(discarded=True)
             else:
-                path, recorded = recorder.close(message["close"])
-                parent.send(closed=str(path), recorded=recorded)
+                path, counts = recorder.close(message["close"])
+                parent.send(closed=str(path), counts=counts)
             return
 
 
@@ -107,13 +107,19 @@ class _Recorder:
             self._recorded += len(samples) // SAMPLE_SIZE
         return bool(samples or controls or len(events) >= 16 * EVENT_SIZE)
 
-    def close(self, outcome: Mapping[str, str]) -> tuple[Path, int]:
+    def close(self, outcome: Mapping[str, str]) -> tuple[Path, dict[str, int]]:
         while self.transfer():
             pass
-        counted = {**outcome, "recorded": str(self._recorded)}
-        missing = int(outcome["scheduled"]) - int(outcome["missed"]) - self._recorded
-        counted["lost"] = str(missing)
-        return self._writer.close(counted), self._recorded
+        accounted = self._recorded + int(outcome["missed"])
+        # A control process that was killed may have left before it counted its last sample.
+        scheduled = max(int(outcome["scheduled"]), accounted)
+        counts = {
+            "scheduled": scheduled,
+            "recorded": self._recorded,
+            "lost": scheduled - accounted,
+        }
+        counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
+        return self._writer.close(counted), counts
 
     def finish_orphaned(self) -> None:
         """Close what there is once the loop has stopped, the supervisor being gone."""

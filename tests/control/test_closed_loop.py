@@ -8,13 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.beam import Beam, Damping
-from rigd.beam.coupled import couple, propagator
-from rigd.beam.realisation import realise
+from rigd.beam import Damping, couple, propagator, realise
 from rigd.control import (
     ControlDesignError,
-    ControlSettings,
-    LoopModel,
     PidController,
     check_stability,
     close_loop,
@@ -293,27 +289,3 @@ def test_an_unstable_loop_is_no_endless_simulation(loop_model):
         pytest.raises(ControlDesignError, match="unstable"),
     ):
         loop.simulate(np.ones(200_000))
-
-
-@settings(max_examples=15, deadline=None)
-@given(
-    length=st.floats(0.5, 1.5),
-    stiffness=st.floats(0.05, 0.5),
-    zeta=st.floats(2e-5, 3e-4),
-    gamma=st.floats(0.01, 0.2),
-    lambda_=st.floats(0.4, 1.4),
-)
-def test_feed_forward_keeps_other_antennas_stable(length, stiffness, zeta, gamma, lambda_):
-    model = LoopModel(
-        rate_hz=1000.0,
-        beam=Beam(length, 4.7e-3, stiffness),
-        damping=Damping(zeta, 1.0, gamma, lambda_),
-        motor_inertia_kg_m2=2e-3,
-        viscous_nm_s_per_rad=0.02,
-        tool_inertia_kg_m2=0.0,
-        actuation_delay_s=1e-3,
-        angle_delay_s=0.0,
-        torque_delay_s=0.0,
-        settings=ControlSettings(80.0, 1.0, 0.03, 2e-3),
-    )
-    check_stability(close_loop(model))

@@ -101,7 +101,7 @@ def test_it_takes_over_without_a_bump(angle, torque):
     controller.reset(angle, torque)
     for _ in range(5):
         assert controller.step(angle, angle, 0.0) == pytest.approx(torque, abs=1e-12)
-    assert controller.friction_nm == 0.0
+    assert controller.friction_nm == pytest.approx(0.0, abs=1e-12)
 
 
 def test_terms_add_up_to_the_torque():

@@ -6,6 +6,7 @@ import math
 import os
 import pickle
 import select
+import struct
 import subprocess
 import sys
 import threading
@@ -76,9 +77,12 @@ class Publisher:
             env={**os.environ, **environment},
         )
         job = LiveJob(ring.spec, self.board.fd, "chirp under test", RATE_HZ, linger_s)
-        self.process.stdin.write(pickle.dumps(job))
-        self.process.stdin.flush()
-        self.answer = json.loads(self._first_line())
+        write_job(self.process.stdin, job)
+        try:
+            self.answer = json.loads(self._first_line())
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def proxy_url(self) -> str:
@@ -122,6 +126,12 @@ class Publisher:
         return self.process.stdout.readline()
 
 
+def write_job(pipe, job: LiveJob) -> None:
+    data = pickle.dumps(job)
+    pipe.write(struct.pack("<Q", len(data)) + data)
+    pipe.flush()
+
+
 def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
@@ -144,6 +154,11 @@ def program() -> Path:
 @pytest.fixture(scope="session")
 def rerun_program(rerun_runs):
     return program()
+
+
+@pytest.fixture
+def send_job():
+    return write_job
 
 
 @pytest.fixture

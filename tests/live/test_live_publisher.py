@@ -1,7 +1,6 @@
 """The publisher as the supervisor sees it: one line, loopback only, and never in the way."""
 
 import os
-import pickle
 import signal
 import socket
 import subprocess
@@ -156,7 +155,9 @@ def test_a_killed_publisher_leaves_no_server(publisher, gone, eventually, end):
     assert eventually(lambda: gone(server))
 
 
-def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, gone, eventually):
+def test_ends_when_its_parent_dies_though_its_input_stays_open(
+    producer, send_job, gone, eventually
+):
     board = Board.create()
     fds = (producer.ring.spec.fd, board.fd)
     middle = subprocess.Popen(
@@ -175,8 +176,7 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, gone, e
     with middle:
         pid = int(middle.stderr.readline())
         job = LiveJob(producer.ring.spec, board.fd, "orphan", 1000.0, linger_s=60.0)
-        middle.stdin.write(pickle.dumps(job))
-        middle.stdin.flush()
+        send_job(middle.stdin, job)
         assert b"url" in middle.stdout.readline()
         (server,) = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
         middle.kill()

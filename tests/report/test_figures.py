@@ -75,7 +75,7 @@ def test_one_panel_a_type(paper_analysis):
     ("types", "weightings", "estimator"),
     [
         (("VI",), ("omega^-2",), "h1"),
-        (("I", "II", "III", "IV", "V", "VI", "VII"), ("const", "omega", "omega^0.5"), "hv"),
+        (("I", "II", "III", "IV", "V", "VI", "VII"), ("const", "omega^0.5"), "hv"),
         (("I", "III"), ("const",), "fft"),
     ],
 )

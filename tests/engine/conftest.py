@@ -1,0 +1,168 @@
+"""A session in this process: simulated devices under the virtual clock, with faults on demand."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from rigd.devices.contracts import Devices
+from rigd.devices.registry import open_devices
+from rigd.engine.board import Phase, Word
+from rigd.engine.channels import create_channels
+from rigd.engine.clocks import VirtualClock
+from rigd.engine.control import ControlJob, conduct
+from rigd.engine.events import read_events
+from rigd.excitation import chirp
+from rigd.profile import load_profile
+from rigd.session.format import decode_controls, decode_samples
+
+
+@dataclass
+class WatchedDrive:
+    """The simulated drive, with a log of what it was told, and faults from a given read on."""
+
+    inner: object
+    fault_at: int | None = None
+    fault: object = None
+    reads: int = 0
+    enabled: bool = False
+    torque_nm: float = 0.0
+    torques: list = field(default_factory=list)
+
+    @property
+    def angle_stale(self):
+        return self.inner.angle_stale
+
+    def connect(self):
+        self.inner.connect()
+
+    def enable(self):
+        self.inner.enable()
+        self.enabled = True
+
+    def latch(self, due_ns):
+        self.inner.latch(due_ns)
+
+    def read_angle(self):
+        self.reads += 1
+        angle_rad = self.inner.read_angle()
+        if self.fault_at is not None and self.reads >= self.fault_at:
+            return self.fault(angle_rad)
+        return angle_rad
+
+    def command(self, torque_nm):
+        assert self.enabled
+        self.torque_nm = torque_nm
+        self.torques.append(torque_nm)
+        self.inner.command(torque_nm)
+
+    def disable(self):
+        self.inner.disable()
+        self.enabled = False
+        self.torque_nm = 0.0
+
+    def close(self):
+        self.inner.close()
+
+
+class FakeParent:
+    """A supervisor that notes what it is told, and can die."""
+
+    def __init__(self):
+        self.messages = []
+        self.living = True
+
+    def send(self, **message):
+        self.messages.append(message)
+
+    def alive(self):
+        return self.living
+
+
+class Session:
+    """One session, run to its end in this process.
+
+    The record is small enough for the rings to hold it, so that nobody needs to read meanwhile.
+    """
+
+    def __init__(self, clock=None, profile=None, excitation=None):
+        self.profile = profile or load_profile("sim")
+        self.excitation = excitation or chirp(
+            rate_hz=self.profile.rig.rate_hz,
+            duration_s=4.0,
+            rest_s=0.5,
+            ring_down_s=0.5,
+            stop_hz=5.0,
+        )
+        self.channels = create_channels(self.profile.rig.rate_hz)
+        self.board = self.channels.board
+        self.parent = FakeParent()
+        devices = open_devices(self.profile.rig)
+        self.drive = WatchedDrive(devices.drive)
+        self.devices = Devices(self.drive, devices.sensor, simulated=True)
+        self.clock = clock or VirtualClock()
+        self.board[Word.GO] = 1
+
+    def run(self):
+        job = ControlJob(self.profile, self.excitation, self.channels.specs, fast=True)
+        conduct(job, self.devices, self.clock, self.channels, self.parent, {})
+        return self
+
+    @property
+    def finished(self):
+        return self.parent.messages[-1]
+
+    @property
+    def samples(self):
+        blocks = []
+        while block := self.channels.samples.take(1000):
+            blocks.append(decode_samples(block))
+        return np.concatenate(blocks) if blocks else None
+
+    @property
+    def controls(self):
+        return decode_controls(self.channels.controls.take(100_000))
+
+    @property
+    def events(self):
+        return read_events(self.channels.events.take(1000))
+
+    def assert_safe(self):
+        assert not self.drive.enabled
+        assert self.drive.torque_nm == 0.0
+        assert self.board[Word.PHASE] == Phase.OFF
+
+    def close(self):
+        self.channels.close()
+
+
+@pytest.fixture
+def make_session():
+    made = []
+
+    def make(**options):
+        made.append(Session(**options))
+        return made[-1]
+
+    yield make
+    for session in made:
+        session.close()
+
+
+@pytest.fixture
+def quiet_profile():
+    """The simulated rig without noise, friction and quantisation."""
+    profile = load_profile("sim")
+    rig = profile.rig
+    simulation = replace(rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0)
+    return replace(
+        profile,
+        rig=replace(
+            rig,
+            encoder=replace(rig.encoder, resolution_rad=0.0),
+            sensor=replace(rig.sensor, resolution=(0.0,) * 6),
+            motor=replace(rig.motor, coulomb_nm=0.0),
+            simulation=simulation,
+        ),
+        control=replace(profile.control, friction_compensation_nm=0.0),
+    )

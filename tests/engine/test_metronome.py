@@ -1,0 +1,89 @@
+"""Deadlines are absolute, and missed ticks are skipped and counted."""
+
+import time
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rigd.engine.clocks import RealClock, VirtualClock
+from rigd.engine.metronome import Metronome
+
+
+class LateClock:
+    """A clock on which each wait wakes late by what the test says."""
+
+    virtual = False
+
+    def __init__(self, delays_ns):
+        self._delays_ns = iter(delays_ns)
+        self._now_ns = 5_000_000_000
+
+    def now_ns(self):
+        return self._now_ns
+
+    def wait_until(self, deadline_ns):
+        self._now_ns = max(self._now_ns, deadline_ns + next(self._delays_ns))
+        return self._now_ns - deadline_ns
+
+
+@given(
+    st.sampled_from([1000.0, 500.0, 3000.0, 48000.0, 0.7]),
+    st.lists(st.floats(0, 40), min_size=1, max_size=60),
+)
+def test_every_tick_is_run_once_or_counted_as_missed(rate_hz, delays):
+    period_ns = 1e9 / rate_hz
+    metronome = Metronome(LateClock([int(d * period_ns) for d in delays]), rate_hz)
+    start_ns = metronome.start_ns
+    metronome.restart()
+    before = -1
+    for _ in delays:
+        missed = metronome.wait()
+        assert metronome.tick == before + 1 + missed
+        assert metronome.t_ns == round(metronome.tick * period_ns)
+        assert metronome.due_ns == metronome.start_ns + metronome.t_ns
+        assert 0 <= metronome.lateness_ns <= period_ns + 1
+        before = metronome.tick
+    assert metronome.start_ns - start_ns == round(period_ns)
+
+
+def test_a_burst_of_missed_ticks_is_not_made_up():
+    metronome = Metronome(LateClock([0, 7_300_000, 0, 0]), 1000.0)
+    assert metronome.wait() == 0
+    assert metronome.wait() == 7
+    assert (metronome.tick, metronome.lateness_ns) == (9, 300_000)
+    assert metronome.wait() == 0
+    assert (metronome.tick, metronome.lateness_ns) == (10, 0)
+
+
+def test_due_times_go_on_evenly_through_a_restart():
+    metronome = Metronome(VirtualClock(), 1000.0)
+    due = []
+    for tick in range(6):
+        if tick == 3:
+            metronome.restart()
+        metronome.wait()
+        due.append(metronome.due_ns)
+    assert due == [1_000_000 * k for k in range(1, 7)]
+    assert metronome.tick == 2
+
+
+def test_real_deadlines_do_not_drift_with_the_work():
+    metronome = Metronome(RealClock(), 500.0)
+    first = time.monotonic_ns()
+    missed = 0
+    for _ in range(50):
+        missed += metronome.wait()
+        time.sleep(0.0005)
+    elapsed_s = (time.monotonic_ns() - first) * 1e-9
+    # A loop that slept "period minus nothing" after its work would need a quarter more.
+    assert metronome.tick == 50 + missed
+    assert elapsed_s < (metronome.tick + 3) / 500.0 + metronome.lateness_ns * 1e-9
+    assert elapsed_s > (metronome.tick - 1) / 500.0
+
+
+def test_spinning_ends_the_wait_at_the_deadline_and_not_before():
+    clock = RealClock(spin_ns=150_000)
+    for _ in range(5):
+        deadline_ns = clock.now_ns() + 1_000_000
+        assert clock.wait_until(deadline_ns) >= 0
+        assert clock.now_ns() >= deadline_ns

@@ -1,0 +1,267 @@
+"""A session from rest to rest, and every way out of it: the torque is off, the books balance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.control import close_loop
+from rigd.devices.contracts import DeviceError
+from rigd.engine.board import Stop, Word
+from rigd.engine.clocks import VirtualClock
+from rigd.session.format import Status
+
+
+def assert_books_balance(session, samples):
+    counts = session.finished["counts"]
+    assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
+
+
+def test_a_complete_session_has_every_tick(make_session):
+    session = make_session().run()
+    samples = session.samples
+    assert session.finished["finished"] == "complete"
+    assert session.finished["reason"] == ""
+    assert session.finished["counts"] == {"scheduled": 5000, "missed": 0, "late": 0, "lost": 0}
+    assert np.array_equal(samples["tick"], np.arange(5000))
+    assert np.array_equal(samples["t_ns"], 1_000_000 * np.arange(5000))
+    assert not samples["lateness_ns"].any()
+    assert not samples["work_ns"].any()
+    assert not np.bitwise_and(samples["status"], Status.TORQUE_OFF).any()
+    session.assert_safe()
+
+
+def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(make_session):
+    session = make_session().run()
+    samples = session.samples
+    relative = samples["angle_reference_rad"] - samples["angle_reference_rad"][0]
+    assert np.allclose(relative, session.excitation.reference_rad, atol=1e-15)
+    assert abs(samples["angle_reference_rad"][0] - samples["angle_rad"][0]) < 3 * 7e-5
+
+
+def test_the_tare_takes_the_offset_away(make_session):
+    session = make_session().run()
+    ready = session.parent.messages[0]["ready"]
+    offset = session.profile.rig.simulation.offset
+    axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+    for axis, expected in zip(axes, offset, strict=True):
+        spread = float(ready[f"tare_std_{axis}"])
+        assert abs(float(ready[f"tare_mean_{axis}"]) - expected) < 0.2 * spread
+    rest = session.samples[: session.excitation.segments["rest"][1]]
+    assert abs(rest["fz_n"].mean()) < 0.01
+    assert abs(rest["coupling_torque_nm"].mean()) < 1e-3
+    assert np.array_equal(rest["coupling_torque_nm"], rest["tz_nm"])
+
+
+def test_the_terms_of_the_controller_add_up(make_session):
+    session = make_session().run()
+    controls = session.controls
+    assert np.array_equal(controls["tick"], np.arange(0, 5000, 10))
+    terms = sum(
+        controls[name]
+        for name in (
+            "proportional_nm",
+            "integral_nm",
+            "derivative_nm",
+            "feedforward_nm",
+            "friction_nm",
+        )
+    )
+    command = session.samples["torque_command_nm"][::10]
+    assert np.allclose(terms, controls["unlimited_torque_nm"], atol=1e-12)
+    assert np.allclose(terms, command, atol=1e-12)
+
+
+def test_without_friction_and_noise_the_rig_is_the_computed_closed_loop(
+    make_session, quiet_profile
+):
+    session = make_session(profile=quiet_profile).run()
+    response = close_loop(quiet_profile.loop_model()).simulate(session.excitation.reference_rad)
+    samples = session.samples
+    scale = np.abs(response.angle_rad).max()
+    assert np.abs(samples["angle_rad"] - response.angle_rad).max() < 0.02 * scale
+    scale = np.abs(response.torque_nm).max()
+    assert np.abs(samples["torque_command_nm"] - response.torque_nm).max() < 0.02 * scale
+
+
+def test_the_same_seed_gives_the_same_samples_and_another_one_does_not(make_session):
+    first = make_session().run().samples
+    again = make_session().run().samples
+    assert np.array_equal(first, again)
+    profile = make_session().profile
+    simulation = replace(profile.rig.simulation, seed=2)
+    other = replace(profile, rig=replace(profile.rig, simulation=simulation))
+    assert not np.array_equal(first, make_session(profile=other).run().samples)
+
+
+class StopAt(VirtualClock):
+    """A clock that does something at one of its deadlines."""
+
+    def __init__(self, at_ns, action):
+        super().__init__()
+        self._at_ns = at_ns
+        self._action = action
+
+    def wait_until(self, deadline_ns):
+        if deadline_ns == self._at_ns:
+            self._action()
+        return super().wait_until(deadline_ns)
+
+
+@pytest.mark.parametrize(
+    ("action", "outcome", "words"),
+    [
+        (lambda s: s.board.__setitem__(Word.STOP, Stop.OPERATOR), "stopped", "operator"),
+        (lambda s: s.board.__setitem__(Word.STOP, Stop.NO_RECORDER), "fault", "recorder"),
+        (lambda s: setattr(s.parent, "living", False), "fault", "supervising"),
+    ],
+)
+@pytest.mark.parametrize("at_s", [0.3, 1.2, 3.0])
+def test_a_stop_leaves_the_torque_off(make_session, action, outcome, words, at_s):
+    session = make_session()
+    session.clock = StopAt(int(at_s * 1e9), lambda: action(session))
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == outcome
+    assert words in session.finished["reason"]
+    samples = session.samples
+    if samples is not None:
+        assert samples["status"][-1] & Status.TORQUE_OFF
+        assert samples["torque_command_nm"][-1] == 0.0
+        assert samples["tick"][-1] + 1 == session.finished["counts"]["scheduled"]
+        assert_books_balance(session, samples)
+    else:
+        assert session.finished["counts"]["scheduled"] == 0
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (lambda angle: angle + 2.0, "exceeds its limit"),
+        (lambda angle: float("nan"), "not a number"),
+        (lambda angle: float("inf"), "not a number"),
+    ],
+)
+@pytest.mark.parametrize("read", [1200, 1501, 3000])
+def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
+    make_session, fault, words, read
+):
+    session = make_session()
+    session.drive.fault_at, session.drive.fault = read, fault
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert words in session.finished["reason"]
+    assert session.drive.reads == read
+    samples = session.samples
+    if samples is not None:
+        assert samples["status"][-1] & Status.TORQUE_OFF
+        assert samples["torque_command_nm"][-1] == 0.0
+        assert_books_balance(session, samples)
+
+
+@pytest.mark.parametrize("read", [2, 1200, 3000, 6200])
+@pytest.mark.parametrize("error", [DeviceError("The drive is gone."), ZeroDivisionError()])
+def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
+    def fail(angle_rad):
+        raise error
+
+    session = make_session()
+    session.drive.fault_at, session.drive.fault = read, fail
+    if isinstance(error, DeviceError):
+        session.run()
+        assert "The drive is gone." in session.finished["reason"]
+        samples = session.samples
+        if read == 3000:
+            expected = Status.TORQUE_OFF | Status.ANGLE_STALE | Status.WRENCH_STALE
+            assert samples["status"][-1] & expected == expected
+            assert samples["torque_command_nm"][-1] == 0.0
+            assert_books_balance(session, samples)
+    else:
+        with pytest.raises(ZeroDivisionError):
+            session.run()
+    session.assert_safe()
+
+
+def test_it_refuses_to_start_while_the_motor_moves(make_session):
+    session = make_session()
+    session.drive.fault_at = 1
+    session.drive.fault = lambda angle: angle + 1e-5 * session.drive.reads
+    session.run()
+    session.assert_safe()
+    assert session.drive.torques == []
+    assert session.finished["finished"] == "fault"
+    assert "not at rest" in session.finished["reason"]
+
+
+class LateAt(VirtualClock):
+    """A clock that wakes late at some of its deadlines."""
+
+    virtual = False
+
+    def __init__(self, late_ns):
+        super().__init__()
+        self._late_ns = late_ns
+
+    def wait_until(self, deadline_ns):
+        late_ns = max(self._late_ns.get(deadline_ns, 0), self._now_ns - deadline_ns)
+        self._now_ns = deadline_ns + late_ns
+        return late_ns
+
+
+def test_missed_ticks_are_skipped_flagged_and_counted(make_session):
+    session = make_session(clock=LateAt({2_000_000_000: 3_200_000, 2_500_000_000: 700_000}))
+    session.run()
+    samples = session.samples
+    counts = session.finished["counts"]
+    assert session.finished["finished"] == "complete"
+    assert counts == {"scheduled": 5000, "missed": 3, "late": 1, "lost": 0}
+    assert_books_balance(session, samples)
+    gap = int(np.flatnonzero(np.diff(samples["tick"]) > 1)[0])
+    assert samples["tick"][gap + 1] - samples["tick"][gap] == 4
+    after = np.flatnonzero(samples["status"] & Status.AFTER_MISSED)
+    assert after.tolist() == [gap + 1]
+    assert samples["lateness_ns"][gap + 1] == 200_000
+    assert np.flatnonzero(samples["status"] & Status.LATE).size == 1
+
+
+def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):
+    session = make_session(clock=LateAt({3_000_000_000: 80_000_000}))
+    session.run()
+    session.assert_safe()
+    samples = session.samples
+    assert session.finished["finished"] == "fault"
+    assert "missed ticks" in session.finished["reason"]
+    assert session.finished["counts"]["missed"] == 80
+    assert samples["status"][-1] & Status.TORQUE_OFF
+    assert_books_balance(session, samples)
+
+
+def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
+    session = make_session()
+    session.run()
+    end_ns = session.samples["t_ns"][-1] + 1_500_000_000 + 1_000_000
+    late = make_session(clock=LateAt({int(end_ns): 10_400_000}))
+    late.run()
+    samples = late.samples
+    counts = late.finished["counts"]
+    assert late.finished["finished"] == "complete"
+    assert counts["scheduled"] == 5000
+    assert_books_balance(late, samples)
+
+
+def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
+    # The ring holds 16 s; nobody reads, so a longer record must lose a sample in real time.
+    from rigd.excitation import hold
+
+    profile = make_session().profile
+    session = make_session(
+        clock=LateAt({}), excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0)
+    )
+    session.run()
+    session.assert_safe()
+    counts = session.finished["counts"]
+    assert session.finished["finished"] == "fault"
+    assert "recorder" in session.finished["reason"]
+    assert counts["lost"] == 1
+    assert_books_balance(session, session.samples)
