@@ -261,7 +261,7 @@ def info(
         found = describe(path)
     except SessionError as error:
         _fail(str(error), EXIT_FAILED)
-    typer.echo(json.dumps(found.as_dict()) if as_json else found.as_text())
+    typer.echo(json.dumps(found.as_dict()) if as_json else "\n".join(found.lines()))
 
 
 def _as_json(result: "SessionResult") -> dict[str, object]:

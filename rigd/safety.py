@@ -42,8 +42,9 @@ class Limits:
     velocity_rad_s: Annotated[float, Gt(0)]
     tracking_error_rad: Annotated[float, Gt(0)]
     """Reference minus measured angle."""
-    sensor_range_percent: Annotated[float, Gt(0), Le(100)]
-    """Part of each axis of the sensor's range that may be used."""
+    sensor_range_percent: Annotated[float, Gt(0), Le(200)]
+    """Of the range of each of the sensor's axes; above 100 a clipped reading ends nothing (it is
+    flagged in its sample)."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
     missed_percent: Annotated[float, Gt(0), Le(100)]
     """Of all ticks scheduled so far, counted as if they were at least ten seconds' worth."""
@@ -252,7 +253,8 @@ class PredictedViolation:
 
     sentence: str
     may_be_forced: bool
-    """True only for the torque: it is limited whatever is asked for, the others are not."""
+    """True for torques: command and reading are then clipped and flagged. Angle, speed and tracking
+    error end the session when they are left, so forcing it would be no use."""
 
 
 def predict(
@@ -304,7 +306,8 @@ def violations(
     torque_limit_nm
         The motor's peak torque: beyond it the command saturates, which may be forced.
     coupling_torque_limit_nm
-        Coupling torque at which the sensor leaves its range.
+        Coupling torque at which the sensor leaves its range: beyond it the reading is clipped,
+        which may be forced too.
 
     Returns
     -------
@@ -335,8 +338,8 @@ def violations(
             prediction.peak_coupling_torque_nm,
             coupling_torque_limit_nm,
             "N·m",
-            "limits.sensor_range_percent",
-            False,
+            "sensor.range",
+            True,
         ),
         (
             "torque",
@@ -352,7 +355,7 @@ def violations(
                 f"The predicted peak {channel} of {value:.4g} {unit} exceeds {limit:.4g} {unit} "
                 f"({key}); lower the amplitude"
             )
-            sentence += ", or force the session to run saturated." if forced else "."
+            sentence += ", or force the session to run clipped." if forced else "."
             found.append(PredictedViolation(sentence, may_be_forced=forced))
     return found
 

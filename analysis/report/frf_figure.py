@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from analysis.welch_route import FittedModel, WelchAnalysis
 
 _COLUMNS: Final = 700
+_LEGEND_COLUMNS: Final = 4
 _LINES: Final[dict[str, dict[str, Any]]] = {
     "const": {"color": style.BLUE, "linestyle": "-"},
     "omega": {"color": style.VERMILION, "linestyle": (0, (4, 2))},
@@ -42,14 +43,17 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     types = settings.types
     columns = min(len(types), 4 if len(types) > 6 else 3)
     rows = -(-len(types) // columns)
-    width_in, height_in = max(4.4 * columns, 8.0), 3.75 * rows + 2.35
+    legend_rows = -(-(len(settings.weightings) + 2) // _LEGEND_COLUMNS)
+    width_in = max(4.4 * columns, 10.0)
+    head_in = 1.0 + 0.2 * legend_rows
+    height_in = 3.75 * rows + 1.15 + head_in
     figure = style.new_figure(
         width_in, height_in, f"{analysis.record.path.name} — frequency response",
         f"coupling torque over motor angle  ·  {_estimate_text(analysis)}",
     )  # fmt: skip
     grid = figure.add_gridspec(
         rows + 1, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
-        top=1 - 1.2 / height_in, bottom=0.5 / height_in, wspace=0.12, hspace=0.26,
+        top=1 - head_in / height_in, bottom=0.5 / height_in, wspace=0.12, hspace=0.26,
         height_ratios=(*(1.0,) * rows, 0.22),
     )  # fmt: skip
     lines = line_styles(settings.weightings)
@@ -78,8 +82,8 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     _coherence(strip, analysis)
     figure.legend(
         list(handles.values()), list(handles), loc="upper left",
-        bbox_to_anchor=(0.3 / width_in, 1 - 0.66 / height_in), ncols=len(handles),
-        borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.66 / height_in),
+        ncols=min(len(handles), _LEGEND_COLUMNS), borderaxespad=0.0,
     )  # fmt: skip
     return figure
 
@@ -179,7 +183,8 @@ def _db_limits(analysis: WelchAnalysis) -> tuple[float, float]:
     )
     bottom = float(np.quantile(measured_db, 0.002))
     # Room for the scores above the highest peak.
-    return bottom - 4.0, min(top, float(measured_db.max()) + 15.0) + 9.0
+    scores = 5.0 * len(analysis.settings.weightings)
+    return bottom - 4.0, min(top, float(measured_db.max()) + 15.0) + scores
 
 
 def _coherence(axes: Axes, analysis: WelchAnalysis) -> None:

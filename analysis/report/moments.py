@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _PERIODS_SHOWN: Final = 12
 _SHORTEST_S: Final = 0.3
+_LARGEST_SHARE: Final = 1 / 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +40,14 @@ class Moment:
 
 def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
     """Where the torque rings most at each of the first modes that the sampling can show."""
+    duration_s = len(record.time_s) / record.rate_hz
     moments = []
     for number, frequency_hz in enumerate(undamped_frequencies_hz(record.beam, count), start=1):
         if frequency_hz >= record.rate_hz / 2:
             break
         centre_s = loudest_moment_s(record.torque_nm, record.rate_hz, float(frequency_hz))
-        length_s = max(_PERIODS_SHOWN / float(frequency_hz), _SHORTEST_S)
+        length_s = min(_PERIODS_SHOWN / float(frequency_hz), _LARGEST_SHARE * duration_s)
+        length_s = max(length_s, _SHORTEST_S)
         samples = min(round(length_s * record.rate_hz), len(record.time_s))
         first = round((centre_s - length_s / 2) * record.rate_hz)
         first = min(max(first, 0), len(record.time_s) - samples)

@@ -46,7 +46,7 @@ def fits_table(analysis: WelchAnalysis) -> Table:
     """Parameters with standard deviation, and the indices of fit."""
     table = _table(f"{analysis.record.path.name}: fits", ["type", "weights"])
     for _parameter, heading, _factor in _COLUMNS:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", min_width=7)
     for heading in ("MSE", "WMSE", "MD"):
         table.add_column(heading, justify="right")
     for model in analysis.models:
@@ -107,7 +107,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
     """Mean and standard deviation over the files of each fit's parameters and indices."""
     table = _table(f"mean ± standard deviation over {len(analyses)} files", ["type", "weights"])
     for _parameter, heading, _factor in _COLUMNS:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", min_width=7)
     for heading in ("MSE", "WMSE", "MD"):
         table.add_column(heading, justify="right")
     for models in zip(*(analysis.models for analysis in analyses), strict=True):
@@ -131,20 +131,20 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
 def with_spread(value: float, std: float | None) -> str:
     """Write a value with its standard deviation, both to the latter's second digit.
 
-    A narrow terminal may break the line before the ±, not after it: a non-breaking space follows.
+    No space follows the ±, so that a narrow terminal breaks the line before it, if anywhere.
     """
     if std is None or not math.isfinite(std) or std <= 0.0:
         return f"{value:.5g}"
     decimals = max(1 - math.floor(math.log10(std)), 0)
     if decimals > 6:
-        return f"{value:.5g} ±\N{NO-BREAK SPACE}{std:.1e}"
-    return f"{value:.{decimals}f} ±\N{NO-BREAK SPACE}{std:.{decimals}f}"
+        return f"{value:.5g} ±{std:.1e}"
+    return f"{value:.{decimals}f} ±{std:.{decimals}f}"
 
 
 def _table(title: str, leading: list[str]) -> Table:
     table = Table(
         title=Text(title, style="bold"), title_justify="left", caption_justify="left",
-        box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold",
+        box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
     )  # fmt: skip
     for heading in leading:
         table.add_column(heading, no_wrap=True)

@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam.parameters import Beam, Damping
 
-_HOMOTOPY_STEPS = (8, 64, 512, 4096)
-"""Steps in which damping grows, coarse first. Only near critical damping, where a path turns
-sharply, does a finer one have to be walked."""
+_HOMOTOPY_STEPS = (8, 64)
+"""Steps in which damping grows: few, and more for the beams where that loses a path."""
+
+_ON_THE_CUT = 1e-9
+"""How far beyond pi an argument may be, by rounding, of a pole that is all but real."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +117,11 @@ def poles_for_eigenvalues(
         return _second_order_poles(omega_squared, damper + damping.zeta * omega_squared)
     for steps in _HOMOTOPY_STEPS:
         upper = _continued_poles(omega_squared, damper, damping, steps)
-        if not np.isnan(upper).any():
+        lost = np.isnan(upper)
+        if not lost.any():
             break
+    else:
+        upper[lost] = _searched_poles(omega_squared[lost], damper, damping)
     return np.stack([upper, upper.conj()], axis=1)
 
 
@@ -158,23 +163,55 @@ def _continued_poles(
 ) -> NDArray[np.complex128]:
     """Poles in the upper half plane, followed from the undamped ones while damping grows.
 
-    Newton's method in ln s, where a pole moves almost linearly, and where one that leaves the
-    principal sheet shows as an argument beyond pi. NaN where no pole was found.
+    NaN where the path was lost or has left the principal sheet.
     """
     log_s = 0.5 * np.log(omega_squared) + 0.5j * np.pi
-    with np.errstate(all="ignore"):  # a lost path overflows, and is recognised by its residual
-        for fraction in (np.arange(1, steps + 1) / steps) ** 2:
-            for _ in range(20):
-                inertial = np.exp(2 * log_s)
-                external = fraction * damper * np.exp(damping.lambda_ * log_s)
-                internal = fraction * damping.zeta * omega_squared * np.exp(damping.alpha * log_s)
-                residual = inertial + external + internal + omega_squared
-                step = residual / (
-                    2 * inertial + damping.lambda_ * external + damping.alpha * internal
-                )
-                log_s = log_s - step
-                if not np.max(np.abs(step)) > 1e-12:
-                    break
+    for fraction in (np.arange(1, steps + 1) / steps) ** 2:
+        log_s = _newton(log_s, omega_squared, fraction * damper, fraction * damping.zeta, damping)
+    return np.exp(log_s)
+
+
+def _searched_poles(
+    omega_squared: NDArray[np.float64], damper: float, damping: Damping
+) -> NDArray[np.complex128]:
+    """Poles in the upper half plane from many starts, most of them near the cut.
+
+    Near critical damping of a nearly first order, a pole turns along the cut so sharply that no
+    reasonable step follows it. NaN where no start leads to a pole on the principal sheet.
+    """
+    ratios, angles = np.meshgrid(np.linspace(-6, 6, 49), np.pi * np.array([0.7, 0.9, 0.98, 0.999]))
+    starts = (ratios + 1j * angles).ravel()
+    log_s = 0.5 * np.log(omega_squared)[:, None] + starts
+    log_s = _newton(log_s, omega_squared[:, None], damper, damping.zeta, damping)
+    found = ~np.isnan(log_s)
+    first = np.argmax(found, axis=1)[:, None]
+    return np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
+
+
+def _newton(
+    log_s: NDArray[np.complex128],
+    omega_squared: NDArray[np.float64],
+    damper: float,
+    zeta: float,
+    damping: Damping,
+) -> NDArray[np.complex128]:
+    """Roots of the characteristic equation by Newton's method in ln s.
+
+    There a pole moves almost linearly, and one that leaves the principal sheet shows as an argument
+    beyond pi. NaN where nothing was found, or not in the upper half of the principal sheet.
+    """
+    with np.errstate(all="ignore"):  # a start that leads nowhere overflows
+        for _ in range(40):
+            inertial = np.exp(2 * log_s)
+            external = damper * np.exp(damping.lambda_ * log_s)
+            internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
+            residual = inertial + external + internal + omega_squared
+            slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
+            step = residual / slope
+            log_s = log_s - step
+            if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
+                break
         scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
-        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi)
-        return np.where((np.abs(residual) < 1e-9 * scale) & on_sheet, np.exp(log_s), np.nan)
+        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _ON_THE_CUT)
+        solved = np.abs(residual) < 1e-9 * scale
+        return np.where(solved & on_sheet, log_s, np.nan + 0j)

@@ -96,6 +96,6 @@ def design_pid(
         kd_nm_s_per_rad=kd,
         filter_s=1.0 / a3,
         setpoint_weight_p=b,
-        # c = (b2 - b Kp)/(Kd a3) is the weight of the reference in the derivative path.
-        setpoint_weight_d=(b2 - b * kp) / (kd * a3),
+        # At p = g/3 there is no derivative part, neither of the angle nor of the reference.
+        setpoint_weight_d=(b2 - b * kp) / (kd * a3) if kd else 0.0,
     )

@@ -6,6 +6,7 @@ everything before it has left: what waits in the SDK is never more than one bloc
 """
 
 import contextlib
+import threading
 import time
 import uuid
 from typing import TYPE_CHECKING, Any
@@ -90,16 +91,23 @@ class Feed:
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
-            self._stalled = "timed out" in str(error)
-            if not self._stalled:
+            if "timed out" in str(error):
+                self._stalled = True
+            else:
                 # The connection is broken, and a stream never connects a second time.
-                self._stream = None
+                self._discard()
         else:
             self._stalled = False
 
-    def _restart(self) -> None:
+    def _discard(self) -> None:
+        # Up to 10 s in which it tries to reach its server once more; not for us to wait.
+        if self._stream is not None:
+            threading.Thread(target=self._stream.disconnect, daemon=True).start()
         self._stream = None
         self._stalled = False
+
+    def _restart(self) -> None:
+        self._discard()
         if time.monotonic() - self._started > _RESTART_S:
             self._started = time.monotonic()
             with contextlib.suppress(ServerError):  # to be tried again

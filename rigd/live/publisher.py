@@ -54,14 +54,14 @@ class _Publisher:
         self._unsent = 0
 
     def transfer(self) -> None:
-        """Show what the ring has; count what cannot be shown."""
-        while block := self._observer.take(self._most):
-            try:
-                sent = self._feed.offer(decode_samples(block))
-            except ValueError:
-                sent = False  # overwritten while it was copied
-            if not sent:
-                self._unsent += len(block) // SAMPLE_SIZE
+        """Show what the ring has, a second of it at most; count what cannot be shown."""
+        block = self._observer.take(self._most)
+        try:
+            sent = not block or self._feed.offer(decode_samples(block))
+        except ValueError:
+            sent = False  # overwritten while it was copied
+        if not sent:
+            self._unsent += len(block) // SAMPLE_SIZE
         self._board[Word.LIVE_DROPPED] = self._observer.dropped + self._unsent
 
 

@@ -100,7 +100,8 @@ class Server:
     @property
     def ports(self) -> Ports | None:
         """Where it listens, or None as long as it does not accept connections."""
-        return Ports(self._grpc, self._web) if self._grpc and self._web else None
+        accepting = self._grpc and self._web and self.running
+        return Ports(self._grpc, self._web) if accepting else None
 
     @property
     def last_words(self) -> str:

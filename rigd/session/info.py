@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from rigd.session.errors import SessionError
 from rigd.session.format import Status
 from rigd.session.reader import Event, Session, read_session
 
@@ -96,10 +97,15 @@ def describe(path: Path) -> SessionInfo:
     Raises
     ------
     SessionError
-        If the file cannot be read or does not state its rate.
+        If the file cannot be read or does not state a rate greater than 0.
     """
     session = read_session(path)
     rate_hz = session.number("rate_hz")
+    if rate_hz <= 0:
+        raise SessionError(
+            f"{path}: rate_hz in the metadata 'session' is {rate_hz:g}, but must be greater than 0 "
+            "Hz. Whoever writes the file must correct it."
+        )
     ticks = session.samples["tick"]
     span = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
     return SessionInfo(

@@ -300,12 +300,14 @@ class _Reader:
         end = start
         while end < footer:
             opcode, content, end = _record_at(data[:footer], end, " of the summary")
-            if opcode != Opcode.STATISTICS:
-                continue
-            statistics = _parsed(Statistics.read, data[content:end], " in the summary")
-            counts = statistics.channel_message_counts
-            if any(self._counts[channel] != count for channel, count in counts.items()):
-                raise _DamageError("has not the messages that its statistics count")
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                # Those of channels without messages may stand here only.
+                self._read_other(opcode, data[content:end], " in the summary")
+            elif opcode == Opcode.STATISTICS:
+                statistics = _parsed(Statistics.read, data[content:end], " in the summary")
+                counts = statistics.channel_message_counts
+                if any(self._counts[channel] != count for channel, count in counts.items()):
+                    raise _DamageError("has not the messages that its statistics count")
 
 
 def _prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rigd.control import ControlDesignError, ControlSettings, PidController, design_pid
@@ -41,6 +41,7 @@ def reference_path(gains, s):
 
 
 @given(inertia=inertias, g=friction_poles, ratio=ratios)
+@example(inertia=1.0, g=15.0, ratio=1 / 3)  # no derivative part at all
 def test_reference_to_angle_is_the_double_pole(inertia, g, ratio):
     p = ratio * max(g, 1.0)
     gains = design_pid(inertia, g * inertia, p)
@@ -53,6 +54,7 @@ def test_reference_to_angle_is_the_double_pole(inertia, g, ratio):
 
 
 @given(inertia=inertias, g=friction_poles, ratio=ratios)
+@example(inertia=1.0, g=15.0, ratio=1 / 3)  # no derivative part at all
 def test_all_four_poles_lie_at_the_place_asked_for(inertia, g, ratio):
     p = ratio * max(g, 1.0)
     gains = design_pid(inertia, g * inertia, p)

@@ -25,10 +25,15 @@ RATE_HZ = 1000.0
 
 
 class Producer(threading.Thread):
-    """Writes plausible samples at 1 kHz, like the control loop, and never waits for anybody."""
+    """Writes plausible samples at 1 kHz, like the control loop, and never waits for anybody.
 
-    def __init__(self, capacity: int = 16_000) -> None:
+    `speed` makes more of them in the same time: kernels buffer seconds of samples for a server
+    that does not read.
+    """
+
+    def __init__(self, capacity: int = 16_000, speed: float = 1.0) -> None:
         super().__init__(daemon=True)
+        self.speed = speed
         self.ring = Ring.create(SAMPLE_SIZE, capacity)
         self.tick = 0
         self.refused = 0
@@ -37,7 +42,7 @@ class Producer(threading.Thread):
     def run(self) -> None:
         start = time.monotonic()
         while not self._halt.wait(0.005):
-            while self.tick < (time.monotonic() - start) * RATE_HZ:
+            while self.tick < (time.monotonic() - start) * self.speed * RATE_HZ:
                 self._write()
                 self.ring.take(1000)  # what the recorder does
 
@@ -192,8 +197,8 @@ def gone():
 def start_producer():
     producers = []
 
-    def start(capacity: int = 16_000) -> Producer:
-        producers.append(Producer(capacity))
+    def start(**options) -> Producer:
+        producers.append(Producer(**options))
         producers[-1].start()
         return producers[-1]
 

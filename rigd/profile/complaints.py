@@ -1,0 +1,169 @@
+"""What is wrong with a profile, in sentences that name key, value, unit and remedy."""
+
+import difflib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic_core import ErrorDetails
+
+from rigd.control import ControlDesignError, design_pid
+from rigd.profile.settings import SECTIONS, SOURCES, TEXTS, keys
+
+# Longest endings first: the first that fits is the key's unit.
+_UNITS = {
+    "_nm_s_per_rad": "N·m·s/rad",
+    "_kg_per_m": "kg/m",
+    "_kg_m2": "kg·m²",
+    "_n_m2": "N·m²",
+    "_percent": "%",
+    "_rad_s": "rad/s",
+    "_rad": "rad",
+    "_nm": "N·m",
+    "_hz": "Hz",
+    "_us": "µs",
+    "_m": "m",
+    "_n": "N",
+    "_s": "s",
+}
+_UNITS_OF_SIX = {
+    "sensor.resolution": "N, N, N, N·m, N·m, N·m",
+    "sensor.range": "N, N, N, N·m, N·m, N·m",
+    "sensor.projection": "m, m, m, 1, 1, 1",
+    "simulation.offset": "N, N, N, N·m, N·m, N·m",
+}
+
+
+def no_source(key: str, source: object) -> str:
+    """Complain about a number whose source is absent or made up."""
+    if source is None:
+        return f"{key} has no source; add source = {_choice(SOURCES)}."
+    return f"{key} has source = {_show(source)}; choose {_choice(SOURCES)}."
+
+
+def bare_number(key: str, value: object) -> str:
+    """Complain about a number that stands without a source."""
+    return (
+        f"{key} = {_show(value)}{_unit(key)} does not say where it comes from; write "
+        f'{{ value = {_show(value)}, source = "…" }} with {_choice(SOURCES)}.'
+    )
+
+
+def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong between values that are each in range."""
+    rated, peak = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
+    if peak < rated:
+        yield (
+            f"motor.peak_torque_nm = {peak:g} N·m is below motor.rated_torque_nm = {rated:g} N·m; "
+            "the peak is at least the rated torque."
+        )
+    if not any(values["sensor.projection"]):
+        yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
+    try:
+        design_pid(
+            values["motor.inertia_kg_m2"],
+            values["motor.viscous_nm_s_per_rad"],
+            values["control.pole_rad_s"],
+        )
+    except ControlDesignError as error:
+        yield str(error)
+    simulated = "sim" in (values["devices.drive"], values["devices.sensor"])
+    if simulated and "simulation.seed" not in values:
+        yield "section [simulation] is missing, which the simulated devices of [devices] need."
+
+
+def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
+    """Yield one complaint for each key that is absent, or for a whole section."""
+    reported = set()
+    for key in absent:
+        section = key.rpartition(".")[0]
+        if section and not any(k.rpartition(".")[0] == section for k in given):
+            if section not in reported:
+                reported.add(section)
+                yield f"section [{section}] is missing."
+        elif key in TEXTS:
+            yield f'{key} is missing; add {key} = "…" at the top.'
+        else:
+            yield f'{key} is missing; add it as {{ value = …, source = "…" }}{_unit(key, " in")}.'
+
+
+def unknown(key: str, given: Mapping[str, Any]) -> str:
+    """Complain about a key that no profile has: a slip of the pen, or another unit."""
+    if key in SECTIONS:
+        return f"{key} = {_show(given[key])} must be a section; write [{key}] and its keys below."
+    section = key.rpartition(".")[0]
+    known = [k for k in keys() if k.rpartition(".")[0] == section]
+    if not known:
+        close = difflib.get_close_matches(section or key, SECTIONS, 1)
+        hint = f"did you mean [{close[0]}]?" if close else f"sections are {', '.join(SECTIONS)}."
+        return f"{key} is not a key of a profile; {hint}"
+    for candidate in known:
+        suffix = next((s for s in _UNITS if candidate.endswith(s)), "")
+        stem = candidate.removesuffix(suffix)
+        if suffix and key.startswith(stem + "_"):
+            return (
+                f"{key} = {_show(given[key])} has the wrong unit "
+                f"('{key.removeprefix(stem + '_')}'); write {candidate}, the value in "
+                f"{_UNITS[suffix]}."
+            )
+    close = difflib.get_close_matches(key, known, 1)
+    if close:
+        return f"{key} is unknown; did you mean {close[0]}{_unit(close[0], ', in')}?"
+    names = ", ".join(k.rpartition(".")[2] for k in known)
+    return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names}."
+
+
+_KINDS = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "text in quotes",
+    "tuple_type": "an array of six numbers",
+    "finite_number": "a finite number",
+    "missing": "an array of six numbers",
+    "too_long": "an array of six numbers",
+    "string_too_short": "text",
+}
+_RANGES = {
+    "greater_than": ("gt", "more than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+
+
+def wrong(detail: ErrorDetails) -> str:
+    """Complain about a value of the wrong type or out of its range."""
+    key, *place = detail["loc"]
+    if detail["type"] == "missing":  # one of the six
+        place = []
+    where = f"{key}[{place[0]}]" if place else str(key)
+    what = f"{where} = {_show(detail['input'])}{_unit(str(key))}"
+    if detail["type"] in _RANGES:
+        name, words = _RANGES[detail["type"]]
+        remedy = f"must be {words} {detail['ctx'][name]:g}"
+        if str(key).startswith("beam.damping."):
+            remedy += ": a negative coefficient or an order of 2 or more is an unstable beam"
+    else:
+        remedy = f"must be {_KINDS.get(detail['type'], detail['msg'])}"
+    return f"{what} {remedy}."
+
+
+def _unit(key: str, before: str = "") -> str:
+    """Return the unit of a key as written after its value, or nothing."""
+    unit = _UNITS_OF_SIX.get(key) or next((u for s, u in _UNITS.items() if key.endswith(s)), "")
+    return f"{before} {unit}" if unit else ""
+
+
+def _show(value: object) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_show(item) for item in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _choice(words: tuple[str, ...]) -> str:
+    return " or ".join(f'"{word}"' for word in words)

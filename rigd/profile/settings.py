@@ -1,0 +1,131 @@
+"""What a profile consists of: its sections, and the settings that no other module declares."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+from annotated_types import Ge, Gt, Le, MinLen
+
+from rigd.beam import Beam, Damping
+from rigd.control import ControlSettings, LoopModel
+from rigd.devices.parameters import (
+    Actuation,
+    Encoder,
+    Motor,
+    RigParameters,
+    Selection,
+    Simulation,
+    WrenchSensor,
+)
+from rigd.safety import Limits
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSettings:
+    """What happens round a record: taring before it, the way back and the check after it."""
+
+    tare_s: Annotated[float, Ge(0.5), Le(60)]
+    """Time at rest over which the sensor is averaged."""
+    rest_velocity_rad_s: Annotated[float, Gt(0)]
+    """Mean speed over the tare up to which the rig counts as resting."""
+    tare_drift_nm: Annotated[float, Gt(0)]
+    """Change of the coupling torque's zero over a session above which a warning is given."""
+    return_s: Annotated[float, Gt(0), Le(60)]
+    """Time of the smooth return to the start angle."""
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeSettings:
+    """What the control process asks of the operating system, where it is granted."""
+
+    priority: Annotated[int, Ge(0), Le(99)]
+    """SCHED_FIFO priority; 0 leaves the ordinary scheduler."""
+    cpu: Annotated[int, Ge(-1)]
+    """Core the process is bound to; -1 takes the last one it may use."""
+    spin_us: Annotated[float, Ge(0), Le(200)]
+    """Last part of each wait that is spent polling the clock instead of sleeping."""
+    late_us: Annotated[float, Gt(0)]
+    """Lateness above which a tick is flagged as late."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigSection:
+    """What is of the rig as a whole."""
+
+    rate_hz: Annotated[float, Gt(0), Le(20_000)]
+
+
+SECTIONS: dict[str, type] = {
+    "rig": RigSection,
+    "beam": Beam,
+    "beam.damping": Damping,
+    "motor": Motor,
+    "encoder": Encoder,
+    "sensor": WrenchSensor,
+    "actuation": Actuation,
+    "control": ControlSettings,
+    "limits": Limits,
+    "session": SessionSettings,
+    "realtime": RealtimeSettings,
+    "devices": Selection,
+    "simulation": Simulation,
+}
+OPTIONAL_SECTIONS = ("simulation",)
+TEXTS = ("name", "description")
+SOURCES = ("paper", "datasheet", "measured", "assumed")
+
+
+@cache
+def keys() -> dict[str, Any]:
+    """Every key a profile must have, dotted, and the annotated type of its value.
+
+    Defaults of the dataclasses do not count: a delay that nobody states is not known to be zero.
+    """
+    types: dict[str, Any] = dict.fromkeys(TEXTS, Annotated[str, MinLen(1)])
+    for section, cls in SECTIONS.items():
+        hints = get_type_hints(cls, include_extras=True)
+        types |= {key: hints[field] for key, field in fields_of(section)}
+    return types
+
+
+def fields_of(section: str) -> list[tuple[str, str]]:
+    """Pairs of dotted key and field of a section's dataclass."""
+    # A trailing underscore only keeps a field's name off a Python keyword.
+    names = [field.name for field in fields(SECTIONS[section])]
+    return [(f"{section}.{name.rstrip('_')}", name) for name in names]
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One rig, as its profile describes it."""
+
+    name: str
+    description: str
+    path: Path
+    text: str
+    """The file as read, for the session that uses it."""
+    rig: RigParameters
+    control: ControlSettings
+    limits: Limits
+    session: SessionSettings
+    realtime: RealtimeSettings
+    sources: Mapping[str, str]
+    """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
+
+    def loop_model(self) -> LoopModel:
+        """Return what the closed loop's design and prediction need to know of this rig."""
+        rig = self.rig
+        return LoopModel(
+            rate_hz=rig.rate_hz,
+            beam=rig.beam,
+            damping=rig.damping,
+            motor_inertia_kg_m2=rig.motor.inertia_kg_m2,
+            viscous_nm_s_per_rad=rig.motor.viscous_nm_s_per_rad,
+            tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
+            actuation_delay_s=rig.actuation.delay_s,
+            angle_delay_s=rig.encoder.delay_s,
+            torque_delay_s=rig.sensor.delay_s,
+            settings=self.control,
+        )

@@ -1,0 +1,134 @@
+"""The real-time realisation against Eq. 25, and what it refuses."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigd.beam import (
+    Beam,
+    Damping,
+    RealisationError,
+    couple,
+    modes,
+    realise,
+    transfer,
+)
+
+PAPER_BEAM = Beam(0.98, 4.7e-3, 0.090275)
+
+
+def table_3():
+    """Mean parameters of the twelve models of the paper's Table 3."""
+    sets = {}
+    with (Path(__file__).parent.parent / "data" / "paper_table3.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            name = "lambda_" if row["parameter"] == "lambda" else row["parameter"]
+            sets.setdefault(f"{row['type']}-{row['weighting']}", {})[name] = float(row["mean"])
+    return {name: Damping(**values) for name, values in sets.items()}
+
+
+SETS = table_3() | {"undamped": Damping()}
+
+
+def random_rigs(n, seed):
+    """Beams from centimetres to metres; damping from almost none to over-damped first modes."""
+    rng = np.random.default_rng(seed)
+    for _ in range(n):
+        beam = Beam(rng.uniform(0.3, 2), 10 ** rng.uniform(-3, 0), 10 ** rng.uniform(-2, 1.5))
+        yield (
+            beam,
+            Damping(
+                10 ** rng.uniform(-6, -2.7),
+                rng.uniform(0.2, 1.8),
+                10 ** rng.uniform(-3, 0),
+                rng.uniform(0.2, 1.8),
+            ),
+        )
+
+
+def measured_error(realisation, beam, damping):
+    """Largest relative error on a grid of this test's own: 0.05 to 100 Hz, dense at resonances."""
+    hz = [np.geomspace(0.05, 100, 4001)]
+    for mode in modes(beam, damping, 4):
+        width = max(mode.damping_ratio, 1e-4) * mode.natural_frequency_rad_s / (2 * np.pi)
+        hz.append(mode.frequency_hz + width * np.linspace(-2, 2, 41))
+    hz = np.concatenate(hz)
+    s = 2j * np.pi * hz[(hz > 0.05) & (hz < 100)]
+    apart = [abs(s - mode.poles_rad_s[0]) > 1e-6 * abs(s) for mode in modes(beam, damping, 4)]
+    s = s[np.all(apart, axis=0)]
+    return np.max(np.abs(realisation.transfer(s) / transfer(s, beam, damping) - 1))
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_table_3(name):
+    realisation = realise(PAPER_BEAM, SETS[name])
+    error = measured_error(realisation, PAPER_BEAM, SETS[name])
+    assert error < 5e-5
+    assert error < 2 * realisation.relative_error + 1e-9
+    assert realisation.b.size <= 60
+
+
+def test_random_beams_and_dampings():
+    for beam, damping in random_rigs(120, seed=1):
+        realisation = realise(beam, damping)
+        assert measured_error(realisation, beam, damping) < 3 * realisation.relative_error + 1e-9
+        for share in (0.1, 1.0, 10.0):
+            motor = couple(realisation, motor_inertia_kg_m2=share * beam.inertia_kg_m2)
+            assert np.linalg.eigvals(motor.a).real.max() < 1e-2
+
+
+def test_state_space_is_the_transfer_function_and_block_diagonal():
+    realisation = realise(PAPER_BEAM, SETS["VI-omega"])
+    s = 2j * np.pi * np.geomspace(0.01, 500, 40)
+    states = np.array(
+        [np.linalg.solve(x * np.eye(realisation.b.size) - realisation.a, realisation.b) for x in s]
+    )
+    g = (
+        s**2 * (states @ realisation.c + realisation.direct_inertia_kg_m2)
+        + s * realisation.direct_viscosity_nm_s_per_rad
+        + realisation.direct_stiffness_nm_per_rad
+    )
+    np.testing.assert_allclose(g, realisation.transfer(s), rtol=1e-10)
+    residues, poles = realisation.residues_kg_m2_per_s, realisation.poles_rad_s
+    pair = poles.imag > 0
+    partial = residues / (s[:, None] - poles)
+    partial[:, pair] += residues[pair].conj() / (s[:, None] - poles[pair].conj())
+    np.testing.assert_allclose(partial.sum(axis=1), states @ realisation.c, rtol=1e-10, atol=1e-15)
+    blocks = 2 * pair.sum()
+    assert not np.triu(realisation.a, 2).any()
+    assert not np.diag(realisation.a, 1)[1:blocks:2].any()
+    assert not np.diag(realisation.a, 1)[blocks:].any()
+    np.testing.assert_array_equal(np.diag(realisation.a, 1), -np.diag(realisation.a, -1))
+
+
+def test_direct_terms_dissipate_or_store():
+    for name, damping in SETS.items():
+        realisation = realise(PAPER_BEAM, damping)
+        assert realisation.direct_inertia_kg_m2 >= 0, name
+        assert realisation.direct_viscosity_nm_s_per_rad >= 0, name
+        assert realisation.direct_stiffness_nm_per_rad >= 0, name
+
+
+def test_refusal_names_the_error_achieved():
+    achieved = realise(PAPER_BEAM, SETS["VI-omega"]).relative_error
+    with pytest.raises(RealisationError, match=rf"{achieved:.1e}.*1\.0e-07 was asked"):
+        realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1e-7)
+    assert realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1.01 * achieved)
+
+
+@pytest.mark.parametrize(
+    "damping",
+    [
+        Damping(zeta=-1e-5),
+        Damping(gamma=-0.01),
+        Damping(zeta=1e-5, alpha=2.0),
+        Damping(gamma=0.01, lambda_=2.1),
+        Damping(zeta=1e-5, alpha=-0.1),
+        Damping(zeta=float("nan")),
+    ],
+)
+def test_active_beams_are_refused(damping):
+    with pytest.raises(RealisationError, match="creates energy"):
+        realise(PAPER_BEAM, damping)

@@ -1,0 +1,220 @@
+"""`rigd run`, from the command line to the closed file."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigd.session import Status, read_controls, read_session
+
+SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")
+
+
+def the_session(done):
+    assert done.returncode == 0, done.stderr
+    (session,) = json.loads(done.stdout)["sessions"]
+    return session
+
+
+def test_the_paper_s_chirp_is_recorded_whole(rigd, tmp_path):
+    session = the_session(rigd("run", "chirp", "--fast", "--json", "--output", "out"))
+    assert session["outcome"] == "complete"
+    assert session["scheduled"] == session["recorded"] == 136_000
+    assert session["missed"] == session["lost"] == session["late"] == 0
+    record = read_session(tmp_path / session["path"])
+    assert record.outcome["outcome"] == "complete"
+    assert record.outcome["recorded"] == "136000"
+    assert record.segments == {
+        "rest": (0, 1000),
+        "sweep": (1000, 121_000),
+        "ring_down": (121_000, 136_000),
+    }
+    samples = record.samples
+    assert np.array_equal(samples["tick"], np.arange(136_000))
+    flagged = Status.TORQUE_SATURATED | Status.WRENCH_SATURATED | Status.LIMIT_WARNING
+    assert not (samples["status"] & flagged).any()
+    # DESIGN: the reference is the paper's formula, relative to the angle at the start.
+    t = np.arange(120_000) / 1000
+    chirp = 0.025 * np.sin(2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 240))
+    reference = samples["angle_reference_rad"] - samples["angle_reference_rad"][0]
+    assert np.abs(reference[1000:121_000] - chirp).max() < 1e-12
+    assert read_controls(tmp_path / session["path"]).size == 13_600
+    assert record.attachments["profile.toml"].decode().startswith("# The simulated rig")
+    assert not list((tmp_path / "out").glob("*.part"))
+
+
+def test_all_three_modes_are_excited_and_the_torque_stays_below_the_limit(rigd, tmp_path):
+    session = the_session(rigd("run", "chirp", "--fast", "--json"))
+    samples = read_session(tmp_path / session["path"]).samples[1000:121_000]
+    assert np.abs(samples["torque_command_nm"]).max() < 0.9
+    spectrum = np.abs(np.fft.rfft(samples["coupling_torque_nm"]))
+    frequency_hz = np.fft.rfftfreq(120_000, 1e-3)
+    noise = np.median(spectrum[frequency_hz > 100])
+    for mode_hz in (2.57, 16.05, 44.5):
+        assert spectrum[np.abs(frequency_hz - mode_hz) < 0.5].max() > 20 * noise
+
+
+def test_the_same_seed_gives_equal_data_and_another_does_not(rigd, tmp_path):
+    paths = [
+        tmp_path
+        / the_session(rigd("run", "chirp", "--fast", "--json", "--seed", seed, *SHORT))["path"]
+        for seed in (5, 5, 6)
+    ]
+    first, again, other = (read_session(path).samples for path in paths)
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "ticks"),
+    [
+        (("hold", "--duration", "1", "--rest", "0.5"), 1500),
+        (("step", "--duration", "1", "--rest", "0.5", "--ring-down", "0.5"), 2000),
+        (
+            ("multisine", "--amplitude", "0.01", "--period", "1", "--duration", "2", "--start-hz",
+             "1", "--stop-hz", "20", "--rest", "0.5", "--ring-down", "0.5"),
+            3000,
+        ),
+    ],
+)  # fmt: skip
+def test_every_excitation_runs(rigd, tmp_path, arguments, ticks):
+    session = the_session(rigd("run", *arguments, "--fast", "--json"))
+    assert session["recorded"] == ticks
+    record = read_session(tmp_path / session["path"])
+    assert record.metadata["excitation"] == arguments[0]
+
+
+def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
+    (tmp_path / "reference.csv").write_text(
+        "time_s,angle_rad\n" + "".join(f"{t / 100},{0.01 * (t / 100)}\n" for t in range(201))
+    )
+    session = the_session(rigd("run", "file", "reference.csv", "--fast", "--json"))
+    record = read_session(tmp_path / session["path"])
+    first, end = record.segments["sweep"]
+    sweep = record.samples["angle_reference_rad"][first:end]
+    assert np.allclose(np.diff(sweep), 1e-5, atol=1e-9)
+    assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
+
+
+def test_a_series_gives_a_file_each_with_a_seed_each(rigd, tmp_path):
+    done = rigd("run", "chirp", "--fast", "--json", "--repeat", "3", "--note", "a series", *SHORT)
+    sessions = json.loads(done.stdout)["sessions"]
+    records = [read_session(tmp_path / session["path"]) for session in sessions]
+    assert [record.metadata["simulation_seed"] for record in records] == ["1", "2", "3"]
+    assert {record.metadata["note"] for record in records} == {"a series"}
+    assert len({record.path for record in records}) == 3
+
+
+def test_real_time_keeps_its_books(rigd, tmp_path):
+    session = the_session(
+        rigd("run", "chirp", "--json", "--duration", "3", "--rest", "0.5", "--ring-down", "0.5")
+    )
+    assert session["scheduled"] == 4000
+    assert session["lost"] == 0
+    assert session["recorded"] + session["missed"] == 4000
+    record = read_session(tmp_path / session["path"])
+    assert len(record.samples) == session["recorded"]
+    rate_hz = float(record.outcome["true_rate_hz"])
+    assert rate_hz == pytest.approx(1000 * session["recorded"] / 4000, rel=0.01)
+    assert record.metadata["realtime_clock"] == "real"
+    late = record.samples["status"] & Status.LATE
+    assert np.count_nonzero(late) == session["late"]
+
+
+@pytest.mark.parametrize("interrupt", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_stops_with_the_torque_off_and_a_complete_file(start_rigd, tmp_path, interrupt):
+    process = start_rigd("run", "chirp", "--json", "--duration", "60")
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    wait_for(lambda: part.stat().st_size > 100_000)
+    process.send_signal(interrupt)
+    output, errors = process.communicate(timeout=20)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    (session,) = json.loads(output)["sessions"]
+    assert session["outcome"] == "stopped"
+    assert session["scheduled"] == session["recorded"] + session["missed"]
+    record = read_session(tmp_path / session["path"])
+    assert record.outcome["outcome"] == "stopped"
+    last = record.samples[-1]
+    assert last["torque_command_nm"] == 0.0
+    assert last["status"] & Status.TORQUE_OFF
+    assert not list(tmp_path.glob("sessions/*.part"))
+
+
+def test_a_stop_before_the_record_leaves_no_file(start_rigd, tmp_path):
+    process = start_rigd("run", "chirp", "--json")
+    wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=20)
+    assert process.returncode == 130, errors
+    (session,) = json.loads(output)["sessions"]
+    assert session["path"] is None
+    assert session["scheduled"] == 0
+    assert not list((tmp_path / "sessions").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("victim", "words"), [("rigd.engine.control", "control process"), ("rigd.engine.recorder", "")]
+)
+def test_a_killed_process_ends_the_session_safely(start_rigd, tmp_path, victim, words):
+    process = start_rigd("run", "chirp", "--duration", "60")
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    wait_for(lambda: part.stat().st_size > 100_000)
+    os.kill(child_of(process.pid, victim), signal.SIGKILL)
+    output, errors = process.communicate(timeout=20)
+    assert process.returncode == 1, (output, errors)
+    assert "Traceback" not in errors
+    if victim == "rigd.engine.control":
+        (path,) = tmp_path.glob("sessions/*.mcap")
+        record = read_session(path)
+        assert record.outcome["outcome"] == "fault"
+        assert words in record.outcome["reason"]
+        counts = {name: int(record.outcome[name]) for name in ("scheduled", "missed", "lost")}
+        assert counts["scheduled"] == len(record.samples) + counts["missed"] + counts["lost"]
+    else:
+        assert part.exists()
+        assert "recorder process was killed" in output + errors
+
+
+def test_a_dead_supervisor_ends_the_session_safely(start_rigd, tmp_path):
+    process = start_rigd("run", "chirp", "--duration", "60")
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    wait_for(lambda: part.stat().st_size > 100_000)
+    control = child_of(process.pid, "rigd.engine.control")
+    process.kill()
+    process.wait()
+    path = wait_for(lambda: next(tmp_path.glob("sessions/*.mcap"), None))
+    record = read_session(path)
+    assert record.outcome["outcome"] == "fault"
+    assert "supervising process" in record.outcome["reason"]
+    assert record.samples[-1]["torque_command_nm"] == 0.0
+    assert record.samples[-1]["status"] & Status.TORQUE_OFF
+    wait_for(lambda: not Path(f"/proc/{control}").exists() or zombie(control))
+
+
+def wait_for(condition, timeout_s=20.0):
+    deadline = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+    return found
+
+
+def child_of(pid, module):
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (folder / "cmdline").read_bytes().decode()
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue  # it has ended meanwhile
+        if parent == pid and module in command:
+            return int(folder.name)
+    raise AssertionError(f"no {module} below {pid}")
+
+
+def zombie(pid):
+    return Path(f"/proc/{pid}/stat").read_text().split(")")[-1].split()[0] == "Z"

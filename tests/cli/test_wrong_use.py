@@ -1,0 +1,92 @@
+"""What an operator can get wrong: one or two sentences, an exit code, nothing broken."""
+
+import pytest
+
+PROFILE_CHANGES = {
+    "missing key": ("viscous_nm_s_per_rad = ", "# viscous_nm_s_per_rad = ", "viscous_nm_s_per_rad"),
+    "unknown key": ("rate_hz =", "colour = { value = 1.0, source = 'paper' }\nrate_hz =", "colour"),
+    "wrong unit": ("inertia_kg_m2 = ", "inertia_g_cm2 = ", "inertia_g_cm2"),
+    "out of range": ("value = 2.0e-3, source", "value = -2.0e-3, source", "inertia_kg_m2"),
+    "not a number": ("value = 0.98", "value = nan", "length_m"),
+    "a word": ("value = 0.98", "value = 'long'", "length_m"),
+    "no source": ("{ value = 0.98, source = \"paper\" }", "0.98", "length_m"),
+    "unstable beam": ("zeta = { value = 7.1e-5", "zeta = { value = -7.1e-5", "zeta"),
+    "unstable loop": (
+        "feedforward_gain = { value = 1.0",
+        "feedforward_gain = { value = 0.0",
+        "feedforward_gain",
+    ),
+    "no such drive": ('drive = "sim"', 'drive = "steam"', "steam"),
+    "not TOML": ("[rig]", "[rig", "TOML"),
+}  # fmt: skip
+
+
+def assert_refused(done, code, *words):
+    text = done.stdout + done.stderr
+    assert done.returncode == code, text
+    assert "Traceback" not in text
+    for word in words:
+        assert word in text
+    assert len(text) < 1500
+
+
+@pytest.mark.parametrize("change", PROFILE_CHANGES.values(), ids=PROFILE_CHANGES.keys())
+def test_a_bad_profile_is_refused(rigd, tmp_path, change):
+    from rigd.profile import load_profile
+
+    old, new, word = change
+    text = load_profile("sim").text
+    assert old in text
+    (tmp_path / "bad.toml").write_text(text.replace(old, new, 1))
+    done = rigd("run", "chirp", "--fast", "--profile", "bad.toml")
+    assert_refused(done, 2, word)
+    assert not (tmp_path / "sessions").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--amplitude", "nan"), ("amplitude",)),
+        (("--amplitude", "inf"), ("amplitude",)),
+        (("--amplitude", "0"), ("amplitude",)),
+        (("--amplitude", "much"), ("--amplitude",)),
+        (("--duration", "-1"), ("duration",)),
+        (("--duration", "1e9"), ("s",)),
+        (("--stop-hz", "1e4"), ("stop_hz", "Hz")),
+        (("--start-hz", "nan"), ("start_hz",)),
+        (("--rest", "-1"), ("rest",)),
+        (("--repeat", "0"), ("--repeat",)),
+        (("--seed", "-1"), ("--seed",)),
+        (("--profile", "nowhere"), ("nowhere", "sim")),
+        (("--no-such-option",), ("--no-such-option",)),
+        (("--output", "taken"), ("taken",)),
+    ],
+)
+def test_an_absurd_option_is_refused(rigd, tmp_path, arguments, words):
+    (tmp_path / "taken").write_text("a file")
+    assert_refused(rigd("run", "chirp", "--fast", *arguments), 2, *words)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["taken"]
+
+
+def test_ten_times_the_amplitude_is_refused_before_anything_moves_unless_forced(rigd, tmp_path):
+    done = rigd("run", "chirp", "--fast", "--amplitude", "0.25")
+    assert_refused(done, 2, "torque", "0.9 N·m", "peak_torque_nm")
+    assert not (tmp_path / "sessions").exists()
+
+
+def test_what_a_limit_forbids_cannot_be_forced(rigd, tmp_path):
+    done = rigd("run", "chirp", "--fast", "--force", "--amplitude", "3", "--stop-hz", "1")
+    assert_refused(done, 2, "angle", "limits.angle_rad")
+    assert not (tmp_path / "sessions").exists()
+
+
+@pytest.mark.parametrize(
+    "content", [None, b"", b"time,angle\n", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" * 2]
+)
+def test_info_on_what_is_no_session_file(rigd, tmp_path, content):
+    path = tmp_path / "broken.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert_refused(rigd("info", path), 1, "broken.mcap")
+    if content is not None:
+        assert path.read_bytes() == content

@@ -1,0 +1,176 @@
+"""Excitations: shape, length to the tick, and refusals."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rigd.excitation import ExcitationError, chirp, from_csv, hold, multisine, step
+
+
+def test_the_papers_chirp_to_the_last_bit():
+    excitation = chirp(rate_hz=1000.0)
+    reference = excitation.reference_rad
+    assert reference.shape == (136_000,)
+    assert excitation.segments == {
+        "rest": (0, 1000),
+        "sweep": (1000, 121_000),
+        "ring_down": (121_000, 136_000),
+    }
+    assert not reference[:1001].any()
+    for tick in (1, 777, 60_000, 119_999):
+        t = tick / 1000.0
+        phase = 2 * math.pi * (0.05 * t + (50.0 - 0.05) * t**2 / (2 * 120.0))
+        assert reference[1000 + tick] == pytest.approx(0.025 * math.sin(phase), abs=1e-12)
+    assert (reference[121_000:] == reference[120_999]).all()
+    assert excitation.parameters["amplitude_rad"] == 0.025
+    with pytest.raises(ValueError, match="read-only"):
+        reference[0] = 1.0
+
+
+def test_chirp_has_the_frequencies_it_says():
+    reference = chirp(
+        rate_hz=1000.0, start_hz=2.0, stop_hz=20.0, duration_s=30.0, rest_s=0.0, ring_down_s=0.0
+    ).reference_rad
+    crossings = np.flatnonzero(np.diff(np.signbit(reference)))
+    frequency_hz = 500.0 / np.diff(crossings)
+    at_s = (crossings[1:] + crossings[:-1]) / 2000.0
+    np.testing.assert_allclose(frequency_hz, 2.0 + 18.0 * at_s / 30.0, rtol=0.05)
+
+
+def test_taper_fades_both_ends_and_leaves_the_middle():
+    plain = chirp(rate_hz=1000.0, duration_s=20.0).reference_rad
+    faded = chirp(rate_hz=1000.0, duration_s=20.0, taper_s=2.0).reference_rad
+    assert (faded[3000:19_000] == plain[3000:19_000]).all()
+    assert abs(faded[20_999]) < 1e-7
+    np.testing.assert_allclose(faded[2000], 0.5 * plain[2000])
+
+
+@given(
+    rest=st.integers(0, 3000),
+    duration=st.integers(2, 5000),
+    ring_down=st.integers(0, 3000),
+    rate_hz=st.sampled_from([250.0, 1000.0, 997.0]),
+)
+def test_ticks_are_rate_times_time(rest, duration, ring_down, rate_hz):
+    excitation = hold(
+        rate_hz=rate_hz,
+        rest_s=rest / rate_hz,
+        duration_s=duration / rate_hz,
+        ring_down_s=ring_down / rate_hz,
+    )
+    assert excitation.reference_rad.size == rest + duration + ring_down
+    assert excitation.segments["sweep"] == (rest, rest + duration)
+
+
+def test_step_steps_at_the_sweeps_first_tick_and_holds():
+    excitation = step(rate_hz=1000.0, amplitude_rad=-0.01)
+    reference = excitation.reference_rad
+    assert reference[999] == 0.0
+    assert (reference[1000:] == -0.01).all()
+
+
+def test_multisine_is_flat_periodic_and_seeded():
+    options = {"rate_hz": 1000.0, "period_s": 10.0, "duration_s": 30.0, "taper_s": 0.0}
+    excitation = multisine(**options, start_hz=1.0, stop_hz=30.0, seed=7)
+    sweep = excitation.reference_rad[slice(*excitation.segments["sweep"])]
+    period = sweep[:10_000]
+    assert (sweep.reshape(3, -1) == period).all()
+    assert np.max(np.abs(period)) == pytest.approx(0.025)
+    spectrum = np.abs(np.fft.rfft(period))
+    inside = spectrum[10:301]
+    np.testing.assert_allclose(inside, inside[0], rtol=1e-9)
+    assert np.max(np.delete(spectrum, np.arange(10, 301))) < 1e-9 * inside[0]
+    assert abs(period[0]) == np.min(np.abs(period))
+    crest = 0.025 / np.sqrt(np.mean(period**2))
+    assert excitation.parameters["crest_factor"] == pytest.approx(crest)
+    again = multisine(**options, start_hz=1.0, stop_hz=30.0, seed=7)
+    other = multisine(**options, start_hz=1.0, stop_hz=30.0, seed=8)
+    assert (again.reference_rad == excitation.reference_rad).all()
+    assert (other.reference_rad != excitation.reference_rad).any()
+
+
+def test_csv_with_times_is_interpolated(tmp_path):
+    path = tmp_path / "path.csv"
+    path.write_text("angle_rad,time_s,note\n0.0,5.0,a\n0.2,5.1,b\n\n-0.1,5.4,c\n")
+    excitation = from_csv(path, rate_hz=100.0, rest_s=0.1, ring_down_s=0.2)
+    first, end = excitation.segments["sweep"]
+    sweep = excitation.reference_rad[first:end]
+    assert sweep.size == 41
+    np.testing.assert_allclose(sweep[[0, 5, 10, 25, 40]], [0.0, 0.1, 0.2, 0.05, -0.1], atol=1e-12)
+    assert (excitation.reference_rad[end:] == sweep[-1]).all()
+    assert excitation.parameters["file"] == "path.csv"
+
+
+@pytest.mark.parametrize("heading", ["", "angle_rad\n", "\ufeffangle_rad\r\n"])
+def test_csv_of_one_column_is_one_angle_a_tick(tmp_path, heading):
+    path = tmp_path / "angles.csv"
+    path.write_text(heading + "0.0\n0.1\n0.3\n", encoding="utf-8")
+    excitation = from_csv(path, rate_hz=1000.0, rest_s=0.0, ring_down_s=0.0)
+    assert excitation.reference_rad.tolist() == [0.0, 0.1, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "line 1 must name the columns"),
+        ("a,b\n1,2\n", "line 1 must name the columns"),
+        ("t,angle_rad\n1,2\n", "no time_s"),
+        ("time_s,angle_rad\n0,0\n1,x\n", "line 3: angle_rad = 'x' is not a finite number"),
+        ("time_s,angle_rad\n0,0\n1,nan\n", "line 3: angle_rad = 'nan' is not a finite number"),
+        ("time_s,angle_rad\n0,0\n1\n", "line 3 has no value in the column angle_rad"),
+        ("time_s,angle_rad\n1,0\n1,1\n", "line 3: time_s = 1 s does not come after"),
+        ("time_s,angle_rad\n0,0\n1e9,1\n", "7200 s is the most"),
+        ("angle_rad\n1.0\n", "has 1 angles"),
+    ],
+)
+def test_bad_csv_files_are_refused_with_their_line(tmp_path, text, complaint):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(ExcitationError) as caught:
+        from_csv(path, rate_hz=1000.0)
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])
+def test_files_that_cannot_be_read_are_named(tmp_path, content):
+    path = tmp_path / "bad.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ExcitationError, match=r"bad\.csv"):
+        from_csv(path, rate_hz=1000.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "complaint"),
+    [
+        (chirp, {"amplitude_rad": math.nan}, "amplitude_rad = nan rad is not a finite number"),
+        (chirp, {"amplitude_rad": 0.0}, "amplitude_rad = 0 rad must be more than 0 rad"),
+        (chirp, {"stop_hz": 400.0}, "stop_hz = 400 Hz leaves fewer than 4 samples"),
+        (chirp, {"start_hz": -1.0}, "start_hz = -1 Hz must not be negative"),
+        (chirp, {"stop_hz": 0.0}, "stop_hz = 0 Hz must be more than 0 Hz"),
+        (chirp, {"duration_s": -120.0}, "duration_s = -120 s must be more than 0 s"),
+        (chirp, {"duration_s": math.inf}, "duration_s = inf s is not a finite number"),
+        (chirp, {"duration_s": 1e7}, "7200 s is the most"),
+        (chirp, {"duration_s": 1e300}, "7200 s is the most"),
+        (chirp, {"duration_s": 1e-4}, "less than two ticks"),
+        (chirp, {"rest_s": -1.0}, "rest_s = -1 s must not be negative"),
+        (chirp, {"ring_down_s": math.nan}, "ring_down_s = nan s is not a finite number"),
+        (chirp, {"taper_s": 61.0}, "taper_s = 61 s at both ends does not fit"),
+        (step, {"amplitude_rad": 0.0}, "is no step"),
+        (step, {"amplitude_rad": math.inf}, "amplitude_rad = inf rad"),
+        (hold, {"duration_s": 0.0}, "duration_s = 0 s must be more than 0 s"),
+        (multisine, {"period_s": 7.0}, "is not a whole number of periods"),
+        (multisine, {"period_s": 0.01234567}, "is not a whole number of ticks"),
+        (multisine, {"seed": -1}, "seed = -1 is negative"),
+        (multisine, {"start_hz": 20.01, "stop_hz": 20.02}, "No harmonic"),
+        (multisine, {"start_hz": 20.0, "stop_hz": 10.0}, "No harmonic"),
+        (multisine, {"period_s": 0.0}, "period_s = 0 s must be more than 0 s"),
+    ],
+)
+def test_absurd_options_are_refused(make, options, complaint):
+    with pytest.raises(ExcitationError) as caught:
+        make(rate_hz=1000.0, **options)
+    assert complaint in str(caught.value)

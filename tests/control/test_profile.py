@@ -1,0 +1,256 @@
+"""Profiles: what the shipped one says, and every way to get one wrong."""
+
+import dataclasses
+import os
+import pickle
+import re
+from pathlib import Path
+
+import pytest
+
+from rigd.beam import Beam, Damping
+from rigd.control import check_stability, close_loop
+from rigd.profile import ProfileError, load_profile
+
+
+@pytest.fixture
+def refuse(tmp_path, sim_toml):
+    """Change the shipped profile, load it, and return the lines of the complaint."""
+
+    def attempt(*changes: tuple[str, str]) -> list[str]:
+        text = sim_toml
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        path = tmp_path / "rig.toml"
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ProfileError) as caught:
+            load_profile(path)
+        lines = str(caught.value).splitlines()
+        assert all(line.startswith(f"{path}: ") for line in lines)
+        return [line.removeprefix(f"{path}: ") for line in lines]
+
+    return attempt
+
+
+INERTIA = 'inertia_kg_m2 = { value = 2.0e-3, source = "assumed" }'
+
+
+def test_shipped_profile_is_the_papers_antenna(profile):
+    assert profile.rig.beam == Beam(0.98, 4.7e-3, 0.090275)
+    assert profile.rig.damping == Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
+    assert profile.rig.rate_hz == 1000.0
+    assert profile.rig.encoder.resolution_rad == 7e-5
+    assert profile.rig.simulation is not None
+
+
+def test_shipped_profile_is_stable(profile):
+    assert check_stability(close_loop(profile.loop_model())) is None
+
+
+def test_every_number_has_a_source(profile):
+    sources = profile.sources
+    assert sources["beam.length_m"] == "paper"
+    assert sources["motor.inertia_kg_m2"] == "assumed"
+    assert set(sources.values()) <= {"paper", "datasheet", "measured", "assumed"}
+    numbers = re.findall(r"^\w+ = \{", profile.text, re.MULTILINE)
+    assert len(sources) == len(numbers) > 40
+
+
+def test_profile_is_frozen_and_can_be_sent_to_another_process(profile):
+    assert pickle.loads(pickle.dumps(profile)) == profile
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        profile.name = "other"
+
+
+def test_a_path_and_a_name_find_the_same_profile(profile):
+    assert load_profile(profile.path) == profile
+    assert load_profile(str(profile.path)).rig == profile.rig
+
+
+def test_a_profile_of_the_working_directory_is_found(tmp_path, monkeypatch, sim_toml):
+    (tmp_path / "hw_profiles").mkdir()
+    (tmp_path / "hw_profiles/mine.toml").write_text(
+        sim_toml.replace('name = "sim"', 'name = "mine"'), encoding="utf-8"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert load_profile("mine").name == "mine"
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(ProfileError, match=r"no profile 'simm'; known profiles are .*sim"):
+        load_profile("simm")
+
+
+def test_a_missing_file_is_named():
+    with pytest.raises(ProfileError, match=r"nowhere/rig\.toml: there is no such file"):
+        load_profile("nowhere/rig.toml")
+
+
+def test_a_folder_is_no_profile(tmp_path):
+    folder = tmp_path / "x.toml"
+    folder.mkdir()
+    with pytest.raises(ProfileError, match=r"x\.toml: there is no such file"):
+        load_profile(folder)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read every file")
+def test_an_unreadable_file_is_named(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.touch(mode=0)
+    with pytest.raises(ProfileError, match="cannot be read"):
+        load_profile(path)
+
+
+def test_a_binary_file_is_named(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(ProfileError, match=r"rig\.toml: is not a text file"):
+        load_profile(path)
+
+
+def test_a_syntax_error_is_given_with_its_line(refuse):
+    [line] = refuse(("[motor]", "[motor"))
+    assert re.search(r"not valid TOML: .*line \d+", line)
+
+
+def test_an_unknown_key_names_the_closest_one_and_its_unit(refuse):
+    lines = refuse((INERTIA, INERTIA.replace("inertia", "inertai")))
+    assert "motor.inertai_kg_m2 is unknown; did you mean motor.inertia_kg_m2, in kg·m²?" in lines
+    assert len(lines) == 2  # and the right one is missing
+
+
+def test_a_wrong_unit_says_which_is_meant(refuse):
+    lines = refuse((INERTIA, 'inertia_g_cm2 = { value = 2.0e4, source = "assumed" }'))
+    assert (
+        "motor.inertia_g_cm2 = 20000 has the wrong unit ('g_cm2'); "
+        "write motor.inertia_kg_m2, the value in kg·m²." in lines
+    )
+
+
+def test_a_missing_key_is_named_with_its_unit(refuse):
+    [line] = refuse((INERTIA, ""))
+    assert line.startswith("motor.inertia_kg_m2 is missing")
+    assert "kg·m²" in line
+
+
+def test_a_missing_section_is_named_once(refuse, sim_toml):
+    section = sim_toml[sim_toml.index("[encoder]") : sim_toml.index("[sensor]")]
+    assert refuse((section, "")) == ["section [encoder] is missing."]
+
+
+def test_what_has_a_default_in_the_code_must_stand_in_a_profile(refuse, sim_toml):
+    section = sim_toml[sim_toml.index("[beam.damping]") : sim_toml.index("[motor]")]
+    assert refuse((section, "")) == ["section [beam.damping] is missing."]
+    [line] = refuse(("tool_inertia_kg_m2 = { value = 0.0, source", "# { value = 0.0, source"))
+    assert line.startswith("sensor.tool_inertia_kg_m2 is missing")
+
+
+def test_a_section_must_be_one(refuse, sim_toml):
+    section = sim_toml[sim_toml.index("[encoder]") : sim_toml.index("[sensor]")]
+    lines = refuse((section, ""), ("[rig]", "encoder = 3\n[rig]"))
+    assert "encoder = 3 must be a section; write [encoder] and its keys below." in lines
+
+
+def test_an_unknown_section_names_the_closest(refuse):
+    lines = refuse(("[encoder]", "[enkoder]"))
+    assert "section [encoder] is missing." in lines
+    assert any("enkoder.resolution_rad" in line and "[encoder]" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("value", "complaint"),
+    [
+        ("nan", "= nan kg·m² must be a finite number"),
+        ("inf", "= inf kg·m² must be a finite number"),
+        ("-1.0", "= -1 kg·m² must be more than 0"),
+        ("0.0", "= 0 kg·m² must be more than 0"),
+        ('"2e-3"', '= "2e-3" kg·m² must be a number'),
+        ("true", "= true kg·m² must be a number"),
+        ("[1.0]", "= [1] kg·m² must be a number"),
+    ],
+)
+def test_bad_values_are_named_with_their_unit(refuse, value, complaint):
+    [line] = refuse((INERTIA, INERTIA.replace("2.0e-3", value)))
+    assert line.startswith(f"motor.inertia_kg_m2 {complaint}")
+
+
+def test_a_whole_number_must_be_whole(refuse):
+    [line] = refuse(("priority = { value = 80", "priority = { value = 80.5"))
+    assert line.startswith("realtime.priority = 80.5 must be a whole number")
+
+
+def test_six_numbers_must_be_six(refuse):
+    [line] = refuse(("[0.0, 0.0, 0.0, 0.0, 0.0, 1.0]", "[0.0, 1.0]"))
+    assert line.startswith("sensor.projection")
+    assert "six numbers" in line
+
+
+def test_one_bad_number_of_six_is_named(refuse):
+    [line] = refuse(("[20.0, 20.0, 60.0,", "[20.0, -20.0, 60.0,"))
+    assert line.startswith("sensor.range[1] = -20 ")
+
+
+def test_a_number_without_a_source_is_refused(refuse):
+    [line] = refuse((INERTIA, "inertia_kg_m2 = { value = 2.0e-3 }"))
+    assert line.startswith("motor.inertia_kg_m2 has no source")
+    [line] = refuse((INERTIA, "inertia_kg_m2 = 2.0e-3"))
+    assert line.startswith("motor.inertia_kg_m2 = 0.002 kg·m² does not say where it comes from")
+
+
+def test_a_made_up_source_is_refused(refuse):
+    [line] = refuse((INERTIA, INERTIA.replace("assumed", "guess")))
+    assert 'source = "guess"' in line
+    assert '"datasheet"' in line
+
+
+def test_more_than_value_and_source_is_refused(refuse):
+    [line] = refuse((INERTIA, INERTIA.replace(" }", ", error = 0.1 }")))
+    assert "unknown part 'error'" in line
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("value = 7.1e-5", "value = -7.1e-5"), ("value = 0.594", "value = 2.0")],
+)
+def test_damping_that_is_unstable_by_nature_is_refused(refuse, old, new):
+    [line] = refuse((old, new))
+    assert line.startswith("beam.damping.")
+    assert "unstable beam" in line
+
+
+def test_a_peak_below_the_rated_torque_is_refused(refuse):
+    [line] = refuse(("peak_torque_nm = { value = 0.9", "peak_torque_nm = { value = 0.4"))
+    assert "motor.peak_torque_nm = 0.4 N·m is below motor.rated_torque_nm = 0.5 N·m" in line
+
+
+def test_a_pole_too_slow_for_the_motor_is_refused(refuse):
+    [line] = refuse(("pole_rad_s = { value = 80.0", "pole_rad_s = { value = 2.0"))
+    assert line.startswith("control.pole_rad_s = 2 rad/s is too slow")
+
+
+def test_simulated_devices_need_their_section(refuse, sim_toml):
+    [line] = refuse((sim_toml[sim_toml.index("[simulation]") :], ""))
+    assert "[simulation] is missing" in line
+
+
+def test_a_projection_of_nothing_is_refused(refuse):
+    [line] = refuse(("0.0, 0.0, 1.0]", "0.0, 0.0, 0.0]"))
+    assert line.startswith("sensor.projection is all zero")
+
+
+def test_all_problems_are_reported_at_once(refuse):
+    lines = refuse(
+        (INERTIA, INERTIA.replace("2.0e-3", "nan")),
+        ("tare_s = { value = 1.0", "tare_s = { value = 0.1"),
+        ('name = "sim"\n', ""),
+        ("rate_hz =", "rate_khz ="),
+    )
+    assert len(lines) == 5
+    assert any(line.startswith("session.tare_s = 0.1 s must be at least 0.5") for line in lines)
+    assert any("rig.rate_khz" in line and "rig.rate_hz" in line for line in lines)
+    assert any(line.startswith("name is missing") for line in lines)
+
+
+def test_the_shipped_profile_stands_where_the_checkout_keeps_it(profile):
+    assert profile.path == Path(__file__).resolve().parents[2] / "hw_profiles" / "sim.toml"

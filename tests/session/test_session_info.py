@@ -1,0 +1,74 @@
+"""Summary of a session file."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rigd.session import SessionError, SessionWriter, describe
+from rigd.session.format import Status
+
+
+@pytest.fixture
+def gappy(kit, tmp_path):
+    """Ticks 100…119 and 150…199; two samples late, one saturated."""
+    samples = kit.make_samples(100, first_tick=100)
+    samples["status"] = 0
+    samples["status"][3] = Status.LATE
+    samples["status"][60] = Status.LATE | Status.TORQUE_SATURATED
+    samples = np.concatenate([samples[:20], samples[50:]])
+    writer = SessionWriter(tmp_path / "a.mcap")
+    metadata = kit.METADATA | {"note": "red\x1b[31m\nsecond line"}
+    writer.begin(kit.START_UTC_NS, metadata, kit.SEGMENTS, kit.ATTACHMENTS)
+    writer.write_samples(kit.packed(samples))
+    writer.log(1_500_000_000, "error", "too fast")
+    return writer.close({"outcome": "stopped", "reason": "angle limit"})
+
+
+def test_counts(gappy):
+    info = describe(gappy)
+    assert (info.samples, info.ticks, info.missing_ticks) == (70, 100, 30)
+    assert info.duration_s == 0.1
+    assert info.status_counts == {"torque_saturated": 1, "late": 2}
+    assert info.start_utc == "2023-11-14T22:13:20.123456+00:00"
+    assert info.attachments == {"profile.toml": 6, "calibration.json": 2}
+    assert info.size_bytes == gappy.stat().st_size
+
+
+def test_the_document_is_json(gappy, kit):
+    document = json.loads(json.dumps(describe(gappy).as_dict()))
+    assert document["segments"] == {"rest": [0, 10], "sweep": [10, 900]}
+    assert document["outcome"] == {"outcome": "stopped", "reason": "angle limit"}
+    assert document["metadata"]["operator"] == kit.METADATA["operator"]
+    assert document["events"] == [
+        {"t_ns": 1_500_000_000, "level": "error", "name": "rigd", "message": "too fast"}
+    ]
+
+
+def test_the_lines_tell_people_and_carry_no_control_characters(gappy):
+    lines = describe(gappy).lines()
+    assert all(line.isprintable() for line in lines)
+    text = "\n".join(lines)
+    for part in (
+        "stopped (reason angle limit)",
+        "70 at 1000 Hz, 0.100 s, 30 ticks missing",
+        "late: 2 samples",
+        "sweep: 10 to 900 (0.89 s)",
+        "1.500 s",
+        "error: too fast [rigd]",
+        "red [31m second line",
+    ):
+        assert part in text
+
+
+def test_a_file_without_rate_is_refused(kit, tmp_path):
+    path = kit.write_foreign(tmp_path / "a.mcap", [], metadata=None)
+    with pytest.raises(SessionError, match=r"a\.mcap.*has no rate_hz"):
+        describe(path)
+
+
+@pytest.mark.parametrize("rate", ["0", "-1000"])
+def test_a_rate_that_is_not_positive_is_refused(kit, tmp_path, rate):
+    path = kit.write_foreign(tmp_path / "a.mcap", [], metadata={"rate_hz": rate})
+    with pytest.raises(SessionError, match=r"a\.mcap.*rate_hz .*must be greater than 0 Hz"):
+        describe(path)

@@ -1,0 +1,266 @@
+"""Reader of sound files: this writer's, and any other MCAP and protobuf library's."""
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, IndexType, Writer
+
+from rigd.session import Event, SessionError, read_controls, read_session
+from rigd.session.format import SAMPLE_FIELDS, SAMPLE_TYPES, decode_controls
+from rigd.session.schema import SAMPLE_SCHEMA, message_class, schema_data
+
+
+def encoded(samples, cls=None):
+    """Messages as google.protobuf writes them: zeros left out."""
+    cls = cls or message_class(SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA))
+    return [
+        cls(**dict(zip(SAMPLE_FIELDS, row, strict=True))).SerializeToString()
+        for row in samples.tolist()
+    ]
+
+
+def changed_schema(change):
+    """Return the sample's schema with `change` applied to its message descriptor."""
+    files = FileDescriptorSet.FromString(schema_data(SAMPLE_SCHEMA))
+    change(files.file[0].message_type[0])
+    return files.SerializeToString()
+
+
+def test_a_recorded_session_is_read_back(kit, recorded):
+    session = read_session(recorded.path)
+    assert session.path == recorded.path
+    np.testing.assert_array_equal(session.samples, recorded.samples)
+    np.testing.assert_array_equal(
+        read_controls(recorded.path), decode_controls(recorded.controls)
+    )  # fmt: skip
+    assert session.start_utc_ns == kit.START_UTC_NS
+    assert kit.METADATA.items() <= session.metadata.items()
+    assert session.segments == kit.SEGMENTS
+    assert session.outcome == kit.OUTCOME
+    assert session.attachments == kit.ATTACHMENTS
+    assert session.events == [
+        Event(-5_000_000, "info", "rigd.engine", "before the first tick"),
+        Event(1_000_000_000, "warning", "rigd", "late — 3 ticks"),
+    ]
+    assert session.number("beam_length_m") == 0.98
+    assert session.number("angle_delay_s", 0.0) == 0.0
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("extra", [None, "/other"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"chunk_size": 1},
+        {"chunk_size": 5000},
+        {"enable_data_crcs": True},
+        {"enable_crcs": False},
+        {"use_chunking": False},
+        {
+            "repeat_channels": False,
+            "repeat_schemas": False,
+            "use_statistics": False,
+            "use_summary_offsets": False,
+            "index_types": IndexType.NONE,
+        },
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_any_container_is_read(kit, tmp_path, compression, extra, options):
+    samples = kit.make_samples(333)
+    path = kit.write_foreign(
+        tmp_path / "f.mcap",
+        kit.fixed_messages(samples),
+        compression=compression,
+        extra=extra,
+        **options,
+    )
+    session = read_session(path)
+    np.testing.assert_array_equal(session.samples, samples)
+    assert session.metadata == kit.MINIMUM
+    assert session.start_utc_ns == 77
+    assert (session.segments, session.outcome, session.events) == ({}, None, [])
+    assert len(read_controls(path)) == 0
+
+
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 3000), st.booleans())
+def test_fixed_and_other_encodings_mix_in_any_order(kit, tmp_path, kinds, chunk_size, extra):
+    samples = kit.make_samples(len(kinds))
+    samples["status"] = 0  # which the other encoder leaves out
+    samples["fx_n"][::2] = 0.0
+    pairs = zip(kinds, kit.fixed_messages(samples), encoded(samples), strict=True)
+    path = kit.write_foreign(
+        tmp_path / "f.mcap",
+        [fixed if kind else other for kind, fixed, other in pairs],
+        chunk_size=chunk_size,
+        extra="/other" if extra else None,
+    )
+    np.testing.assert_array_equal(read_session(path).samples, samples)
+
+
+def test_fields_in_another_order_and_unknown_ones_are_decoded(kit, tmp_path):
+    samples = kit.make_samples(20)
+    messages = []
+    for message in kit.fixed_messages(samples):
+        # Fields 1 and 2 exchanged, at unchanged length; then an unknown field 20.
+        messages += [message[9:14] + message[:9] + message[14:] + b"\xa0\x01\x07"]
+    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    np.testing.assert_array_equal(read_session(path).samples, samples)
+    swapped = [m[:-3] for m in messages]
+    path = kit.write_foreign(tmp_path / "g.mcap", swapped)
+    np.testing.assert_array_equal(read_session(path).samples, samples)
+
+
+def test_samples_of_the_fixed_length_follow_their_own_schema(kit, tmp_path):
+    """The bytes are those of the fixed layout, but two fields have exchanged their names."""
+
+    def swap(message):
+        message.field[3].name, message.field[5].name = message.field[5].name, message.field[3].name
+
+    samples = kit.make_samples(20)
+    path = kit.write_foreign(
+        tmp_path / "f.mcap", kit.fixed_messages(samples), schema=changed_schema(swap)
+    )  # fmt: skip
+    read = read_session(path).samples
+    np.testing.assert_array_equal(read["angle_rad"], samples["coupling_torque_nm"])
+    np.testing.assert_array_equal(read["coupling_torque_nm"], samples["angle_rad"])
+
+
+def test_other_numbers_types_names_and_files_are_decoded(kit, tmp_path):
+    def change(message):
+        message.name = "Probe"
+        types = {"t_ns": "INT64", "tick": "UINT64", "angle_rad": "FLOAT", "status": "SINT32"}
+        for field in message.field:
+            field.number += 40
+            if field.name in types:
+                field.type = getattr(FieldDescriptorProto, f"TYPE_{types[field.name]}")
+        del message.field[6:12]  # no wrench
+        message.field.add(name="note", number=3, type=9, label=1)
+
+    schema = changed_schema(change)
+    cls = message_class("rigd.Probe", schema)
+    samples = kit.make_samples(30)
+    samples["angle_rad"] = samples["angle_rad"].astype(np.float32)
+    for name in SAMPLE_FIELDS[6:12]:
+        samples[name] = 0.0
+    names = [name for name in SAMPLE_FIELDS if name not in SAMPLE_FIELDS[6:12]]
+    messages = [
+        cls(note="x", **{name: sample[name].item() for name in names}).SerializeToString()
+        for sample in samples
+    ]
+    path = kit.write_foreign(tmp_path / "f.mcap", messages, schema=schema, name="rigd.Probe")
+    np.testing.assert_array_equal(read_session(path).samples, samples)
+
+
+@pytest.mark.parametrize("field", ["t_ns", "tick", "angle_rad", "coupling_torque_nm"])
+def test_a_schema_without_a_required_field_is_refused(kit, tmp_path, field):
+    def change(message):
+        del message.field[SAMPLE_FIELDS.index(field)]
+
+    path = kit.write_foreign(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
+    with pytest.raises(SessionError, match=rf"f\.mcap: the schema .* no field {field}"):
+        read_session(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "kind", "label"), [("tick", 1, 1), ("angle_rad", 9, 1), ("fx_n", 1, 3)]
+)
+def test_a_schema_with_unreadable_types_is_refused(kit, tmp_path, field, kind, label):
+    def change(message):
+        message.field[SAMPLE_FIELDS.index(field)].type = kind
+        message.field[SAMPLE_FIELDS.index(field)].label = label
+
+    path = kit.write_foreign(tmp_path / "f.mcap", [b""], schema=changed_schema(change))
+    with pytest.raises(SessionError, match=rf"field {field} .*{SAMPLE_TYPES[field]}"):
+        read_session(path)
+
+
+def test_a_number_too_large_for_its_field_is_refused(kit, tmp_path):
+    def change(message):
+        message.field[SAMPLE_FIELDS.index("tick")].type = FieldDescriptorProto.TYPE_UINT64
+
+    schema = changed_schema(change)
+    message = message_class(SAMPLE_SCHEMA, schema)(tick=2**32).SerializeToString()
+    path = kit.write_foreign(tmp_path / "f.mcap", [message], schema=schema)
+    with pytest.raises(SessionError, match="holds a number that its field cannot take"):
+        read_session(path)
+
+
+def test_an_event_log_that_is_no_protobuf_is_left_out(kit, tmp_path):
+    path = kit.write_foreign(
+        tmp_path / "f.mcap", kit.fixed_messages(kit.make_samples(3)), extra="/rig/event"
+    )
+    assert read_session(path).events == []
+
+
+@pytest.mark.parametrize("ticks", [[0, 1, 1], [0, 2, 1], [5, 4, 3]])
+def test_ticks_that_do_not_increase_are_refused(kit, tmp_path, ticks):
+    samples = kit.make_samples(3)
+    samples["tick"] = ticks
+    path = kit.write_foreign(tmp_path / "f.mcap", kit.fixed_messages(samples))
+    with pytest.raises(SessionError, match=r"f\.mcap: tick \d follows tick \d"):
+        read_session(path)
+
+
+def test_gaps_in_the_ticks_are_read(kit, tmp_path):
+    samples = kit.make_samples(10)[[0, 1, 5, 9]]
+    path = kit.write_foreign(tmp_path / "f.mcap", kit.fixed_messages(samples))
+    assert read_session(path).samples["tick"].tolist() == [0, 1, 5, 9]
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (None, "has no rate_hz.*number in Hz"),
+        ("fast", "rate_hz .* is 'fast', .*number in Hz"),
+        ("nan", "'nan', which is not a finite"),
+        ("inf", "'inf', which is not a finite"),
+        ("", "'', which is not a finite"),
+        ("9" * 5000, "not a finite"),
+    ],
+)
+def test_a_bad_number_in_the_metadata_is_named(kit, tmp_path, value, message):
+    metadata = dict(kit.MINIMUM)
+    del metadata["rate_hz"]
+    if value is not None:
+        metadata["rate_hz"] = value
+    path = kit.write_foreign(
+        tmp_path / "f.mcap", kit.fixed_messages(kit.make_samples(2)), metadata=metadata
+    )
+    session = read_session(path)
+    with pytest.raises(SessionError, match=r"f\.mcap: .*" + message) as error:
+        session.number("rate_hz")
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"format_version": "2"}, "version '2', and this program reads version 1"),
+        ({"start_utc_ns": "yesterday"}, "start_utc_ns .* 'yesterday'"),
+        ({"start_utc_ns": "-1"}, "start_utc_ns"),
+    ],
+)
+def test_other_bad_metadata_is_named(kit, tmp_path, metadata, message):
+    path = kit.write_foreign(
+        tmp_path / "f.mcap", kit.fixed_messages(kit.make_samples(2)), metadata=metadata
+    )
+    with pytest.raises(SessionError, match=message):
+        read_session(path)
+
+
+@pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "-1,5", "7,3", "1.5,3", "1" * 50 + ",2"])
+def test_a_bad_segment_is_named(tmp_path, text):
+    path = tmp_path / "f.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("segments", {"sweep": text})
+        schema = writer.register_schema(SAMPLE_SCHEMA, "protobuf", schema_data(SAMPLE_SCHEMA))
+        writer.register_channel("/rig/sample", "protobuf", schema)
+        writer.finish()
+    with pytest.raises(SessionError, match="segment 'sweep'"):
+        read_session(path)

@@ -1,0 +1,274 @@
+"""Writer: a valid MCAP file, durable at every moment, and nothing ever overwritten."""
+
+import errno
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from rigd.session import SessionError, SessionExistsError, SessionWriter, read_session
+from rigd.session.format import SAMPLE_FIELDS, decode_controls, decode_samples
+from rigd.session.schema import message_class
+
+
+def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
+    with recorded.path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        classes, decoded = {}, {}
+        for schema, channel, message in reader.iter_messages():
+            if schema.name not in classes:
+                classes[schema.name] = message_class(schema.name, schema.data)
+            decoded.setdefault(channel.topic, []).append(
+                (message, classes[schema.name].FromString(message.data))
+            )
+        summary = reader.get_summary()
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        attachments = {record.name: record for record in reader.iter_attachments()}
+    rows = [tuple(getattr(m, name) for name in SAMPLE_FIELDS) for _, m in decoded["/rig/sample"]]
+    assert rows == recorded.samples.tolist()
+    assert [m.tick for _, m in decoded["/rig/control"]] == list(range(0, 1111, 10))
+    assert [m.level for _, m in decoded["/rig/event"]] == [2, 3]
+    for record, message in decoded["/rig/sample"]:
+        assert record.log_time == record.publish_time == kit.START_UTC_NS + message.t_ns
+        assert record.sequence == message.tick
+    record, event = decoded["/rig/event"][0]
+    assert event.timestamp.ToNanoseconds() == record.log_time == kit.START_UTC_NS - 5_000_000
+    counts = {summary.channels[i].topic: n for i, n in
+              summary.statistics.channel_message_counts.items()}  # fmt: skip
+    assert counts == {"/rig/sample": 1111, "/rig/control": 112, "/rig/event": 2}
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
+    assert summary.statistics.message_start_time == kit.START_UTC_NS - 5_000_000
+    assert summary.statistics.message_end_time == kit.START_UTC_NS + 1_110_000_000
+    assert metadata["session"] == kit.METADATA | {
+        "format_version": "1",
+        "start_utc_ns": str(kit.START_UTC_NS),
+    }
+    assert metadata["segments"] == {"rest": "0,10", "sweep": "10,900"}
+    assert metadata["outcome"] == kit.OUTCOME
+    assert attachments["profile.toml"].data == b"a = 1\n"
+    assert attachments["profile.toml"].media_type == "application/toml"
+
+
+def test_the_plain_streaming_reader_verifies_all_checksums(recorded):
+    with recorded.path.open("rb") as stream:
+        assert sum(1 for _ in StreamReader(stream, validate_crcs=True).records) > 1111
+
+
+def test_indexes_lead_to_the_messages_of_a_time(kit, recorded):
+    start = kit.START_UTC_NS + 400_000_000
+    with recorded.path.open("rb") as stream:
+        found = [
+            (channel.topic, message.log_time - start)
+            for _, channel, message in make_reader(stream).iter_messages(
+                starting_at=start, ending_before=start + 11_000_000
+            )
+        ]
+    expected = [("/rig/sample", tick * 1_000_000) for tick in range(11)]
+    expected += [("/rig/control", 0), ("/rig/control", 10_000_000)]
+    assert sorted(found) == sorted(expected)
+
+
+def test_a_chunk_has_250_samples_and_the_controls_of_their_time(kit, tmp_path):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_controls(kit.packed_controls(range(0, 600, 10)))
+    writer.write_samples(kit.packed(kit.make_samples(600)))
+    writer.close(kit.OUTCOME)
+    ticks = [
+        {c: [decode(m.data)["tick"][0] for m in chunk if m.channel_id == c]
+         for c, decode in ((1, decode_samples), (2, decode_controls))}
+        for chunk in kit.chunks_of(tmp_path / "a.mcap")
+    ]  # fmt: skip
+    for i, (first, end) in enumerate(((0, 250), (250, 500), (500, 600))):
+        assert ticks[i] == {1: list(range(first, end)), 2: list(range(first, end, 10))}
+
+
+def test_an_error_is_in_the_file_at_once(kit, tmp_path):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(7)))
+    writer.log(7_000_000, "warning", "wait for the chunk")
+    assert kit.chunks_of(writer.part) == []
+    writer.log(7_000_000, "fatal", "angle limit")
+    (chunk,) = kit.chunks_of(writer.part)
+    assert len(chunk) == 9
+    writer.abandon()
+
+
+def test_a_session_without_samples_is_complete(kit, tmp_path):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.close({"outcome": "fault"})
+    session = read_session(tmp_path / "a.mcap")
+    assert len(session.samples) == 0
+    assert session.outcome == {"outcome": "fault"}
+
+
+CHILD = """
+    import sys
+    from pathlib import Path
+    sys.path.insert(0, sys.argv[2])
+    from conftest import begin, make_samples, packed
+    from rigd.session.format import SAMPLE_SIZE
+
+    block = packed(make_samples(5000))
+    writer = begin(Path(sys.argv[1]))
+    for tick in range(5000):
+        writer.write_samples(block[tick * SAMPLE_SIZE : (tick + 1) * SAMPLE_SIZE])
+        if tick % 100 == 99:
+            print(tick + 1, flush=True)
+    input()
+"""
+
+
+@pytest.mark.parametrize("after", [100, 2600])
+def test_a_killed_recorder_loses_at_most_250_samples(kit, tmp_path, after):
+    path = tmp_path / "a.mcap"
+    command = [sys.executable, "-c", textwrap.dedent(CHILD), str(path), str(Path(__file__).parent)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        for line in child.stdout:
+            if int(line) >= after:
+                break
+        child.send_signal(signal.SIGKILL)
+        # What it still said before it died, it had written before.
+        said = [after, *(int(line) for line in child.stdout if line.strip().isdigit())]
+    part = tmp_path / "a.mcap.part"
+    ticks = [decode_samples(m.data)["tick"][0] for chunk in kit.chunks_of(part) for m in chunk]
+    assert ticks == list(range(len(ticks)))
+    assert len(ticks) > max(said) - 250
+    assert not path.exists()
+    with pytest.raises(SessionError, match=rf"is incomplete.* {len(ticks)} complete samples"):
+        read_session(part)
+
+
+def test_the_file_is_synced_about_once_a_second(kit, tmp_path, monkeypatch):
+    now = 0.0
+    synced = []
+    monkeypatch.setattr("rigd.session.writer.time.monotonic", lambda: now)
+    writer = kit.begin(tmp_path / "a.mcap")
+    sync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (synced.append(now), sync(fd)))
+    block = kit.packed(kit.make_samples(5000))
+    for first in range(0, 5000, 50):
+        writer.write_samples(block[first * 119 : (first + 50) * 119])
+        now += 0.05
+    writer.abandon()
+    waited = [later - earlier for earlier, later in itertools.pairwise(synced[:-1])]
+    assert len(waited) >= 3
+    assert max(waited) < 1.3
+    assert min(waited) >= 1.0
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.mcap.part"])
+def test_an_existing_file_is_refused_and_left_alone(tmp_path, name):
+    existing = tmp_path / name
+    existing.write_bytes(b"precious")
+    with pytest.raises(SessionExistsError, match=rf"{name} exists"):
+        SessionWriter(tmp_path / "a.mcap")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert existing.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("hard_links", [True, False])
+def test_a_file_that_appears_meanwhile_is_not_overwritten(kit, tmp_path, monkeypatch, hard_links):
+    if not hard_links:
+        forbid_hard_links(monkeypatch)
+    path = tmp_path / "a.mcap"
+    writer = kit.begin(path)
+    writer.write_samples(kit.packed(kit.make_samples(3)))
+    path.write_bytes(b"precious")
+    with pytest.raises(SessionExistsError, match=r"complete session is .*a\.mcap\.part"):
+        writer.close(kit.OUTCOME)
+    assert path.read_bytes() == b"precious"
+    assert len(read_session(writer.part).samples) == 3
+
+
+def forbid_hard_links(monkeypatch):
+    def link(source, target):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", link)
+
+
+def test_without_hard_links_a_session_still_gets_its_name(kit, tmp_path, monkeypatch):
+    forbid_hard_links(monkeypatch)
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(3)))
+    assert writer.close(kit.OUTCOME) == tmp_path / "a.mcap"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+    assert len(read_session(tmp_path / "a.mcap").samples) == 3
+
+
+def test_of_many_writers_of_one_name_one_wins(tmp_path):
+    path = tmp_path / "a.mcap"
+    barrier = threading.Barrier(8)
+    won, lost = [], []
+
+    def record():
+        barrier.wait()
+        try:
+            won.append(SessionWriter(path))
+        except SessionExistsError as error:
+            lost.append(error)
+
+    threads = [threading.Thread(target=record) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(won), len(lost)) == (1, 7)
+    won[0].discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_abandoning_keeps_what_was_written(kit, tmp_path):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(260)))
+    writer.abandon()
+    assert sum(len(chunk) for chunk in kit.chunks_of(writer.part)) == 260
+    assert not writer.path.exists()
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(
+        SessionError, match=r"nowhere/a\.mcap\.part cannot be written: No such file"
+    ):
+        SessionWriter(tmp_path / "nowhere" / "a.mcap")
+
+
+def test_a_full_disk_ends_the_recording_with_all_that_went_before(kit, tmp_path, monkeypatch):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(250)))
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full on this system")
+    kept = writer._stream
+    writer._stream = writer._mcap._stream = full.open("wb")
+    with pytest.raises(SessionError, match="cannot be written: No space left on device"):
+        writer.write_samples(kit.packed(kit.make_samples(250, first_tick=250)))
+    with pytest.raises(SessionError, match="writing failed before"):
+        writer.write_samples(kit.packed(kit.make_samples(1, first_tick=500)))
+    writer.abandon()
+    kept.close()
+    assert sum(len(chunk) for chunk in kit.chunks_of(writer.part)) == 250
+
+
+def test_use_in_the_wrong_order_or_with_broken_blocks_is_a_programming_error(kit, tmp_path):
+    writer = SessionWriter(tmp_path / "a.mcap")
+    with pytest.raises(RuntimeError, match="begin"):
+        writer.write_samples(b"")
+    writer.begin(kit.START_UTC_NS, kit.METADATA, {}, {})
+    with pytest.raises(RuntimeError, match="twice"):
+        writer.begin(kit.START_UTC_NS, kit.METADATA, {}, {})
+    with pytest.raises(RuntimeError, match="kept"):
+        writer.discard()
+    with pytest.raises(ValueError, match="119-byte"):
+        writer.write_samples(bytes(118))
+    with pytest.raises(ValueError, match="68-byte"):
+        writer.write_controls(bytes(69))
+    writer.abandon()
