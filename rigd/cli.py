@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -102,11 +103,18 @@ def run_sessions(
     ] = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
+    from rigd.crew import Crew
+    from rigd.engine.process import SINGLE_THREADED
+
+    os.environ.update(SINGLE_THREADED)
+    # Before anything else: its processes import while this one does, and while it plans.
+    crew = Crew(live=live)
     from rigd.foreground import ForegroundError, run_in_foreground
 
     try:
         results = run_in_foreground(
             build,
+            crew,
             profile_name=profile,
             folder=output,
             repeat=repeat,

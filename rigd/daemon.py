@@ -12,15 +12,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from rigd import __version__
+from rigd.crew import Crew
 from rigd.engine.board import Phase, Stop, Word
-from rigd.engine.channels import create_channels
 from rigd.engine.control import ControlJob
 from rigd.engine.events import Event, read_events
-from rigd.engine.process import Child, ChildError, Message
+from rigd.engine.process import ChildError, Message
 from rigd.engine.recorder import RecorderJob
 from rigd.engine.ring import Observer
 from rigd.excitation import Excitation
@@ -28,8 +26,8 @@ from rigd.live.job import LiveJob
 from rigd.profile import Profile
 
 _POLL_S = 0.05
-_GRACE_S = 5.0
-_LIVE_GRACE_S = 2.0
+_PATIENCE_S = 5.0
+_LIVE_PATIENCE_S = 10.0
 
 
 class SessionFailedError(Exception):
@@ -77,64 +75,6 @@ class SessionProgress:
 Watcher = Callable[[SessionProgress, list[Event]], None]
 
 
-class Crew:
-    """The processes of one session; leaving the context ends them all, torque first.
-
-    They are started at once, so that their imports overlap with the planning.
-
-    Parameters
-    ----------
-    rate_hz
-        Of the session, for the size of the shared memory.
-    live
-        Start the live publisher too.
-    """
-
-    def __init__(self, rate_hz: float, *, live: bool) -> None:
-        self.channels = create_channels(rate_hz)
-        fds = self.channels.specs.fds
-        self.control = Child("control", "rigd.engine.control", fds)
-        self.recorder = Child("recorder", "rigd.engine.recorder", fds)
-        self.publisher = Child("live", "rigd.live.publisher", fds) if live else None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if self.channels.board[Word.STOP] == Stop.NO:
-            self.channels.board[Word.STOP] = Stop.OPERATOR
-        self.control.stop(_GRACE_S)
-        self.recorder.stop(_GRACE_S)
-        if self.publisher is not None:
-            self.publisher.stop(_LIVE_GRACE_S)
-        self.channels.close()
-
-    def start_live(self, order: Order) -> str:
-        """Hand the publisher its job and return the address of the view, or why there is none."""
-        assert self.publisher is not None
-        specs = self.channels.specs
-        self.publisher.start(
-            LiveJob(
-                samples=specs.samples,
-                board_fd=specs.board_fd,
-                name=order.path.stem,
-                rate_hz=order.profile.rig.rate_hz,
-            )
-        )
-        try:
-            answer = self.publisher.poll(_GRACE_S * 2) or {"error": "it does not answer"}
-        except ChildError as error:
-            answer = {"error": str(error)}
-        if "url" in answer:
-            return f"Live view: {answer['url']}"
-        return f"No live view: {answer['error']} The session goes on without it."
-
-
 def run_session(order: Order, crew: Crew, watcher: Watcher) -> SessionResult:
     """Run one session in the processes of `crew`.
 
@@ -143,7 +83,7 @@ def run_session(order: Order, crew: Crew, watcher: Watcher) -> SessionResult:
     order
         What to run, already checked against the profile's limits.
     crew
-        Freshly started processes; they serve one session only.
+        Freshly started processes and their memory laid out; they serve one session only.
     watcher
         Called some twenty times a second with the progress and the events since the last call.
 
@@ -228,9 +168,11 @@ class _Session:
         return None if message is None else str(message.get("error", message))
 
     def _ask_recorder(self, expected: str) -> Message:
-        message = self._crew.recorder.poll(_GRACE_S)
+        message = self._crew.recorder.poll(_PATIENCE_S)
         if message is None:
-            raise SessionFailedError(f"The recorder process does not answer within {_GRACE_S:g} s.")
+            raise SessionFailedError(
+                f"The recorder process does not answer within {_PATIENCE_S:g} s."
+            )
         if "error" in message:
             raise SessionFailedError(message["error"])
         if expected not in message:
@@ -286,7 +228,7 @@ class _Session:
             **finished["results"],
         }
         self._crew.recorder.send(close=outcome)
-        closed = self._crew.recorder.poll(_GRACE_S * 2)
+        closed = self._crew.recorder.poll(2 * _PATIENCE_S)
         if closed is None:
             raise SessionFailedError("The recorder process does not close the file.")
         if "error" in closed:
@@ -304,6 +246,27 @@ class _Session:
             lost=counts.get("lost", 0),
             interrupted=self._interrupted,
         )
+
+
+def start_live(crew: Crew, order: Order) -> str:
+    """Hand the publisher its job and return the address of the view, or why there is none."""
+    assert crew.publisher is not None
+    specs = crew.channels.specs
+    crew.publisher.start(
+        LiveJob(
+            samples=specs.samples,
+            board_fd=specs.board_fd,
+            name=order.path.stem,
+            rate_hz=order.profile.rig.rate_hz,
+        )
+    )
+    try:
+        answer = crew.publisher.poll(_LIVE_PATIENCE_S) or {"error": "it does not answer."}
+    except ChildError as error:
+        answer = {"error": str(error)}
+    if "url" in answer:
+        return f"Live view: {answer['url']}"
+    return f"No live view: {answer['error']} The session goes on without it."
 
 
 def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:

@@ -8,14 +8,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
+from rigd.crew import Crew
 from rigd.daemon import (
-    Crew,
     Order,
     SessionFailedError,
     SessionProgress,
     SessionResult,
     choose_path,
     run_session,
+    start_live,
     with_seed,
 )
 from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
@@ -46,6 +47,7 @@ class ForegroundError(Exception):
 
 def run_in_foreground(
     build: Callable[[float], Excitation],
+    crew: Crew,
     *,
     profile_name: str,
     folder: Path,
@@ -63,6 +65,8 @@ def run_in_foreground(
     ----------
     build
         Makes the excitation for a rate in Hz.
+    crew
+        The processes of the first session, started but not yet needed.
     profile_name
         Name or path of the profile.
     folder
@@ -83,8 +87,8 @@ def run_in_foreground(
         profile = _load(profile_name, fast=fast, seed=seed)
         excitation: Excitation | None = None
         for number in range(repeat):
-            # The processes import while this one plans.
-            with Crew(profile.rig.rate_hz, live=live) as crew:
+            with crew if number == 0 else Crew(live=live) as crew:
+                crew.lay_out(profile.rig.rate_hz)
                 if excitation is None:
                     excitation = build(profile.rig.rate_hz)
                     plan = plan_session(profile, excitation, force=force)
@@ -98,7 +102,7 @@ def run_in_foreground(
                     notes=tuple((name, text) for name, text in notes.items() if text),
                 )
                 if live:
-                    console.print(crew.start_live(order))
+                    console.print(start_live(crew, order))
                 with _ProgressView(console, excitation.reference_rad.size) as view:
                     results.append(run_session(order, crew, view.update))
             _tell_result(console, results[-1])

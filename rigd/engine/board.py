@@ -5,10 +5,9 @@ blocks, which is why the control loop may do so.
 """
 
 import mmap
+import os
 from enum import IntEnum
 from typing import Self
-
-from rigd.engine.ring import shared_memory_fd
 
 
 class Phase(IntEnum):
@@ -61,9 +60,10 @@ class Board:
         self._words = memoryview(self._memory).cast("q")
 
     @classmethod
-    def create(cls) -> Self:
-        """Make a board of zeros; its descriptor may be passed on to child processes."""
-        return cls(shared_memory_fd(8 * len(Word)))
+    def create(cls, fd: int) -> Self:
+        """Lay out a board of zeros in shared memory."""
+        os.ftruncate(fd, 8 * len(Word))
+        return cls(fd)
 
     def __getitem__(self, word: Word) -> int:
         return self._words[word]

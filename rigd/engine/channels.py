@@ -1,9 +1,9 @@
 """The shared memory of one session: three rings and the board, made by the supervisor."""
 
-import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rigd.engine.board import Board
+from rigd.engine.board import Board, Stop, Word
 from rigd.engine.events import EVENT_SIZE
 from rigd.engine.ring import Ring, RingSpec
 from rigd.session.format import CONTROL_SIZE, SAMPLE_SIZE
@@ -24,11 +24,6 @@ class ChannelSpecs:
     events: RingSpec
     board_fd: int
 
-    @property
-    def fds(self) -> tuple[int, ...]:
-        """The descriptors a child must inherit."""
-        return (self.samples.fd, self.controls.fd, self.events.fd, self.board_fd)
-
 
 @dataclass(frozen=True, slots=True)
 class Channels:
@@ -44,23 +39,26 @@ class Channels:
         """What to hand to a child process."""
         return ChannelSpecs(self.samples.spec, self.controls.spec, self.events.spec, self.board.fd)
 
+    def ask_to_stop(self) -> None:
+        """Ask the control process to stop, unless that was done before."""
+        if self.board[Word.STOP] == Stop.NO:
+            self.board[Word.STOP] = Stop.OPERATOR
+
     def close(self) -> None:
-        """Unmap the memory and close the descriptors of this process."""
-        specs = self.specs
+        """Unmap the memory; the descriptors stay open."""
         for part in (self.samples, self.controls, self.events, self.board):
             part.close()
-        for fd in specs.fds:
-            os.close(fd)
 
 
-def create_channels(rate_hz: float) -> Channels:
-    """Make the shared memory of one session at ``rate_hz``."""
+def create_channels(rate_hz: float, fds: Sequence[int]) -> Channels:
+    """Lay out the memory of one session at ``rate_hz`` in four descriptors of shared memory."""
+    samples, controls, events, board = fds
     ticks = int(rate_hz * BUFFERED_S)
     return Channels(
-        samples=Ring.create(SAMPLE_SIZE, ticks),
-        controls=Ring.create(CONTROL_SIZE, ticks // CONTROL_DECIMATION + 1),
-        events=Ring.create(EVENT_SIZE, _EVENTS),
-        board=Board.create(),
+        samples=Ring.create(SAMPLE_SIZE, ticks, samples),
+        controls=Ring.create(CONTROL_SIZE, ticks // CONTROL_DECIMATION + 1, controls),
+        events=Ring.create(EVENT_SIZE, _EVENTS, events),
+        board=Board.create(board),
     )
 
 

@@ -17,7 +17,11 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+SINGLE_THREADED = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
+"""Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,
+and would disturb the loop."""
 _SIZE = struct.Struct("<Q")
 
 Message = dict[str, Any]
@@ -47,8 +51,7 @@ class Child:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=fds,
-            # A library that starts threads for its matrices would disturb the loop.
-            env=os.environ | dict.fromkeys(_THREADS, "1"),
+            env=os.environ | SINGLE_THREADED,
         )
         self._lines = LineReader(self._stdout_fd)
 

@@ -5,6 +5,7 @@ it, and closes the file with the outcome. If the supervisor dies it waits until 
 stopped, and closes the file itself.
 """
 
+import contextlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,7 +47,8 @@ def main() -> None:
         _record(parent, channels, writer)
     except SessionError as error:
         # Disk full, device gone: what reached the disk stays there under its .part name.
-        writer.abandon()
+        with contextlib.suppress(SessionError):
+            writer.abandon()
         parent.send(error=str(error))
         raise SystemExit(1) from None
 

@@ -51,9 +51,9 @@ class Ring:
         self._next = self._counters[_WRITTEN]
 
     @classmethod
-    def create(cls, record_size: int, capacity: int) -> Self:
-        """Make an empty ring; its descriptor may be passed on to child processes."""
-        fd = shared_memory_fd(HEADER_SIZE + capacity * record_size)
+    def create(cls, record_size: int, capacity: int, fd: int) -> Self:
+        """Lay out an empty ring in the memory of `fd`, from :func:`shared_memory_fd`."""
+        os.ftruncate(fd, HEADER_SIZE + capacity * record_size)
         return cls(RingSpec(fd, record_size, capacity))
 
     @property
@@ -131,11 +131,10 @@ class Observer:
         return block
 
 
-def shared_memory_fd(size: int) -> int:
-    """Descriptor of ``size`` zeroed bytes of memory that child processes can inherit."""
+def shared_memory_fd() -> int:
+    """Return a descriptor of shared memory, still of size 0, that child processes can inherit."""
     folder = "/dev/shm" if Path("/dev/shm").is_dir() else None
     with tempfile.TemporaryFile(dir=folder) as file:
         fd = os.dup(file.fileno())
-    os.truncate(fd, size)
     os.set_inheritable(fd, True)
     return fd

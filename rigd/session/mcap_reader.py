@@ -43,7 +43,7 @@ _RUN_KEY: Final = np.dtype(
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
 _FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
-_FIRST_STRETCH: Final = 64
+_FIRST_STRETCH: Final = 256
 _BLOCK_BYTES: Final = 1 << 18
 
 _Record = TypeVar("_Record")
@@ -60,7 +60,6 @@ class Run:
     channel: int
     size: int
     """Bytes of a record, head and all."""
-    count: int = 0
     pieces: list[Buffer] = field(default_factory=list)
 
     def blocks(self) -> Iterator[bytes]:
@@ -85,7 +84,9 @@ class McapContents:
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     runs: dict[str, list[Run]] = field(default_factory=lambda: defaultdict(list))
-    """Topic → its messages in the order of the file."""
+    """Wanted topic → its messages in the order of the file."""
+    message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
+    """Channel → how many messages were read, wanted or not."""
     complete: bool = False
     """Whether the file has its end."""
     damage: str | None = None
@@ -93,7 +94,8 @@ class McapContents:
 
     def count(self, topic: str) -> int:
         """Return how many messages of a topic were read."""
-        return sum(run.count for run in self.runs.get(topic, ()))
+        channels = [channel.id for channel in self.channels.values() if channel.topic == topic]
+        return sum(self.message_counts[channel] for channel in channels)
 
 
 def read_mcap(data: memoryview, topics: Collection[str]) -> McapContents:
@@ -160,7 +162,6 @@ class _Reader:
         self._data = data
         self._topics = topics
         self._wanted: dict[int, str | None] = {}  # channel → its topic if wanted
-        self._counts: dict[int, int] = defaultdict(int)
         self._uncompressed = 0
         self._zstd = zstandard.ZstdDecompressor()
 
@@ -268,14 +269,13 @@ class _Reader:
         channel = MESSAGE_HEAD.unpack_from(run)[2]
         if channel not in self._wanted:
             raise _DamageError(f"has a message of an undeclared channel {channel}{where}")
-        self._counts[channel] += count
+        self.contents.message_counts[channel] += count
         topic = self._wanted[channel]
         if topic is None:
             return
         runs = self.contents.runs[topic]
         if not runs or (runs[-1].channel, runs[-1].size) != (channel, size):
             runs.append(Run(channel, size))
-        runs[-1].count += count
         # A slice keeps the chunk in memory, which is well where it is most of it.
         runs[-1].pieces.append(run if 2 * len(run) > total else bytes(run))
 
@@ -305,8 +305,9 @@ class _Reader:
                 self._read_other(opcode, data[content:end], " in the summary")
             elif opcode == Opcode.STATISTICS:
                 statistics = _parsed(Statistics.read, data[content:end], " in the summary")
+                found = self.contents.message_counts
                 counts = statistics.channel_message_counts
-                if any(self._counts[channel] != count for channel, count in counts.items()):
+                if any(found[channel] != count for channel, count in counts.items()):
                     raise _DamageError("has not the messages that its statistics count")
 
 
@@ -346,8 +347,9 @@ def _run_length(records: memoryview, start: int, size: int) -> int:
             count, _RUN_KEY, records, start + known * size, (size,)
         )
         equal = (keys["head"] == head) & (keys["tail"] == tail)
-        if not equal.all():
-            return known + int(np.argmin(equal))
+        first = int(equal.argmin())
+        if not equal[first]:
+            return known + first
         known += count
         stretch *= 8
     return known

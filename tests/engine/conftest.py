@@ -12,6 +12,7 @@ from rigd.engine.channels import create_channels
 from rigd.engine.clocks import VirtualClock
 from rigd.engine.control import ControlJob, conduct
 from rigd.engine.events import read_events
+from rigd.engine.ring import shared_memory_fd
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 from rigd.session.format import decode_controls, decode_samples
@@ -94,7 +95,9 @@ class Session:
             ring_down_s=0.5,
             stop_hz=5.0,
         )
-        self.channels = create_channels(self.profile.rig.rate_hz)
+        self.channels = create_channels(
+            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(4)]
+        )
         self.board = self.channels.board
         self.parent = FakeParent()
         devices = open_devices(self.profile.rig)

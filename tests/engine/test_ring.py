@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine.ring import Observer, Ring
+from rigd.engine.ring import Observer, Ring, shared_memory_fd
 
 RECORD = struct.Struct("<Q")
 
 
 @pytest.fixture
 def ring():
-    made = Ring.create(RECORD.size, 8)
+    made = Ring.create(RECORD.size, 8, shared_memory_fd())
     yield made
     made.close()
 
@@ -42,7 +42,7 @@ def take_all(source, most=100):
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 12)), max_size=60))
 def test_any_mix_of_writing_and_reading_keeps_the_order(steps):
-    ring = Ring.create(RECORD.size, 8)
+    ring = Ring.create(RECORD.size, 8, shared_memory_fd())
     written, read = 0, []
     for writing, count in steps:
         if writing:

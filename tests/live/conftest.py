@@ -17,7 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from rigd.engine.board import Board, Word
-from rigd.engine.ring import Ring
+from rigd.engine.ring import Ring, shared_memory_fd
 from rigd.live.job import LiveJob
 from rigd.session.format import SAMPLE_SIZE, pack_sample_into
 
@@ -34,7 +34,7 @@ class Producer(threading.Thread):
     def __init__(self, capacity: int = 16_000, speed: float = 1.0) -> None:
         super().__init__(daemon=True)
         self.speed = speed
-        self.ring = Ring.create(SAMPLE_SIZE, capacity)
+        self.ring = Ring.create(SAMPLE_SIZE, capacity, shared_memory_fd())
         self.tick = 0
         self.refused = 0
         self._halt = threading.Event()
@@ -72,7 +72,7 @@ class Publisher:
     """``python -m rigd.live.publisher``, as the supervisor starts it."""
 
     def __init__(self, ring: Ring, linger_s: float = 0.0, **environment: str) -> None:
-        self.board = Board.create()
+        self.board = Board.create(shared_memory_fd())
         self.process = subprocess.Popen(
             [sys.executable, "-m", "rigd.live.publisher"],
             stdin=subprocess.PIPE,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rigd.engine.board import Board
+from rigd.engine.ring import shared_memory_fd
 from rigd.live.job import LiveJob
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
@@ -158,7 +159,7 @@ def test_a_killed_publisher_leaves_no_server(publisher, gone, eventually, end):
 def test_ends_when_its_parent_dies_though_its_input_stays_open(
     producer, send_job, gone, eventually
 ):
-    board = Board.create()
+    board = Board.create(shared_memory_fd())
     fds = (producer.ring.spec.fd, board.fd)
     middle = subprocess.Popen(
         [
