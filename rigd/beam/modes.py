@@ -16,6 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam.parameters import Beam, Damping
 
+Real = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
+
 _HOMOTOPY_STEPS = (8, 64)
 """Steps in which damping grows: few, and more for the beams where that loses a path."""
 
@@ -41,7 +44,7 @@ class Mode:
     """a_i²; times rho, the mode's share of the beam's moment of inertia."""
 
 
-def clamped_free_eigenvalues(n: int) -> NDArray[np.float64]:
+def clamped_free_eigenvalues(n: int) -> Real:
     """First `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,), to full precision."""
     i = np.arange(1, n + 1)
     middle = (i - 0.5) * np.pi
@@ -56,7 +59,7 @@ def clamped_free_eigenvalues(n: int) -> NDArray[np.float64]:
     return middle + d
 
 
-def mode_shape(number: int, x_over_length: ArrayLike) -> NDArray[np.float64]:
+def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
     """Shape of a mode (1, 2, …) at ``x / L`` in 0…1, with mean square 1 and 2 at the tip.
 
     Written without growing exponentials, so high modes are as accurate as low ones.
@@ -68,19 +71,17 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> NDArray[np.float64]:
     one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
     grown = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
     sign = 1.0 if number % 2 == 1 else -1.0
-    shape: NDArray[np.float64] = sign * (
-        np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + grown
-    )
+    shape: Real = sign * (np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + grown)
     return shape
 
 
-def participation(beam: Beam, n: int) -> NDArray[np.float64]:
+def participation(beam: Beam, n: int) -> Real:
     """First `n` factors ``a_i² = 4 L³ / z_i⁴`` in m³; all of them add up to L³/3."""
-    factors: NDArray[np.float64] = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
+    factors: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
     return factors
 
 
-def poles(beam: Beam, damping: Damping, n: int) -> NDArray[np.complex128]:
+def poles(beam: Beam, damping: Damping, n: int) -> Complex:
     """Poles of the first `n` modes, shape (n, 2), in rad/s.
 
     A row holds a conjugate pair (positive frequency first), or two real poles (slow one first)
@@ -101,9 +102,7 @@ def poles(beam: Beam, damping: Damping, n: int) -> NDArray[np.complex128]:
     return found
 
 
-def poles_for_eigenvalues(
-    z: NDArray[np.float64], beam: Beam, damping: Damping
-) -> NDArray[np.complex128]:
+def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
     """Both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as `poles` has them.
 
     With the roots of ``tan z = tanh z`` in place of the clamped–free eigenvalues these are the
@@ -144,9 +143,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     return tuple(found)
 
 
-def _second_order_poles(
-    omega_squared: NDArray[np.float64], rate: NDArray[np.float64]
-) -> NDArray[np.complex128]:
+def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
     """Roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
     half = -0.5 * rate
     first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
@@ -158,43 +155,41 @@ def _second_order_poles(
     return np.stack([first, second], axis=1)
 
 
-def _continued_poles(
-    omega_squared: NDArray[np.float64], damper: float, damping: Damping, steps: int
-) -> NDArray[np.complex128]:
+def _continued_poles(omega_squared: Real, damper: float, damping: Damping, steps: int) -> Complex:
     """Poles in the upper half plane, followed from the undamped ones while damping grows.
 
     NaN where the path was lost or has left the principal sheet.
     """
-    log_s = 0.5 * np.log(omega_squared) + 0.5j * np.pi
+    log_s: Complex = 0.5 * np.log(omega_squared) + 0.5j * np.pi
     for fraction in (np.arange(1, steps + 1) / steps) ** 2:
         log_s = _newton(log_s, omega_squared, fraction * damper, fraction * damping.zeta, damping)
-    return np.exp(log_s)
+    poles: Complex = np.exp(log_s)
+    return poles
 
 
-def _searched_poles(
-    omega_squared: NDArray[np.float64], damper: float, damping: Damping
-) -> NDArray[np.complex128]:
+def _searched_poles(omega_squared: Real, damper: float, damping: Damping) -> Complex:
     """Poles in the upper half plane from many starts, most of them near the cut.
 
     Near critical damping of a nearly first order, a pole turns along the cut so sharply that no
     reasonable step follows it. NaN where no start leads to a pole on the principal sheet.
     """
-    ratios, angles = np.meshgrid(np.linspace(-6, 6, 49), np.pi * np.array([0.7, 0.9, 0.98, 0.999]))
-    starts = (ratios + 1j * angles).ravel()
-    log_s = 0.5 * np.log(omega_squared)[:, None] + starts
+    angles = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
+    starts: Complex = np.add.outer(1j * angles, np.linspace(-6, 6, 49)).ravel()
+    log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + starts
     log_s = _newton(log_s, omega_squared[:, None], damper, damping.zeta, damping)
     found = ~np.isnan(log_s)
     first = np.argmax(found, axis=1)[:, None]
-    return np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
+    poles: Complex = np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
+    return poles
 
 
 def _newton(
-    log_s: NDArray[np.complex128],
-    omega_squared: NDArray[np.float64],
+    log_s: Complex,
+    omega_squared: Real,
     damper: float,
     zeta: float,
     damping: Damping,
-) -> NDArray[np.complex128]:
+) -> Complex:
     """Roots of the characteristic equation by Newton's method in ln s.
 
     There a pole moves almost linearly, and one that leaves the principal sheet shows as an argument

@@ -106,7 +106,6 @@ class SimulatedPlant:
         n = free.b.size
         step = _step(free, locked.sensor_torque, period, *instants)
         locked_step = _step(locked, locked.sensor_torque, period, *instants)
-        locked_step[:, 1] = 0.0  # what rounding has left of the speed moves nothing
 
         # A period's friction is known only after its step, from the speed reached without it. The
         # outputs are then corrected at once, the state by a last column of the next step.

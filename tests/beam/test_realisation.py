@@ -118,6 +118,13 @@ def test_refusal_names_the_error_achieved():
     assert realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1.01 * achieved)
 
 
+def test_refusal_of_what_would_make_a_motor_unstable(monkeypatch):
+    """No damping is known that fails this check; the undamped beam does under a stricter limit."""
+    monkeypatch.setattr("rigd.beam.realisation.MAX_GROWTH_PER_S", 1e-6)
+    with pytest.raises(RealisationError, match="without friction would be unstable"):
+        realise(PAPER_BEAM, Damping())
+
+
 @pytest.mark.parametrize(
     "damping",
     [

@@ -1,6 +1,6 @@
 """Eq. 25 and its derivatives against values computed with 50 and 60 digits.
 
-``exact_model.csv`` has G. ``exact_derivatives.csv`` has the derivatives of G with respect to the six
+``exact_model.csv`` has G. ``exact_derivatives.csv`` has its derivatives with respect to the six
 parameters: central differences (step 1e-20) of Eq. 25 as the paper writes it, with the external
 damping outside ``rho/EI``, evaluated by mpmath with 60 digits, for the means of Table 3 and four
 random beams, at 24 points each from 1e-3 to 5e3 Hz, every fourth of them off the imaginary axis.
