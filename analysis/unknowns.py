@@ -30,10 +30,7 @@ SIZE_RANGE: Final = (1e-9, 1e3)
 def undamped_frequencies_rad_s(beam: Beam, count: int) -> NDArray[np.float64]:
     """Natural frequencies of the undamped clamped-free beam, shape (count,)."""
     z = clamped_free_eigenvalues(count)
-    frequencies: NDArray[np.float64] = (z / beam.length_m) ** 2 / math.sqrt(
-        beam.density_over_stiffness
-    )
-    return frequencies
+    return z * z / (beam.length_m**2 * math.sqrt(beam.density_over_stiffness))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,28 +5,26 @@ through the same cycle and leaves its results in the metadata.
 """
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from rigd.devices.contracts import DeviceError, Wrench
 from rigd.engine.board import Phase, Stop, Word
-from rigd.engine.channels import CONTROL_DECIMATION, Channels
+from rigd.engine.channels import Channels
 from rigd.engine.clocks import Clock
 from rigd.engine.cycle import Cycle
 from rigd.engine.events import Event, Level, write_event
 from rigd.engine.metronome import Metronome
 from rigd.engine.process import Parent
+from rigd.engine.sample_log import SampleLog
 from rigd.excitation import Excitation
 from rigd.profile import Profile
-from rigd.session.format import Status, pack_control_into, pack_sample_into
 
 _AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 _SETTLE_S = 0.5
-_ALIVE_EVERY = 128
-"""Ticks between two looks at whether the supervisor still runs."""
-_ROOM_PATIENCE_S = 5.0
-_ROOM_POLL_S = 0.0002
+_LOOK_EVERY = 64
+"""Ticks between two looks at whether everybody is still there and keeps up."""
+_GO_POLL_S = 0.0002
 
 
 class SessionEnd(Exception):
@@ -36,16 +34,6 @@ class SessionEnd(Exception):
         super().__init__(reason)
         self.outcome = outcome
         self.reason = reason
-
-
-@dataclass(slots=True)
-class Counts:
-    """The bookkeeping of a record: scheduled = published + missed + lost."""
-
-    scheduled: int = 0
-    missed: int = 0
-    late: int = 0
-    lost: int = 0
 
 
 class Procedure:
@@ -80,11 +68,12 @@ class Procedure:
         self._board = channels.board
         self._parent = parent
         self._rate_hz = profile.rig.rate_hz
-        self._late_ns = int(profile.realtime.late_us * 1000)
         self._metronome = Metronome(clock, self._rate_hz)
+        late_ns = int(profile.realtime.late_us * 1000)
+        self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
         self._start_angle_rad = 0.0
         self._interrupted = False
-        self.counts = Counts()
+        self.counts = self._log.counts
         self.results: dict[str, str] = {}
         """What the record's outcome has to tell beside the counts."""
 
@@ -149,7 +138,7 @@ class Procedure:
         while not self._board[Word.GO]:
             if self._clock.virtual:
                 self._check_stop()
-                time.sleep(_ROOM_POLL_S)
+                time.sleep(_GO_POLL_S)
             else:
                 self._tick(self._start_angle_rad)
 
@@ -162,48 +151,49 @@ class Procedure:
             If it ends early. The last sample is then one with the torque off.
         """
         reference = (self._start_angle_rad + self._excitation.reference_rad).tolist()
-        metronome, cycle, board = self._metronome, self._cycle, self._board
-        counts = self.counts
+        total = len(reference)
+        metronome, cycle, log, board = self._metronome, self._cycle, self._log, self._board
+        counts, virtual = self.counts, self._clock.virtual
+        stop, scheduled = board.word(Word.STOP), board.word(Word.SCHEDULED)
         metronome.restart()
         wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
         # Under the real clock tick 0 is still ahead, or up to one period behind.
-        ahead_ns = 0 if self._clock.virtual else metronome.start_ns - before_ns
+        ahead_ns = 0 if virtual else metronome.start_ns - before_ns
         board[Word.START_UTC_NS] = wall_ns + ahead_ns
         board[Word.PHASE] = Phase.RUNNING
-        self._say("info", f"Record starts: {len(reference)} ticks at {self._rate_hz:g} Hz.")
+        self._say("info", f"Record starts: {total} ticks at {self._rate_hz:g} Hz.")
         last = -1
         first_ns = last_ns = 0
         end: SessionEnd | None = None
         while end is None:
             missed = metronome.wait()
-            tick = min(metronome.tick, len(reference))
-            if missed:
-                counts.missed += tick - last - 1
+            tick = metronome.tick
+            if missed or tick >= total:
+                tick = min(tick, total)
+                missed = tick - last - 1
+                counts.missed += missed
                 board[Word.MISSED] = counts.missed
-            if tick == len(reference):
-                counts.scheduled = tick
-                break
-            end = self._stop_reason(tick) or self._missed_too_many(missed, tick)
-            t_ns = metronome.t_ns
-            last_ns = t_ns + metronome.lateness_ns
-            if last < 0:
-                first_ns = last_ns
+                if tick == total:
+                    counts.scheduled = total
+                    break
+                end = self._missed_too_many(missed, tick)
+            if end is None and (
+                stop[0] or counts.lost or self._interrupted or tick % _LOOK_EVERY == 0
+            ):
+                end = self._stop_reason()
             if end is None:
                 end = self._step(reference[tick])
             else:
                 cycle.observe(metronome.due_ns)
                 cycle.torque_off()
-            counts.scheduled = tick + 1
-            lost = self._publish(tick, t_ns, reference[tick], missed, wait=end is not None)
-            if lost and end is None:
-                # A record with lost samples can never be complete: no reason to move on.
-                end = SessionEnd("fault", "The recorder cannot keep up: a sample was lost.")
-                cycle.torque_off()
-            board[Word.SCHEDULED] = tick + 1
+            log.write(tick, reference[tick], missed, wait=virtual or end is not None)
+            scheduled[0] = tick + 1
+            last_ns = metronome.t_ns + metronome.lateness_ns
+            if last < 0:
+                first_ns = last_ns
             last = tick
-        else:
-            if not cycle.flags & Status.TORQUE_OFF:
-                raise AssertionError("a session ended early with the torque on")
+        if end is not None:
+            counts.scheduled = last + 1
         self._take_stock(wall_ns, before_ns, last_ns - first_ns)
         if end is not None:
             raise end
@@ -263,92 +253,27 @@ class Procedure:
             angles.append(cycle.angle_rad)
         return np.array(wrenches), np.array(angles)
 
-    def _publish(
-        self, tick: int, t_ns: int, reference_rad: float, missed: int, *, wait: bool
-    ) -> bool:
-        """Put the tick's sample into the ring; say whether it was lost."""
-        cycle, ring, counts = self._cycle, self._channels.samples, self.counts
-        metronome = self._metronome
-        flags = cycle.flags
-        if missed:
-            flags |= Status.AFTER_MISSED
-        if counts.lost:
-            flags |= Status.AFTER_LOST
-        if metronome.lateness_ns > self._late_ns:
-            flags |= Status.LATE
-            counts.late += 1
-            self._board[Word.LATE] = counts.late
-        offset = ring.slot()
-        if offset < 0:
-            offset = self._wait_for_room() if wait or self._clock.virtual else -1
-            if offset < 0:
-                counts.lost += 1
-                self._board[Word.LOST] = counts.lost
-                return True
-        start_ns = metronome.start_ns + t_ns + metronome.lateness_ns
-        pack_sample_into(
-            ring.buffer,
-            offset,
-            t_ns,
-            tick,
-            reference_rad,
-            cycle.angle_rad,
-            cycle.torque_command_nm,
-            cycle.coupling_torque_nm,
-            *cycle.wrench,
-            flags,
-            metronome.lateness_ns,
-            self._clock.now_ns() - start_ns,
-        )
-        ring.publish()
-        if tick % CONTROL_DECIMATION == 0:
-            self._publish_terms(tick, t_ns)
-        return False
-
-    def _publish_terms(self, tick: int, t_ns: int) -> None:
-        ring, terms = self._channels.controls, self._cycle.controller
-        offset = ring.slot()
-        if offset < 0:
-            return  # The terms explain a record; they are not what it stands on.
-        pack_control_into(
-            ring.buffer,
-            offset,
-            t_ns,
-            tick,
-            terms.proportional_nm,
-            terms.integral_nm,
-            terms.derivative_nm,
-            terms.feedforward_nm,
-            terms.friction_nm,
-            terms.unlimited_torque_nm,
-        )
-        ring.publish()
-
-    def _wait_for_room(self) -> int:
-        ring = self._channels.samples
-        deadline = time.monotonic() + _ROOM_PATIENCE_S
-        while (offset := ring.slot()) < 0 and time.monotonic() < deadline:
-            time.sleep(_ROOM_POLL_S)
-        return offset
-
     def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
         if not missed:
             return None
         reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
         return None if reason is None else SessionEnd("fault", str(reason))
 
-    def _stop_reason(self, tick: int) -> SessionEnd | None:
+    def _stop_reason(self) -> SessionEnd | None:
         stop = self._board[Word.STOP]
         if self._interrupted or stop == Stop.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
         if stop == Stop.NO_RECORDER:
             return SessionEnd("fault", "The recorder process ended during the session.")
-        if tick % _ALIVE_EVERY == 0 and not self._parent.alive():
+        if self.counts.lost:
+            # A record with a lost sample can never be complete: no reason to move on.
+            return SessionEnd("fault", "The recorder cannot keep up: a sample was lost.")
+        if not self._parent.alive():
             return SessionEnd("fault", "The supervising process ended during the session.")
         return None
 
     def _check_stop(self) -> None:
-        end = self._stop_reason(self._metronome.tick)
+        end = self._stop_reason()
         if end is not None:
             self._cycle.torque_off()
             raise end

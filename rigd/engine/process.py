@@ -17,9 +17,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-SINGLE_THREADED = dict.fromkeys(
-    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-)
+SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,
 and would disturb the loop."""
 _SIZE = struct.Struct("<Q")

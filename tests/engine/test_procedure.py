@@ -9,7 +9,8 @@ from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
 from rigd.engine.board import Stop, Word
 from rigd.engine.clocks import VirtualClock
-from rigd.session.format import Status
+from rigd.excitation import hold
+from rigd.session.format import Status, decode_samples
 
 
 def assert_books_balance(session, samples):
@@ -251,17 +252,24 @@ def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
 
 
 def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
-    # The ring holds 16 s; nobody reads, so a longer record must lose a sample in real time.
-    from rigd.excitation import hold
-
+    # The ring holds 16 s. In real time nobody waits for the reader, which here sleeps that long.
     profile = make_session().profile
-    session = make_session(
-        clock=LateAt({}), excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0)
+    read_late = []
+
+    class ReaderWakes(StopAt):
+        virtual = False
+
+    session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
+    session.clock = ReaderWakes(
+        17_502_000_000, lambda: read_late.append(session.channels.samples.take(1000))
     )
     session.run()
     session.assert_safe()
-    counts = session.finished["counts"]
+    samples = np.concatenate([decode_samples(read_late[0]), session.samples])
     assert session.finished["finished"] == "fault"
     assert "recorder" in session.finished["reason"]
-    assert counts["lost"] == 1
-    assert_books_balance(session, session.samples)
+    assert session.finished["counts"] == {"scheduled": 16_002, "missed": 0, "late": 0, "lost": 1}
+    assert_books_balance(session, samples)
+    assert samples["tick"][-2:].tolist() == [15_999, 16_001]
+    assert samples["status"][-1] & Status.AFTER_LOST
+    assert samples["status"][-1] & Status.TORQUE_OFF

@@ -1,0 +1,140 @@
+"""The way of a tick's results into the rings that the recorder and the live publisher read."""
+
+import time
+from dataclasses import dataclass
+
+from rigd.engine.board import Word
+from rigd.engine.channels import CONTROL_DECIMATION, Channels
+from rigd.engine.clocks import Clock
+from rigd.engine.cycle import Cycle
+from rigd.engine.metronome import Metronome
+from rigd.session.format import Status, pack_control_into, pack_sample_into
+
+_AFTER_MISSED = int(Status.AFTER_MISSED)
+_AFTER_LOST = int(Status.AFTER_LOST)
+_LATE = int(Status.LATE)
+
+_ROOM_PATIENCE_S = 5.0
+_ROOM_POLL_S = 0.0002
+
+
+@dataclass(slots=True)
+class Counts:
+    """The bookkeeping of a record: scheduled = recorded + missed + lost."""
+
+    scheduled: int = 0
+    missed: int = 0
+    late: int = 0
+    lost: int = 0
+
+
+class SampleLog:
+    """Writes a sample for each tick, and the controller's terms for every tenth.
+
+    Parameters
+    ----------
+    cycle, metronome, clock
+        Where the contents of a sample come from.
+    channels
+        Where they go.
+    late_ns
+        Lateness above which a tick is flagged as late.
+
+    Attributes
+    ----------
+    counts
+        Ticks that were late, and samples that were lost, are counted here.
+    """
+
+    def __init__(
+        self,
+        cycle: Cycle,
+        metronome: Metronome,
+        clock: Clock,
+        channels: Channels,
+        late_ns: int,
+    ) -> None:
+        self._cycle = cycle
+        self._metronome = metronome
+        self._clock = clock
+        self._ring = channels.samples
+        self._buffer = channels.samples.buffer
+        self._terms_ring = channels.controls
+        self._board = channels.board
+        self._late_ns = late_ns
+        self.counts = Counts()
+
+    def write(self, tick: int, reference_rad: float, missed: int, *, wait: bool) -> None:
+        """Log the tick that was just run.
+
+        Parameters
+        ----------
+        tick
+            Its number in the record.
+        reference_rad
+            What the angle was to be.
+        missed
+            Ticks that were missed right before it.
+        wait
+            Wait for room in the ring, because nothing moves or time stands still; otherwise a
+            sample that finds none is lost.
+        """
+        cycle, metronome, ring = self._cycle, self._metronome, self._ring
+        lateness_ns = metronome.lateness_ns
+        flags = cycle.flags
+        if missed:
+            flags |= _AFTER_MISSED
+        if self.counts.lost:
+            flags |= _AFTER_LOST
+        if lateness_ns > self._late_ns:
+            flags |= _LATE
+            self.counts.late += 1
+            self._board[Word.LATE] = self.counts.late
+        offset = ring.slot()
+        if offset < 0 and (not wait or (offset := self._wait_for_room()) < 0):
+            self.counts.lost += 1
+            self._board[Word.LOST] = self.counts.lost
+            return
+        t_ns = metronome.t_ns
+        pack_sample_into(
+            self._buffer,
+            offset,
+            t_ns,
+            tick,
+            reference_rad,
+            cycle.angle_rad,
+            cycle.torque_command_nm,
+            cycle.coupling_torque_nm,
+            *cycle.wrench,
+            flags,
+            lateness_ns,
+            self._clock.now_ns() - metronome.due_ns - lateness_ns,
+        )
+        ring.publish()
+        if tick % CONTROL_DECIMATION == 0:
+            self._write_terms(tick, t_ns)
+
+    def _write_terms(self, tick: int, t_ns: int) -> None:
+        ring, terms = self._terms_ring, self._cycle.controller
+        offset = ring.slot()
+        if offset < 0:
+            return  # The terms explain a record; they are not what it stands on.
+        pack_control_into(
+            ring.buffer,
+            offset,
+            t_ns,
+            tick,
+            terms.proportional_nm,
+            terms.integral_nm,
+            terms.derivative_nm,
+            terms.feedforward_nm,
+            terms.friction_nm,
+            terms.unlimited_torque_nm,
+        )
+        ring.publish()
+
+    def _wait_for_room(self) -> int:
+        deadline = time.monotonic() + _ROOM_PATIENCE_S
+        while (offset := self._ring.slot()) < 0 and time.monotonic() < deadline:
+            time.sleep(_ROOM_POLL_S)
+        return offset
