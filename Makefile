@@ -12,7 +12,7 @@ demo: $(VENV)/ready
 	$(BIN)/analyze demo/*.mcap --report demo/report --json demo/report/fits.json
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -6,6 +6,8 @@ them: encoder steps of 7e-5 rad, torque noise of 5e-3 N·m and steps of 1.25e-4 
 """
 
 import csv
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from analysis.structures import STRUCTURES
 from rigd.beam import Beam, Damping, transfer
+from rigd.session import read_session
 from rigd.spectral import FrequencyResponse, welch_response
 
 RATE_HZ = 1000.0
@@ -113,5 +116,26 @@ def clean_frf(sweep, plant) -> FrequencyResponse:
 
 
 @pytest.fixture(scope="session")
-def noisy_frf(sweep, plant) -> FrequencyResponse:
+def synthetic_frf(sweep, plant) -> FrequencyResponse:
     return sweep(plant, 7_301_926_554).welch()
+
+
+@pytest.fixture(scope="session")
+def shipped_frf(tmp_path_factory) -> FrequencyResponse:
+    """Welch's estimate of a session that the rig recorded with the simulation as shipped."""
+    folder = tmp_path_factory.mktemp("rig")
+    rigd = Path(sys.executable).with_name("rigd")
+    subprocess.run(
+        [rigd, "run", "chirp", "--fast", "--output", folder], check=True, capture_output=True
+    )
+    (path,) = folder.glob("*.mcap")
+    session = read_session(path)
+    samples = session.samples[slice(*session.segments["sweep"])]
+    return Sweep(samples["angle_rad"], samples["coupling_torque_nm"]).welch()
+
+
+@pytest.fixture(scope="session", params=["synthetic", "shipped"])
+def noisy_frf(request) -> FrequencyResponse:
+    """A response with noise: of the exact model, and of the shipped simulation."""
+    frf: FrequencyResponse = request.getfixturevalue(f"{request.param}_frf")
+    return frf
