@@ -41,7 +41,7 @@ def run(*command: object) -> None:
 
 
 def session() -> None:
-    """The paper's chirp, 136 s of rig time, from the command line to the closed file."""
+    """Run the paper's chirp, 136 s of rig time, from the command line to the closed file."""
     with tempfile.TemporaryDirectory() as folder:
         run(RIGD, "run", "chirp", "--fast", "--output", folder)
 
