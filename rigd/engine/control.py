@@ -39,7 +39,11 @@ def main() -> None:
         obtained = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
     else:
         obtained = {"clock": "real"} | obtain(priority=realtime.priority, cpu=realtime.cpu)
-    devices = open_devices(job.profile.rig)
+    try:
+        devices = open_devices(job.profile.rig)
+    except DeviceError as error:
+        parent.send(finished="fault", reason=str(error), counts={}, results={})
+        return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
     conduct(job, devices, clock, channels, parent, obtained)
 

@@ -1,0 +1,96 @@
+"""What the cycle relies on, of every backend."""
+
+import json
+from math import isfinite
+
+PERIOD_NS = 1_000_000
+
+
+def run(devices, first, ticks, torque_nm=None):
+    """Let some ticks pass; returns angles and wrenches."""
+    angles, wrenches = [], []
+    for tick in range(first, first + ticks):
+        devices.drive.latch(tick * PERIOD_NS)
+        devices.sensor.request(tick * PERIOD_NS)
+        angles.append(devices.drive.read_angle())
+        wrenches.append(devices.sensor.read_wrench())
+        if torque_nm is not None:
+            devices.drive.command(torque_nm)
+    return angles, wrenches
+
+
+def connect(devices):
+    devices.drive.connect()
+    devices.sensor.connect()
+
+
+def test_readings_are_finite_fresh_and_complete(devices):
+    connect(devices)
+    angles, wrenches = run(devices, 0, 200)
+    assert all(isfinite(angle) for angle in angles)
+    assert all(len(wrench) == 6 and all(map(isfinite, wrench)) for wrench in wrenches)
+    assert not devices.drive.angle_stale
+    assert not devices.sensor.wrench_stale
+    assert not devices.sensor.wrench_saturated
+
+
+def test_the_calibration_can_be_written_to_the_file(devices):
+    connect(devices)
+    assert json.loads(json.dumps(devices.sensor.calibration()))
+
+
+def test_without_enabling_no_command_moves_the_motor(devices):
+    connect(devices)
+    angles, _ = run(devices, 0, 300, torque_nm=0.3)
+    assert max(angles) - min(angles) < 1e-3
+
+
+def test_positive_torque_turns_towards_positive_angles(devices):
+    connect(devices)
+    run(devices, 0, 10)
+    devices.drive.enable()
+    angles, _ = run(devices, 10, 60, torque_nm=0.2)
+    assert angles[-1] > angles[0] + 1e-3
+
+
+def test_enabling_alone_exerts_no_torque(devices):
+    connect(devices)
+    devices.drive.enable()
+    angles, _ = run(devices, 0, 300)
+    assert max(angles) - min(angles) < 1e-3
+
+
+def test_disabling_ends_the_torque_whatever_was_commanded(devices):
+    connect(devices)
+    devices.drive.enable()
+    run(devices, 0, 30, torque_nm=0.3)
+    devices.drive.disable()
+    devices.drive.disable()
+    speeds = []
+    last = run(devices, 30, 1, torque_nm=0.3)[0][0]
+    for block in range(20):
+        angles, _ = run(devices, 31 + 100 * block, 100, torque_nm=0.3)
+        speeds.append(abs(angles[-1] - last))
+        last = angles[-1]
+    assert speeds[-1] < 0.2 * max(speeds)
+
+
+def test_disabling_and_closing_work_in_every_state(devices):
+    devices.drive.disable()
+    connect(devices)
+    devices.drive.disable()
+    devices.drive.enable()
+    devices.drive.disable()
+    devices.drive.close()
+    devices.drive.close()
+    devices.sensor.close()
+
+
+def test_a_missed_tick_passes_with_the_last_torque_held(devices):
+    connect(devices)
+    run(devices, 0, 2)
+    devices.drive.enable()
+    run(devices, 2, 5, torque_nm=0.2)
+    before = devices.drive.read_angle()
+    devices.drive.latch(56 * PERIOD_NS)
+    assert devices.drive.read_angle() > before + 1e-3

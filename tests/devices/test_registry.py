@@ -1,0 +1,27 @@
+"""Drivers are found by name, and unknown names are refused."""
+
+import subprocess
+import sys
+
+import pytest
+
+from rigd.devices.parameters import Selection
+from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
+
+
+def test_unknown_drivers_are_refused_with_what_there_is():
+    with pytest.raises(UnknownDeviceError, match=r'"steam".*choose drive = "sim"'):
+        check_selection(Selection(drive="steam", sensor="sim"))
+
+
+def test_only_the_simulation_may_skip_real_time():
+    assert is_simulated(Selection(drive="sim", sensor="sim"))
+    assert not is_simulated(Selection(drive="cia402", sensor="ati_can"))
+
+
+def test_the_simulation_is_not_imported_unless_a_profile_names_it():
+    code = (
+        "import sys, rigd.devices.registry, rigd.engine.control\n"
+        "assert not [name for name in sys.modules if name.startswith('rigd.sim')]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,93 @@
+"""The plant as encoder and sensor show it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.devices.contracts import DeviceError
+from rigd.devices.registry import open_devices
+from rigd.profile import load_profile
+
+PERIOD_NS = 1_000_000
+
+
+@pytest.fixture
+def rig():
+    return load_profile("sim").rig
+
+
+def watch(rig, ticks, torque_nm):
+    """Angles (n,) and wrenches (n, 6) of a rig under a torque that follows `torque_nm(tick)`."""
+    devices = open_devices(rig)
+    devices.drive.enable()
+    angles, wrenches, saturated = [], [], []
+    for tick in range(ticks):
+        devices.drive.latch(tick * PERIOD_NS)
+        devices.sensor.request(tick * PERIOD_NS)
+        angles.append(devices.drive.read_angle())
+        wrenches.append(devices.sensor.read_wrench())
+        saturated.append(devices.sensor.wrench_saturated)
+        devices.drive.command(torque_nm(tick))
+    return np.array(angles), np.array(wrenches), np.array(saturated)
+
+
+def wiggle(tick):
+    return 0.3 * np.sin(2 * np.pi * 0.003 * tick)
+
+
+def test_angles_come_in_whole_steps(rig):
+    angles, _, _ = watch(rig, 500, wiggle)
+    steps = angles / rig.encoder.resolution_rad
+    assert np.abs(steps - np.round(steps)).max() < 1e-6
+    assert np.unique(np.round(steps)).size > 20
+
+
+def test_the_wrench_comes_in_whole_steps_with_the_stated_noise_and_offset(rig):
+    _, wrenches, saturated = watch(rig, 4000, lambda tick: 0.0)
+    resolution = np.array(rig.sensor.resolution)
+    steps = wrenches / resolution
+    assert np.abs(steps - np.round(steps)).max() < 1e-6
+    simulation = rig.simulation
+    noise = np.array([simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3)
+    expected = np.sqrt(noise**2 + resolution**2 / 12)
+    assert wrenches.std(axis=0) == pytest.approx(expected, rel=0.06)
+    assert np.abs(wrenches.mean(axis=0) - simulation.offset).max() < 4 * noise.max() / 60
+    assert not saturated.any()
+
+
+def test_a_sensor_at_the_end_of_its_range_says_so(rig):
+    narrow = replace(rig, sensor=replace(rig.sensor, range=(20.0, 20.0, 60.0, 1.0, 1.0, 0.05)))
+    _, wrenches, saturated = watch(narrow, 1500, wiggle)
+    assert saturated.any()
+    assert np.abs(wrenches[:, 5]).max() == pytest.approx(0.05, abs=1.3e-4)
+    assert (np.abs(wrenches[saturated, 5]) > 0.0498).all()
+
+
+def test_the_projection_of_the_wrench_is_the_coupling_torque(rig):
+    # A sensor turned by 180° about x, and off the axis: its fy has a lever arm of 3 cm.
+    quiet = replace(
+        rig,
+        sensor=replace(rig.sensor, resolution=(0.0,) * 6),
+        simulation=replace(
+            rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0, offset=(0.0,) * 6
+        ),
+    )
+    turned = replace(quiet, sensor=replace(quiet.sensor, projection=(0, 0.03, 0, 0, 0, -1.0)))
+    _, straight, _ = watch(quiet, 800, wiggle)
+    _, wrenches, _ = watch(turned, 800, wiggle)
+    assert np.abs(straight[:, 5]).max() > 0.01
+    assert wrenches @ np.array(turned.sensor.projection) == pytest.approx(straight[:, 5])
+
+
+def test_a_declared_delay_is_the_age_of_the_reading(rig):
+    late = replace(rig, encoder=replace(rig.encoder, delay_s=2e-3, resolution_rad=0.0))
+    now = replace(rig, encoder=replace(rig.encoder, resolution_rad=0.0))
+    delayed, _, _ = watch(late, 400, wiggle)
+    prompt, _, _ = watch(now, 400, wiggle)
+    assert delayed[2:] == pytest.approx(prompt[:-2], abs=1e-12)
+
+
+def test_a_profile_without_a_simulation_section_is_refused(rig):
+    with pytest.raises(DeviceError, match=r"\[simulation\]"):
+        open_devices(replace(rig, simulation=None))
