@@ -15,10 +15,14 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from analysis.welch_route import WelchAnalysis, WelchSettings
+    from analysis.settings import WelchSettings
+    from analysis.welch_route import WelchAnalysis
 
 _MAX_NFFT = 2**22
 """Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
+
+_FIGURE_STEPS = 4
+"""How many times longer a figure takes than another step, roughly."""
 
 _EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
@@ -127,7 +131,7 @@ def analyze(
         _complain(str(error))
         code = 1
     except KeyboardInterrupt:
-        _complain("Stopped.")
+        typer.echo("Stopped.", err=True)
         code = 130
     raise typer.Exit(code)
 
@@ -174,9 +178,9 @@ def _analyse_all(
     """Analyse and report every file; return results, message by failed file, and exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from analysis.estimate import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError
-    from analysis.welch_route import RouteError, SettingsError
     from rigd.session import SessionError
 
     analyses: list[WelchAnalysis] = []
@@ -200,16 +204,12 @@ def _analyse_all(
 
             try:
                 analyses.append(_analyse_file(file, folder, settings, on_step))
-            except (SessionError, RecordError, RouteError, OutputError) as error:
+            except (SessionError, RecordError, EstimateError, OutputError) as error:
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)
                 errors[str(file)] = str(error)
                 progress.update(task, completed=number * _steps(settings))
                 terminal.print(f"Error: {error}", markup=False, highlight=False, soft_wrap=True)
     return analyses, errors, code
-
-
-_FIGURE_STEPS = 4
-"""How many times longer a figure takes than another step, roughly."""
 
 
 def _steps(settings: WelchSettings) -> int:
@@ -244,7 +244,7 @@ def _settings(
     nfft: int | None,
 ) -> WelchSettings:
     """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2)."""
-    from analysis.welch_route import WelchSettings
+    from analysis.settings import WelchSettings
 
     if segment is not None and overlap is not None and overlap >= segment:
         raise typer.BadParameter(
@@ -324,7 +324,7 @@ def _say(console: Console, text: str) -> None:
 
 
 def _complain(message: str) -> None:
-    typer.echo(f"Error: {message}" if message != "Stopped." else message, err=True)
+    typer.echo(f"Error: {message}", err=True)
 
 
 if __name__ == "__main__":

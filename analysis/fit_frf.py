@@ -57,8 +57,6 @@ class FrfFit:
         Eq. (26) at the minimum, in (N·m/rad)².
     at_bounds : tuple of str
         Free parameters that rest on the edge of the range searched.
-    evaluations : int
-        Of the model and its derivatives on all points, polishing only.
     """
 
     structure: Structure
@@ -68,7 +66,6 @@ class FrfFit:
     std: dict[str, float] | None
     cost: float
     at_bounds: tuple[str, ...]
-    evaluations: int
 
 
 def fit_frf(
@@ -211,7 +208,6 @@ def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfF
         std=None if on_edge.any() else _standard_deviations(full, best.x),
         cost=best.cost,
         at_bounds=tuple(name for name, held in zip(structure.free, on_edge, strict=True) if held),
-        evaluations=sum(minimum.evaluations for minimum in polished),
     )
 
 

@@ -26,6 +26,10 @@ MAX_FILLED_SHARE = 0.01
 MAX_GAP_S = 0.1
 """Longest single gap in the sweep that is interpolated; a longer one is refused."""
 
+MAX_SPAN = 10
+"""Most ticks per recorded sample: a file with next to no samples in its span would only fill the
+memory, and no sweep in it could be analysed."""
+
 MAX_CLOCK_ERROR = 1e-3
 """Largest relative difference between the rate stated and the rate of the time stamps."""
 
@@ -87,8 +91,6 @@ class Record:
         (n,) angle asked for and angle measured at the output shaft.
     torque_nm
         (n,) coupling torque, positive when the motor pushes the beam.
-    status
-        (n,) status bits of `rigd.session.Status`; 0 where a tick was filled in.
     rate_hz
         Ticks per second.
     beam
@@ -118,7 +120,6 @@ class Record:
     reference_rad: NDArray[np.float64]
     angle_rad: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
-    status: NDArray[np.uint32]
     rate_hz: float
     beam: Beam
     angle_delay_s: float
@@ -163,18 +164,8 @@ def load_record(path: Path) -> Record:
     if len(samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
     rate_hz = _positive(session, "rate_hz", "Hz")
-    beam = Beam(
-        length_m=_positive(session, "beam_length_m", "m"),
-        density_kg_per_m=_positive(session, "beam_density_kg_per_m", "kg/m"),
-        bending_stiffness_n_m2=_positive(session, "beam_bending_stiffness_n_m2", "N·m²"),
-    )
-    tool_inertia_kg_m2 = session.number("tool_inertia_kg_m2", 0.0)
-    if tool_inertia_kg_m2 < 0.0:
-        raise RecordError(
-            f"{path}: tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg m², but an inertia cannot be "
-            "negative; correct the file's metadata."
-        )
     ticks = samples["tick"].astype(np.int64)
+    _check_span(path, ticks)
     _check_clock(path, ticks, samples["t_ns"], rate_hz)
     for field in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
         _check_finite(path, field, samples[field], ticks)
@@ -183,7 +174,7 @@ def load_record(path: Path) -> Record:
     index = ticks - first_tick
     length = int(index[-1]) + 1
     sweep, cut = _sweep(session, first_tick, length)
-    status = np.zeros(length, dtype=np.uint32)
+    status = np.zeros(length, dtype=np.uint32)  # bits of `Status`; 0 where a tick is missing
     status[index] = samples["status"]
     missing = np.ones(length, dtype=bool)
     missing[index] = False
@@ -202,11 +193,7 @@ def load_record(path: Path) -> Record:
         sweep_stale_angles=int(stale_angle[sweep].sum()),
         sweep_stale_torques=int(stale_torque[sweep].sum()),
     )
-    flags = {
-        meaning: count
-        for flag, meaning in _REPORTED_FLAGS
-        if (count := int(np.count_nonzero(status[sweep] & flag)))
-    }
+    flags = _flag_counts(status[sweep])
     outcome = (session.outcome or {}).get("outcome", "unknown")
     return Record(
         path=path,
@@ -214,12 +201,11 @@ def load_record(path: Path) -> Record:
         reference_rad=_filled(samples["angle_reference_rad"], index, missing),
         angle_rad=_filled(samples["angle_rad"], index, missing | stale_angle),
         torque_nm=_filled(samples["coupling_torque_nm"], index, missing | stale_torque),
-        status=status,
         rate_hz=rate_hz,
-        beam=beam,
+        beam=_beam(session),
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
-        tool_inertia_kg_m2=tool_inertia_kg_m2,
+        tool_inertia_kg_m2=_tool_inertia(session),
         sweep=sweep,
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
@@ -240,13 +226,42 @@ def _positive(session: Session, key: str, unit: str) -> float:
     return value
 
 
+def _beam(session: Session) -> Beam:
+    return Beam(
+        length_m=_positive(session, "beam_length_m", "m"),
+        density_kg_per_m=_positive(session, "beam_density_kg_per_m", "kg/m"),
+        bending_stiffness_n_m2=_positive(session, "beam_bending_stiffness_n_m2", "N·m²"),
+    )
+
+
+def _tool_inertia(session: Session) -> float:
+    inertia_kg_m2 = session.number("tool_inertia_kg_m2", 0.0)
+    if inertia_kg_m2 < 0.0:
+        raise RecordError(
+            f"{session.path}: tool_inertia_kg_m2 is {inertia_kg_m2:g} kg·m², but an inertia cannot "
+            "be negative; correct the file's metadata."
+        )
+    return inertia_kg_m2
+
+
+def _check_span(path: Path, ticks: NDArray[np.int64]) -> None:
+    """Refuse a span of ticks that is all but empty."""
+    span = int(ticks[-1] - ticks[0]) + 1
+    if span > MAX_SPAN * len(ticks):
+        raise RecordError(
+            f"{path}: only {len(ticks)} of the {span} ticks from {ticks[0]} to {ticks[-1]} have a "
+            "sample, too few to analyse; record the session again."
+        )
+
+
 def _check_clock(
     path: Path, ticks: NDArray[np.int64], t_ns: NDArray[np.int64], rate_hz: float
 ) -> None:
     """Refuse time stamps that contradict the rate."""
     if len(ticks) < 2:
         return
-    rate_of_stamps_hz = 1e9 * float(ticks[-1] - ticks[0]) / max(float(t_ns[-1] - t_ns[0]), 1.0)
+    elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
+    rate_of_stamps_hz = 1e9 * int(ticks[-1] - ticks[0]) / elapsed_ns
     if abs(rate_of_stamps_hz / rate_hz - 1.0) > MAX_CLOCK_ERROR:
         raise RecordError(
             f"{path}: rate_hz is {rate_hz:g} Hz, but the time stamps t_ns advance at "
@@ -296,6 +311,11 @@ def _longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
         return 0, 0
     longest = int(np.argmax(ends - starts))
     return int(ends[longest] - starts[longest]), int(starts[longest])
+
+
+def _flag_counts(status: NDArray[np.uint32]) -> dict[str, int]:
+    counts = {meaning: int(np.count_nonzero(status & flag)) for flag, meaning in _REPORTED_FLAGS}
+    return {meaning: count for meaning, count in counts.items() if count}
 
 
 def _check_fillable(

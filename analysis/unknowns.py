@@ -18,19 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.structures import Parameter, Structure
-from rigd.beam import Beam, Damping, clamped_free_eigenvalues
+from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
 
 # Orders as the paper sweeps them, inside (0, 2). Sizes run from what no response could show to
 # far beyond what lets a beam vibrate, much wider than the paper's sweep, which its own results
 # leave (type IV with 1/omega weights has zeta = 2.4e-3, the sweep ends at 3.05e-4).
 ORDER_RANGE: Final = (0.001, 1.999)
 SIZE_RANGE: Final = (1e-9, 1e3)
-
-
-def undamped_frequencies_rad_s(beam: Beam, count: int) -> NDArray[np.float64]:
-    """Natural frequencies of the undamped clamped-free beam, shape (count,)."""
-    z = clamped_free_eigenvalues(count)
-    return z * z / (beam.length_m**2 * math.sqrt(beam.density_over_stiffness))
 
 
 @dataclass(frozen=True, slots=True)

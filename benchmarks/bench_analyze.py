@@ -48,7 +48,8 @@ from pathlib import Path
 marks = [("", time.perf_counter())]
 mark = lambda name: marks.append((name, time.perf_counter()))
 from analysis.record import load_record
-from analysis.welch_route import WelchSettings, analyse
+from analysis.settings import WelchSettings
+from analysis.welch_route import analyse
 mark("import analysis")
 record = load_record(Path({str(session)!r})); mark("read file")
 on_step = lambda done: mark("estimate" if "response" in done else "fits")

@@ -8,9 +8,9 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the control process
 
 from collections.abc import Callable
-from time import perf_counter
 
 import numpy as np
+from timing import least_s
 
 from rigd.beam import Beam, Damping, TransferGrid, couple, propagator, realise
 from rigd.sim.plant import SimulatedPlant
@@ -22,12 +22,7 @@ TICKS = 20_000
 
 def best_of_ten(function: Callable[[], object]) -> float:
     """Shortest of ten runs, in milliseconds."""
-    times = []
-    for _ in range(10):
-        start = perf_counter()
-        function()
-        times.append(perf_counter() - start)
-    return 1e3 * min(times)
+    return 1e3 * least_s(function, 10)
 
 
 def textbook(s: np.ndarray, zeta: float, alpha: float, gamma: float, lambda_: float) -> np.ndarray:

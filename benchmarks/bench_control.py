@@ -1,9 +1,7 @@
 """One PID step, one limit check, and the prediction of a session against a loop over its ticks."""
 
-import time
-from collections.abc import Callable
-
 import numpy as np
+from timing import least_s
 
 from rigd.control import ClosedLoop, PidController, check_stability, close_loop, design_pid
 from rigd.excitation import chirp
@@ -11,16 +9,6 @@ from rigd.profile import load_profile
 from rigd.safety import LimitWatch
 
 CALLS = 20_000
-
-
-def best_s(work: Callable[[], object], repeats: int) -> float:
-    """Best of several runs: what the work costs when nothing else runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def tick_by_tick(loop: ClosedLoop, reference_rad: np.ndarray) -> np.ndarray:
@@ -53,17 +41,17 @@ def main() -> None:
         for _ in range(CALLS):
             abs(0.01)
 
-    empty = best_s(nothing, 10) / CALLS * 1e6
-    step, check = (best_s(work, 10) / CALLS * 1e6 for work in (steps, checks))
+    empty = least_s(nothing, 10) / CALLS * 1e6
+    step, check = (least_s(work, 10) / CALLS * 1e6 for work in (steps, checks))
     print(f"PID step         {step:6.2f} µs   {step / empty:5.1f} × a call of abs()")
     print(f"limit check      {check:6.2f} µs   {check / empty:5.1f} × a call of abs()")
 
     loop = close_loop(model)
-    design = best_s(lambda: check_stability(close_loop(model)), 5) * 1e3
+    design = least_s(lambda: check_stability(close_loop(model)), 5) * 1e3
     print(f"close and check  {design:6.1f} ms")
     reference = chirp(rate_hz=profile.rig.rate_hz).reference_rad
-    blocks = best_s(lambda: loop.simulate(reference), 10) * 1e3
-    plain = best_s(lambda: tick_by_tick(loop, reference), 1) * 1e3
+    blocks = least_s(lambda: loop.simulate(reference), 10) * 1e3
+    plain = least_s(lambda: tick_by_tick(loop, reference), 1) * 1e3
     deviation = np.max(
         np.abs(loop.simulate(reference).angle_rad - tick_by_tick(loop, reference).T[0])
     )

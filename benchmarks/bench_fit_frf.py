@@ -11,11 +11,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import differential_evolution, least_squares
+from timing import least_s
 
 from analysis.fit_frf import FrfFit, fit_frf, fit_many
 from analysis.structures import STRUCTURES, Structure
@@ -109,21 +109,11 @@ class Peer:
         return lowest
 
 
-def timed(work: Callable[[], object], repeats: int) -> float:
-    """Least wall time of several runs, in s."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def main() -> None:
     """Print one line a fit."""
     frf = session()
     six = [STRUCTURES[name] for name in ("I", "II", "III", "IV", "V", "VI")]
-    twelve = timed(lambda: fit_many(frf.frequency_hz, frf.response, LINK, six), 10)
+    twelve = least_s(lambda: fit_many(frf.frequency_hz, frf.response, LINK, six), 10)
     print(f"Twelve fits of one session, best of ten: {twelve:.3f} s")
     print(f"Peer: {STARTS} random starts of scipy least_squares on all points, and a local grid")
     print("type weights       cost      ms   random ms  ratio  lowest/ours-1  reached  grid/ours-1")
@@ -134,7 +124,7 @@ def main() -> None:
             def ours(s: Structure = structure, w: str = weighting) -> FrfFit:
                 return fit_frf(frf.frequency_hz, frf.response, LINK, s, w)
 
-            fit, spent = ours(), timed(ours, 3)
+            fit, spent = ours(), least_s(ours, 3)
             peer = Peer(frf, structure, weighting)
             start = time.perf_counter()
             ends = np.array(peer.random_starts(rng))

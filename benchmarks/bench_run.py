@@ -7,11 +7,11 @@ the tick: the bare matrix product of the plant's step, without which nothing can
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from timing import least_s
 
 from rigd.control import PidController, design_pid
 from rigd.devices.registry import open_devices
@@ -23,16 +23,6 @@ from rigd.safety import LimitWatch
 
 RIGD = Path(sys.executable).with_name("rigd")
 TICKS = 20_000
-
-
-def least(work: Callable[[], object], repeats: int) -> float:
-    """Least wall time of several runs, in s."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def run(*command: object) -> None:
@@ -80,16 +70,16 @@ def product() -> Callable[[], None]:
 
 def main() -> None:
     """Print times and ratios."""
-    bare = least(lambda: run(sys.executable, "-c", "import numpy, pydantic"), 10)
-    whole = least(session, 10)
+    bare = least_s(lambda: run(sys.executable, "-c", "import numpy, pydantic"), 10)
+    whole = least_s(session, 10)
     print(f"rigd run chirp --fast, 136 s of rig time, best of ten: {whole:.2f} s")
     print(f"  peer, interpreter with numpy and pydantic: {bare:.2f} s, ratio {whole / bare:.1f}")
-    empty = least(lambda: run(sys.executable, "-c", "pass"), 10)
-    shown = least(lambda: run(RIGD, "--help"), 10)
+    empty = least_s(lambda: run(sys.executable, "-c", "pass"), 10)
+    shown = least_s(lambda: run(RIGD, "--help"), 10)
     print(f"rigd --help, best of ten: {shown:.3f} s")
     print(f"  peer, bare interpreter: {empty:.3f} s, ratio {shown / empty:.1f}")
-    tick_us = least(cycle(), 10) / TICKS * 1e6
-    product_us = least(product(), 10) / TICKS * 1e6
+    tick_us = least_s(cycle(), 10) / TICKS * 1e6
+    product_us = least_s(product(), 10) / TICKS * 1e6
     print(f"one tick (plant, devices, limits, controller), best of ten: {tick_us:.2f} µs")
     print(
         f"  peer, the plant's matrix product: {product_us:.2f} µs, ratio {tick_us / product_us:.1f}"

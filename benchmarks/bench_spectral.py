@@ -1,10 +1,8 @@
 """Welch's estimate with the paper's settings against scipy.signal, on the same record."""
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 import scipy.signal
+from timing import least_s
 
 from rigd.spectral import (
     PAPER_NFFT,
@@ -16,16 +14,6 @@ from rigd.spectral import (
 
 RATE_HZ = 1000.0
 REPEATS = 15
-
-
-def best_of(work: Callable[[], object]) -> float:
-    """Least wall time of several runs, in s."""
-    times = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def main() -> None:
@@ -49,8 +37,9 @@ def main() -> None:
         syy = scipy.signal.welch(y, **options)[1]
         return sxy / sxx, np.abs(sxy) ** 2 / (sxx * syy)
 
-    ours, theirs = best_of(lambda: welch_response(x, y, RATE_HZ)), best_of(peer)
-    whole = best_of(lambda: fft_response(x, y, RATE_HZ, PAPER_NFFT))
+    ours = least_s(lambda: welch_response(x, y, RATE_HZ), REPEATS)
+    theirs = least_s(peer, REPEATS)
+    whole = least_s(lambda: fft_response(x, y, RATE_HZ, PAPER_NFFT), REPEATS)
     difference = np.abs(welch_response(x, y, RATE_HZ).response / peer()[0] - 1)[1:-1].max()
     print(f"Best of {REPEATS}, 120 000 samples, 8 segments of 17 266 padded to 160 000")
     print(f"  welch_response         {ours * 1e3:7.1f} ms")

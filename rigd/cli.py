@@ -43,6 +43,9 @@ Taper = Annotated[float, typer.Option("--taper", help="Fade in and out over this
 
 def main() -> None:
     """Entry point of ``rigd``."""
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that does not know "·" or "²" gets a "?" instead of an error.
+        stream.reconfigure(errors="replace")  # type: ignore[union-attr]
     try:
         app()
     except KeyboardInterrupt:
@@ -103,9 +106,16 @@ def run_sessions(
     ] = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
+    notes = {"operator": operator, "specimen": specimen, "note": note}
+    for option, text in notes.items():
+        if not text.isprintable():
+            _fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
     from rigd.crew import Crew
     from rigd.engine.process import SINGLE_THREADED
+    from rigd.engine.signals import StopRequest, ignore
 
+    stop = StopRequest()
+    stop.catch()
     os.environ.update(SINGLE_THREADED)
     # Before anything else: its processes import while this one does, and while it plans.
     crew = Crew(live=live)
@@ -115,11 +125,12 @@ def run_sessions(
         results = run_in_foreground(
             build,
             crew,
+            stop,
             profile_name=profile,
             folder=output,
             repeat=repeat,
             seed=seed,
-            notes={"operator": operator, "specimen": specimen, "note": note},
+            notes=notes,
             fast=fast,
             live=live,
             force=force,
@@ -127,11 +138,14 @@ def run_sessions(
         )
     except ForegroundError as error:
         _fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+    finally:
+        ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
     if as_json:
         typer.echo(json.dumps({"sessions": [_as_json(result) for result in results]}))
-    code = _exit_code(results[-1])
-    if code:
-        raise typer.Exit(code)
+    if stop.requested:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if not all(result.went_well for result in results):
+        raise typer.Exit(EXIT_FAILED)
 
 
 @excitation_command
@@ -283,9 +297,3 @@ def _as_json(result: "SessionResult") -> dict[str, object]:
         "late": result.late,
         "lost": result.lost,
     }
-
-
-def _exit_code(result: "SessionResult") -> int:
-    if result.interrupted:
-        return EXIT_INTERRUPTED
-    return EXIT_FAILED if result.outcome != "complete" or result.reason else 0

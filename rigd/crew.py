@@ -44,7 +44,13 @@ class Crew:
         return self._channels
 
     def lay_out(self, rate_hz: float) -> None:
-        """Size the shared memory for a session at ``rate_hz``."""
+        """Size the shared memory for a session at ``rate_hz``.
+
+        Raises
+        ------
+        OSError
+            If there is not enough shared memory.
+        """
         from rigd.engine.channels import create_channels
 
         self._channels = create_channels(rate_hz, self._fds)

@@ -6,9 +6,8 @@ recorder is ready, shows the progress, passes a stop on, and closes the file wit
 
 import json
 import platform
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,9 +20,11 @@ from rigd.engine.events import Event, read_events
 from rigd.engine.process import ChildError, Message
 from rigd.engine.recorder import RecorderJob
 from rigd.engine.ring import Observer
+from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation
 from rigd.live.job import LiveJob
 from rigd.profile import Profile
+from rigd.session.writer import PART_SUFFIX
 
 _POLL_S = 0.05
 _PATIENCE_S = 5.0
@@ -59,7 +60,13 @@ class SessionResult:
     missed: int
     late: int
     lost: int
-    interrupted: bool
+    live_dropped: int = 0
+    """Samples that the live view did not get."""
+
+    @property
+    def went_well(self) -> bool:
+        """Whether nothing at all is to be said against it."""
+        return self.outcome == "complete" and not self.reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +82,7 @@ class SessionProgress:
 Watcher = Callable[[SessionProgress, list[Event]], None]
 
 
-def run_session(order: Order, crew: Crew, watcher: Watcher) -> SessionResult:
+def run_session(order: Order, crew: Crew, stop: StopRequest, watcher: Watcher) -> SessionResult:
     """Run one session in the processes of `crew`.
 
     Parameters
@@ -84,6 +91,8 @@ def run_session(order: Order, crew: Crew, watcher: Watcher) -> SessionResult:
         What to run, already checked against the profile's limits.
     crew
         Freshly started processes and their memory laid out; they serve one session only.
+    stop
+        The operator's, from now on passed on to the session.
     watcher
         Called some twenty times a second with the progress and the events since the last call.
 
@@ -97,11 +106,17 @@ def run_session(order: Order, crew: Crew, watcher: Watcher) -> SessionResult:
         If the file cannot be opened or written, or a process died; the drive is then disabled.
     """
     session = _Session(order, crew, watcher)
-    with _stop_on_signal(session.stop):
-        try:
-            return session.run()
-        except ChildError as error:
-            raise SessionFailedError(f"{error} The drive is disabled.") from None
+    stop.on_request = session.stop
+    if stop.requested:
+        session.stop()
+    try:
+        return session.run()
+    except (ChildError, SessionFailedError) as error:
+        part = order.path.with_name(order.path.name + PART_SUFFIX)
+        kept = f" What was recorded is in {part}." if part.exists() else ""
+        raise SessionFailedError(f"{error} The drive is disabled.{kept}") from None
+    finally:
+        stop.on_request = _nothing
 
 
 class _Session:
@@ -111,10 +126,8 @@ class _Session:
         self._board = crew.channels.board
         self._events = Observer(crew.channels.events)
         self._watcher = watcher
-        self._interrupted = False
 
     def stop(self) -> None:
-        self._interrupted = True
         self._board[Word.STOP] = Stop.OPERATOR
 
     def run(self) -> SessionResult:
@@ -135,12 +148,21 @@ class _Session:
     def _listen_to_control(self) -> Message:
         """Wait for the control process's next message, watching the others meanwhile."""
         recorder_lost: str | None = None
+        deadline: float | None = None
         while True:
             try:
                 answer = self._crew.control.poll(_POLL_S)
             except ChildError as error:
-                return self._control_died(error)
+                return self._control_died(str(error))
             self._report()
+            if self._board[Word.STOP] != Stop.NO:
+                deadline = deadline or time.monotonic() + _PATIENCE_S
+                if answer is None and time.monotonic() > deadline:
+                    # It hangs: a drive's own watchdog is all that is left, and this calls it.
+                    self._crew.control.kill()
+                    return self._control_died(
+                        f"The control process did not stop within {_PATIENCE_S:g} s and was killed."
+                    )
             if answer is not None:
                 if recorder_lost is not None:
                     raise SessionFailedError(recorder_lost)
@@ -150,7 +172,7 @@ class _Session:
                 if recorder_lost is not None:
                     self._board[Word.STOP] = Stop.NO_RECORDER
 
-    def _control_died(self, error: ChildError) -> Message:
+    def _control_died(self, reason: str) -> Message:
         """Say what the control process would have said, as far as the board tells."""
         board = self._board
         counts = {
@@ -158,7 +180,7 @@ class _Session:
             "missed": board[Word.MISSED],
             "late": board[Word.LATE],
         }
-        return {"finished": "fault", "reason": str(error), "counts": counts, "results": {}}
+        return {"finished": "fault", "reason": reason, "counts": counts, "results": {}}
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -244,7 +266,7 @@ class _Session:
             missed=counts["missed"],
             late=counts["late"],
             lost=counts.get("lost", 0),
-            interrupted=self._interrupted,
+            live_dropped=self._board[Word.LIVE_DROPPED],
         )
 
 
@@ -278,7 +300,7 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     if number is not None:
         stem += f"-{number:02d}"
     path, extra = folder / f"{stem}.mcap", 1
-    while path.exists() or path.with_name(path.name + ".part").exists():
+    while path.exists() or path.with_name(path.name + PART_SUFFIX).exists():
         extra += 1
         path = folder / f"{stem}_{extra}.mcap"
     return path
@@ -291,18 +313,9 @@ def with_seed(profile: Profile, seed: int) -> Profile:
     return replace(profile, rig=replace(profile.rig, simulation=simulation))
 
 
+def _nothing() -> None:
+    """Answer a stop request that comes between two sessions: its being noted is enough."""
+
+
 def _text(value: float | str) -> str:
     return value if isinstance(value, str) else repr(value)
-
-
-@contextmanager
-def _stop_on_signal(stop: Callable[[], None]) -> Iterator[None]:
-    previous = {
-        number: signal.signal(number, lambda *_: stop())
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

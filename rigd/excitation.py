@@ -87,6 +87,7 @@ def chirp(
         If an option is not finite, out of range, or does not fit the rate.
     """
     _positive("amplitude_rad", amplitude_rad, "rad")
+    _within_a_turn("amplitude_rad", amplitude_rad)
     _frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
     _frequency("stop_hz", stop_hz, rate_hz)
     segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
@@ -141,6 +142,7 @@ def step(
         raise ExcitationError(
             "amplitude_rad = 0 rad is no step; give an angle other than zero, or use hold."
         )
+    _within_a_turn("amplitude_rad", amplitude_rad)
     segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
@@ -196,6 +198,7 @@ def multisine(
         If an option is not finite, out of range, or does not fit the others.
     """
     _positive("amplitude_rad", amplitude_rad, "rad")
+    _within_a_turn("amplitude_rad", amplitude_rad)
     _frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
     _frequency("stop_hz", stop_hz, rate_hz)
     _positive("period_s", period_s, "s")
@@ -209,23 +212,7 @@ def multisine(
             f"duration_s = {duration_s:g} s is not a whole number of periods of "
             f"period_s = {period_s:g} s; choose for example {max(periods, 1) * period_s:g} s."
         )
-    harmonics = np.arange(1, ticks // 2)
-    tolerance = 1e-9 * stop_hz
-    harmonics = harmonics[
-        (harmonics / period_s >= start_hz - tolerance)
-        & (harmonics / period_s <= stop_hz + tolerance)
-    ]
-    if harmonics.size == 0:
-        raise ExcitationError(
-            f"No harmonic of period_s = {period_s:g} s lies between start_hz = {start_hz:g} Hz and "
-            f"stop_hz = {stop_hz:g} Hz; take a longer period or a wider band."
-        )
-    spectrum = np.zeros(ticks // 2 + 1, dtype=complex)
-    random = np.random.default_rng(seed)
-    spectrum[harmonics] = np.exp(2j * pi * random.random(harmonics.size))
-    period = np.fft.irfft(spectrum, ticks)
-    period = np.roll(period, -int(np.argmin(np.abs(period))))
-    period *= amplitude_rad / np.max(np.abs(period))
+    period = amplitude_rad * _random_phase_period(ticks, period_s, (start_hz, stop_hz), seed)
     crest_factor = amplitude_rad / float(np.sqrt(np.mean(period**2)))
     t = _sweep_time(segments, rate_hz)
     sweep = np.tile(period, periods) * _taper(t, duration_s, taper_s)
@@ -242,6 +229,30 @@ def multisine(
         "crest_factor": crest_factor,
     }
     return _assemble("multisine", parameters, rate_hz, segments, sweep)
+
+
+def _random_phase_period(
+    ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
+) -> FloatArray:
+    """One period of every harmonic in the band, shape (ticks,), of peak 1, from near zero on."""
+    frequency_hz = np.arange(1, ticks // 2) / period_s
+    tolerance_hz = 1e-9 * band_hz[1]
+    inside = (frequency_hz >= band_hz[0] - tolerance_hz) & (
+        frequency_hz <= band_hz[1] + tolerance_hz
+    )
+    harmonics = 1 + np.flatnonzero(inside)
+    if harmonics.size == 0:
+        raise ExcitationError(
+            f"No harmonic of period_s = {period_s:g} s lies between start_hz = {band_hz[0]:g} Hz "
+            f"and stop_hz = {band_hz[1]:g} Hz; take a longer period or a wider band."
+        )
+    spectrum = np.zeros(ticks // 2 + 1, dtype=complex)
+    phases = 2 * pi * np.random.default_rng(seed).random(harmonics.size)
+    spectrum[harmonics] = np.exp(1j * phases)
+    period: FloatArray = np.fft.irfft(spectrum, ticks)
+    period = np.roll(period, -int(np.argmin(np.abs(period))))
+    period /= np.max(np.abs(period))
+    return period
 
 
 def from_csv(
@@ -271,11 +282,12 @@ def from_csv(
         ticks = len(angles)
         sweep = np.asarray(angles)
     else:
+        _check_ticks("The file", (times[-1] - times[0]) * rate_hz, rate_hz)
         time_s = np.asarray(times) - times[0]
         # The last row is reached exactly; rounding must not lose its tick.
         ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
-        _check_ticks("the file's duration", ticks, rate_hz)
         sweep = np.interp(np.arange(ticks) / rate_hz, time_s, angles)
+    _within_a_turn(f"{path}: the largest angle_rad", float(np.max(np.abs(sweep))))
     duration_s = ticks / rate_hz
     segments = _segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters: dict[str, float | int | str] = {
@@ -350,7 +362,7 @@ def _segments(
     _not_negative("rest_s", rest_s)
     _positive("duration_s", duration_s, "s")
     _not_negative("ring_down_s", ring_down_s)
-    _check_ticks("the session", (rest_s + duration_s + ring_down_s) * rate_hz, rate_hz)
+    _check_ticks("The session", (rest_s + duration_s + ring_down_s) * rate_hz, rate_hz)
     first = round(rate_hz * rest_s)
     end = first + round(rate_hz * duration_s)
     last = max(end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
@@ -427,6 +439,14 @@ def _not_negative(option: str, value: float) -> None:
     _finite(option, value, "s")
     if value < 0.0:
         raise ExcitationError(f"{option} = {value:g} s must not be negative.")
+
+
+def _within_a_turn(option: str, value_rad: float) -> None:
+    if abs(value_rad) > 2.0 * pi:
+        raise ExcitationError(
+            f"{option} = {value_rad:g} rad is more than a full turn; give an angle in rad of at "
+            f"most {2.0 * pi:.3f}."
+        )
 
 
 def _frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:

@@ -1,5 +1,6 @@
 """Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
 
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from rigd.daemon import (
 from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
 from rigd.engine.board import Phase
 from rigd.engine.events import Event
+from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, ExcitationError
 from rigd.planning import Plan, RefusedError, plan_session
 from rigd.profile import Profile, ProfileError, load_profile
@@ -36,6 +38,10 @@ _PHASES = {
     Phase.OFF: "drive off",
 }
 
+# Uncompressed, with the controller's terms and the index; a file never takes more.
+_BYTES_PER_TICK = 180
+_BYTES_SPARE = 1_000_000
+
 
 class ForegroundError(Exception):
     """No session, or no further one; the message is for the operator."""
@@ -48,6 +54,7 @@ class ForegroundError(Exception):
 def run_in_foreground(
     build: Callable[[float], Excitation],
     crew: Crew,
+    stop: StopRequest,
     *,
     profile_name: str,
     folder: Path,
@@ -59,7 +66,7 @@ def run_in_foreground(
     force: bool,
     quiet_stdout: bool,
 ) -> list[SessionResult]:
-    """Run `repeat` sessions, up to the first that does not end well.
+    """Run `repeat` sessions, up to a stop or the first that does not end well.
 
     Parameters
     ----------
@@ -67,6 +74,8 @@ def run_in_foreground(
         Makes the excitation for a rate in Hz.
     crew
         The processes of the first session, started but not yet needed.
+    stop
+        The operator's.
     profile_name
         Name or path of the profile.
     folder
@@ -83,17 +92,19 @@ def run_in_foreground(
     """
     console = Console(stderr=quiet_stdout, highlight=False, soft_wrap=True)
     results: list[SessionResult] = []
+    excitation: Excitation | None = None
     try:
         profile = _load(profile_name, fast=fast, seed=seed)
-        excitation: Excitation | None = None
         for number in range(repeat):
             with crew if number == 0 else Crew(live=live) as crew:
-                crew.lay_out(profile.rig.rate_hz)
                 if excitation is None:
                     excitation = build(profile.rig.rate_hz)
                     plan = plan_session(profile, excitation, force=force)
                     _tell_plan(console, profile, excitation, plan)
-                    folder.mkdir(parents=True, exist_ok=True)
+                if stop.requested:
+                    break
+                _lay_out(crew, profile.rig.rate_hz)
+                _make_room(folder, excitation)
                 order = Order(
                     profile=_seeded(profile, number),
                     excitation=excitation,
@@ -104,9 +115,9 @@ def run_in_foreground(
                 if live:
                     console.print(start_live(crew, order))
                 with _ProgressView(console, excitation.reference_rad.size) as view:
-                    results.append(run_session(order, crew, view.update))
+                    results.append(run_session(order, crew, stop, view.update))
             _tell_result(console, results[-1])
-            if results[-1].outcome != "complete" or results[-1].interrupted:
+            if not results[-1].went_well:
                 break
     except (
         ProfileError,
@@ -117,14 +128,36 @@ def run_in_foreground(
         RealisationError,
     ) as error:
         raise ForegroundError(str(error), wrong_use=True) from error
-    except OSError as error:
-        raise ForegroundError(
-            f"--output {folder}: cannot be made a folder ({error.strerror}); choose another.",
-            wrong_use=True,
-        ) from error
     except SessionFailedError as error:
         raise ForegroundError(str(error), wrong_use=False) from error
     return results
+
+
+def _lay_out(crew: Crew, rate_hz: float) -> None:
+    try:
+        crew.lay_out(rate_hz)
+    except OSError as error:
+        raise SessionFailedError(
+            f"There is not enough shared memory for the processes of a session "
+            f"({error.strerror}); free some in /dev/shm."
+        ) from error
+
+
+def _make_room(folder: Path, excitation: Excitation) -> None:
+    """Make the folder, and see that a session fits on its disk."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise RefusedError(
+            f"--output {folder}: cannot be made a folder ({error.strerror}); choose another."
+        ) from error
+    needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
+    if free < needed:
+        raise RefusedError(
+            f"--output {folder}: {free / 1e6:.1f} MB are free on its disk and the session may take "
+            f"{needed / 1e6:.1f} MB; make room or choose another folder."
+        )
 
 
 def _load(name: str, *, fast: bool, seed: int | None) -> Profile:
@@ -173,6 +206,8 @@ def _tell_result(console: Console, result: SessionResult) -> None:
         console.print(f"{result.outcome}: no record. {result.reason}")
     else:
         console.print(f"{result.outcome}: {counts}{' ' + result.reason if result.reason else ''}")
+        if result.live_dropped:
+            console.print(f"The live view missed {result.live_dropped} samples; the file has them.")
         console.print(str(result.path))
 
 

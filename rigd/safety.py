@@ -1,4 +1,4 @@
-"""Limits: what a session may do, predicted before it and checked in every tick.
+"""Limits: what a session may do, checked in every tick.
 
 The software stops a session that leaves its limits; it is no safety function. That is the wired
 STO of the drive.
@@ -7,13 +7,9 @@ STO of the drive.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Annotated, Protocol
+from typing import Annotated
 
-import numpy as np
 from annotated_types import Ge, Gt, Le
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
 
 WARNING_FRACTION = 0.8
 """Part of a limit from which on samples carry a warning."""
@@ -45,6 +41,8 @@ class Limits:
     sensor_range_percent: Annotated[float, Gt(0), Le(200)]
     """Of the range of each of the sensor's axes; above 100 a clipped reading ends nothing (it is
     flagged in its sample)."""
+    stale_ticks_in_a_row: Annotated[int, Ge(1)]
+    """Ticks for which an old angle or wrench may stand in for one that did not come."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
     missed_percent: Annotated[float, Gt(0), Le(100)]
     """Of all ticks scheduled so far, counted as if they were at least ten seconds' worth."""
@@ -98,6 +96,8 @@ class LimitWatch:
         "_missed_window",
         "_previous_angle_rad",
         "_rate_hz",
+        "_stale_angles",
+        "_stale_wrenches",
         "_step_warning",
         "_wrench_limits",
         "_wrench_warnings",
@@ -119,6 +119,8 @@ class LimitWatch:
         """Start from rest at ``angle_rad``."""
         self._previous_angle_rad = angle_rad
         self._elapsed = 1
+        self._stale_angles = 0
+        self._stale_wrenches = 0
         self.warning = False
 
     def skip(self, missed: int) -> None:
@@ -181,6 +183,22 @@ class LimitWatch:
             )
         )
 
+    def check_stale(self, angle_stale: bool, wrench_stale: bool) -> Violation | None:
+        """Check for how long readings have not come, in every tick that lacks one and in the next.
+
+        A controller that is fed an old angle turns the motor without limit, and neither speed nor
+        tracking error would show it.
+        """
+        self._stale_angles = self._stale_angles + 1 if angle_stale else 0
+        self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0
+        limit = self._limits.stale_ticks_in_a_row
+        return _worst(
+            (
+                ("run of ticks without a new angle", self._stale_angles, limit, "ticks"),
+                ("run of ticks without a new wrench", self._stale_wrenches, limit, "ticks"),
+            )
+        )
+
     def check_missed(self, missed: int, missed_so_far: int, scheduled: int) -> Violation | None:
         """Check missed ticks; the next speed is then taken over them too.
 
@@ -211,154 +229,3 @@ def _worst(channels: Sequence[tuple[str, float, float, str]]) -> Violation | Non
         if ratio > worst_ratio:
             worst, worst_ratio = channel, ratio
     return None if worst is None else Violation(*worst)
-
-
-class _Response(Protocol):
-    @property
-    def angle_rad(self) -> FloatArray: ...
-    @property
-    def velocity_rad_s(self) -> FloatArray: ...
-    @property
-    def torque_nm(self) -> FloatArray: ...
-    @property
-    def coupling_torque_nm(self) -> FloatArray: ...
-
-
-class _Loop(Protocol):
-    def simulate(self, reference_rad: FloatArray) -> _Response: ...
-
-
-class _Excitation(Protocol):
-    @property
-    def reference_rad(self) -> FloatArray: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """Largest magnitudes of a session, from the linear closed loop (torque not limited)."""
-
-    peak_angle_rad: float
-    """Relative to the rig's zero, start angle included."""
-    peak_velocity_rad_s: float
-    peak_torque_nm: float
-    peak_tracking_error_rad: float
-    peak_coupling_torque_nm: float
-    saturated_ticks: int
-    """Ticks whose torque command lies beyond the limit."""
-
-
-@dataclass(frozen=True, slots=True)
-class PredictedViolation:
-    """A limit that a session is predicted to leave."""
-
-    sentence: str
-    may_be_forced: bool
-    """True for torques: command and reading are then clipped and flagged. Angle, speed and tracking
-    error end the session when they are left, so forcing it would be no use."""
-
-
-def predict(
-    loop: _Loop,
-    excitation: _Excitation,
-    *,
-    torque_limit_nm: float,
-    start_angle_rad: float = 0.0,
-) -> Prediction:
-    """Predict the peaks of a session.
-
-    Parameters
-    ----------
-    loop
-        The closed loop (:class:`rigd.control.ClosedLoop`).
-    excitation
-        Its reference, relative to ``start_angle_rad`` (:class:`rigd.excitation.Excitation`).
-    torque_limit_nm
-        The motor's peak torque.
-    start_angle_rad
-        Where the session starts, relative to the rig's zero.
-    """
-    response = loop.simulate(excitation.reference_rad)
-    return Prediction(
-        peak_angle_rad=_peak(response.angle_rad + start_angle_rad),
-        peak_velocity_rad_s=_peak(response.velocity_rad_s),
-        peak_torque_nm=_peak(response.torque_nm),
-        peak_tracking_error_rad=_peak(excitation.reference_rad - response.angle_rad),
-        peak_coupling_torque_nm=_peak(response.coupling_torque_nm),
-        saturated_ticks=int(np.count_nonzero(np.abs(response.torque_nm) > torque_limit_nm)),
-    )
-
-
-def violations(
-    prediction: Prediction,
-    limits: Limits,
-    *,
-    torque_limit_nm: float,
-    coupling_torque_limit_nm: float,
-) -> list[PredictedViolation]:
-    """Compare a prediction with the limits.
-
-    Parameters
-    ----------
-    prediction
-        From :func:`predict`.
-    limits
-        The limits of the profile.
-    torque_limit_nm
-        The motor's peak torque: beyond it the command saturates, which may be forced.
-    coupling_torque_limit_nm
-        Coupling torque at which the sensor leaves its range: beyond it the reading is clipped,
-        which may be forced too.
-
-    Returns
-    -------
-    list of PredictedViolation
-        Empty if the session stays within all limits. A peak that is not a number violates.
-    """
-    found = []
-    for channel, value, limit, unit, key, forced in (
-        ("angle", prediction.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad", False),
-        (
-            "speed",
-            prediction.peak_velocity_rad_s,
-            limits.velocity_rad_s,
-            "rad/s",
-            "limits.velocity_rad_s",
-            False,
-        ),
-        (
-            "tracking error",
-            prediction.peak_tracking_error_rad,
-            limits.tracking_error_rad,
-            "rad",
-            "limits.tracking_error_rad",
-            False,
-        ),
-        (
-            "coupling torque",
-            prediction.peak_coupling_torque_nm,
-            coupling_torque_limit_nm,
-            "N·m",
-            "sensor.range",
-            True,
-        ),
-        (
-            "torque",
-            prediction.peak_torque_nm,
-            torque_limit_nm,
-            "N·m",
-            "motor.peak_torque_nm",
-            True,
-        ),
-    ):
-        if not value <= limit:
-            sentence = (
-                f"The predicted peak {channel} of {value:.4g} {unit} exceeds {limit:.4g} {unit} "
-                f"({key}); lower the amplitude"
-            )
-            sentence += ", or force the session to run clipped." if forced else "."
-            found.append(PredictedViolation(sentence, may_be_forced=forced))
-    return found
-
-
-def _peak(values: FloatArray) -> float:
-    return float(np.max(np.abs(values)))

@@ -94,6 +94,7 @@ def _file(analysis: WelchAnalysis) -> dict[str, Any]:
         "warnings": list(analysis.warnings),
         "settings": {
             **asdict(settings),
+            **asdict(analysis.segmentation),
             "band_hz": list(settings.band_hz),
             "types": list(settings.types),
             "weightings": list(settings.weightings),

@@ -95,13 +95,14 @@ def line_styles(weightings: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
 
 def _estimate_text(analysis: WelchAnalysis) -> str:
-    settings, response = analysis.settings, analysis.response
+    settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     band = f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
     if settings.estimator == "fft":
         return f"ratio of the transforms of the whole record  ·  {band}"
     return (
         f"{_ESTIMATORS[settings.estimator]}, {response.segments} Hamming segments of "
-        f"{settings.segment_length}, overlap {settings.overlap}, nfft {settings.nfft}  ·  {band}"
+        f"{segmentation.segment_length}, overlap {segmentation.overlap}, "
+        f"nfft {segmentation.nfft}  ·  {band}"
     )
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from analysis.report import style
 from analysis.time_response import loudest_moment_s
-from analysis.welch_route import undamped_frequencies_hz
+from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,11 +44,12 @@ def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
     """Where the torque rings most at each of the first modes that the sampling can show."""
     duration_s = len(record.time_s) / record.rate_hz
     moments = []
-    for number, frequency_hz in enumerate(undamped_frequencies_hz(record.beam, count), start=1):
+    modes_hz = undamped_frequencies_rad_s(record.beam, count) / (2 * math.pi)
+    for number, frequency_hz in enumerate(modes_hz.tolist(), start=1):
         if frequency_hz >= record.rate_hz / 2:
             break
-        centre_s = loudest_moment_s(record.torque_nm, record.rate_hz, float(frequency_hz))
-        length_s = min(_PERIODS_SHOWN / float(frequency_hz), _LARGEST_SHARE * duration_s)
+        centre_s = loudest_moment_s(record.torque_nm, record.rate_hz, frequency_hz)
+        length_s = min(_PERIODS_SHOWN / frequency_hz, _LARGEST_SHARE * duration_s)
         length_s = max(length_s, _SHORTEST_S)
         samples = min(round(length_s * record.rate_hz), len(record.time_s))
         first = round((centre_s - length_s / 2) * record.rate_hz)
@@ -64,12 +67,19 @@ def resonance_moments(record: Record, count: int) -> tuple[Moment, ...]:
     return tuple(moments)
 
 
-def mark(axes: Axes, moments: tuple[Moment, ...], colour: str) -> None:
+def mark(axes: Axes, moments: tuple[Moment, ...]) -> None:
     """Shade the stretches in the panel of the whole record, numbered from 1."""
     for number, moment in enumerate(moments, start=1):
-        axes.axvspan(moment.first_s, moment.last_s, color=colour, linewidth=0, zorder=0)
+        axes.axvspan(moment.first_s, moment.last_s, color=style.SHADE, linewidth=0, zorder=0)
         axes.text(
             (moment.first_s + moment.last_s) / 2, 1.01, str(number),
             transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=7.5,
             color="#8A7A4A",
         )  # fmt: skip
+
+
+def enlarge(axes: Axes, number: int, moment: Moment) -> None:
+    """Make a panel the enlargement of one stretch, which is numbered like its mark."""
+    axes.set_title(f"{number}  {moment.name}", fontsize=8.5, fontweight="normal")
+    axes.set_xlim(moment.first_s, moment.last_s)
+    axes.set_facecolor("#FCFAF4")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from analysis.report import style
-from analysis.report.moments import mark, resonance_moments
+from analysis.report.moments import enlarge, mark, resonance_moments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +54,7 @@ def signals_figure(analysis: WelchAnalysis) -> Figure:
     for axes in (angle, torque):
         axes.set_xlim(record.time_s[0], record.time_s[-1])
         axes.set_xlabel("Time (s)", labelpad=1)
-        mark(axes, moments, style.SHADE)
+        mark(axes, moments)
 
     for column, moment in enumerate(moments):
         times_s = record.time_s[moment.samples]
@@ -64,9 +64,7 @@ def signals_figure(analysis: WelchAnalysis) -> Figure:
         below = figure.add_subplot(grid[3, column])
         below.plot(times_s, record.torque_nm[moment.samples], color=style.GREEN, linewidth=0.9)
         for axes in (above, below):
-            axes.set_title(f"{column + 1}  {moment.name}", fontsize=8.5, fontweight="normal")
-            axes.set_xlim(moment.first_s, moment.last_s)
-            axes.set_facecolor("#FCFAF4")
+            enlarge(axes, column + 1, moment)
         if column == 0:
             above.set_ylabel("Angle (mrad)")
             below.set_ylabel("Torque (N·m)")

@@ -148,9 +148,9 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = T
     axes.tick_params(axis="x", which="both", labelbottom=labels)
 
 
-def limits(*values: NDArray[np.float64], margin: float = 0.06) -> tuple[float, float]:
+def limits(*values: NDArray[np.float64]) -> tuple[float, float]:
     """Axis limits round all values with a margin on either side, never empty."""
     low = min(float(v.min()) for v in values)
     high = max(float(v.max()) for v in values)
-    pad = margin * (high - low) or max(abs(high), 1e-12)
+    pad = 0.06 * (high - low) or max(abs(high), 1e-12)
     return low - pad, high + pad

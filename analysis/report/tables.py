@@ -44,11 +44,7 @@ def analysis_tables(analysis: WelchAnalysis) -> RenderableType:
 
 def fits_table(analysis: WelchAnalysis) -> Table:
     """Parameters with standard deviation, and the indices of fit."""
-    table = _table(f"{analysis.record.path.name}: fits", ["type", "weights"])
-    for _parameter, heading, _factor in _COLUMNS:
-        table.add_column(heading, justify="right", min_width=7)
-    for heading in ("MSE", "WMSE", "MD"):
-        table.add_column(heading, justify="right")
+    table = _fits_table(f"{analysis.record.path.name}: fits")
     for model in analysis.models:
         indices = model.indices
         table.add_row(
@@ -57,13 +53,12 @@ def fits_table(analysis: WelchAnalysis) -> Table:
             *(f"{value:.4g}" for value in (indices.mse, indices.wmse, indices.md)),
             end_section=_is_last_of_type(model, analysis.models),
         )
-    table.caption = "MSE and WMSE in (N·m/rad)², MD in N·m/rad"
     return table
 
 
 def peaks_table(analysis: WelchAnalysis) -> Table:
     """Measured resonant peaks, and how far each model's lie from them, as the paper's Table 4."""
-    table = _table(f"{analysis.record.path.name}: resonant peaks", ["type", "weights"])
+    table = _table(f"{analysis.record.path.name}: resonant peaks")
     for quantity in ("ω{} (rad/s)", "M{} (dB)"):
         for number in range(1, len(analysis.peaks) + 1):
             table.add_column(quantity.format(number), justify="right")
@@ -86,7 +81,7 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
 
 def modes_table(analysis: WelchAnalysis) -> Table:
     """Frequencies and damping ratios of the modes from each model's poles."""
-    table = _table(f"{analysis.record.path.name}: modes", ["type", "weights"])
+    table = _table(f"{analysis.record.path.name}: modes")
     count = max(len(model.modes) for model in analysis.models)
     for quantity in ("f{} (Hz)", "ξ{} (%)"):
         for number in range(1, count + 1):
@@ -105,11 +100,7 @@ def modes_table(analysis: WelchAnalysis) -> Table:
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
     """Mean and standard deviation over the files of each fit's parameters and indices."""
-    table = _table(f"mean ± standard deviation over {len(analyses)} files", ["type", "weights"])
-    for _parameter, heading, _factor in _COLUMNS:
-        table.add_column(heading, justify="right", min_width=7)
-    for heading in ("MSE", "WMSE", "MD"):
-        table.add_column(heading, justify="right")
+    table = _fits_table(f"mean ± standard deviation over {len(analyses)} files")
     for models in zip(*(analysis.models for analysis in analyses), strict=True):
         table.add_row(
             *_names(models[0]),
@@ -124,7 +115,6 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
             _mean_text([model.indices.md for model in models]),
             end_section=_is_last_of_type(models[0], analyses[0].models),
         )
-    table.caption = "MSE and WMSE in (N·m/rad)², MD in N·m/rad"
     return table
 
 
@@ -141,12 +131,24 @@ def with_spread(value: float, std: float | None) -> str:
     return f"{value:.{decimals}f} ±{std:.{decimals}f}"
 
 
-def _table(title: str, leading: list[str]) -> Table:
+def _fits_table(title: str) -> Table:
+    """Columns of the parameters and of the indices, no rows yet."""
+    table = _table(title)
+    for _parameter, heading, _factor in _COLUMNS:
+        table.add_column(heading, justify="right", min_width=7)
+    for heading in ("MSE", "WMSE", "MD"):
+        table.add_column(heading, justify="right")
+    table.caption = "MSE and WMSE in (N·m/rad)², MD in N·m/rad"
+    return table
+
+
+def _table(title: str) -> Table:
+    """Column of a fit's type and of its weights, no rows yet."""
     table = Table(
         title=Text(title, style="bold"), title_justify="left", caption_justify="left",
         box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
     )  # fmt: skip
-    for heading in leading:
+    for heading in ("type", "weights"):
         table.add_column(heading, no_wrap=True)
     return table
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.report import style
-from analysis.report.moments import mark, resonance_moments
+from analysis.report.moments import enlarge, mark, resonance_moments
 from analysis.time_response import band_limited, modelled_torque
 
 if TYPE_CHECKING:
@@ -66,16 +66,14 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     middle.set_xlabel("Time (s)", labelpad=1)
     for axes in (top, middle):
         axes.set_xlim(record.time_s[0], record.time_s[-1])
-        mark(axes, moments if axes is top else (), style.SHADE)
+    mark(top, moments)
     for column, moment in enumerate(moments):
         axes = figure.add_subplot(grid[1, column])
         times_s = record.time_s[moment.samples]
         axes.plot(times_s, measured[moment.samples], color=style.GREY, linewidth=2.6)
         axes.plot(times_s, modelled[moment.samples], color=style.BLUE, linewidth=1.1)
         axes.plot(times_s, residual[moment.samples], color=style.VERMILION, linewidth=0.8)
-        axes.set_title(f"{column + 1}  {moment.name}", fontsize=8.5, fontweight="normal")
-        axes.set_xlim(moment.first_s, moment.last_s)
-        axes.set_facecolor("#FCFAF4")
+        enlarge(axes, column + 1, moment)
         axes.set_xlabel("Time (s)", labelpad=1)
         if column == 0:
             axes.set_ylabel("Torque (N·m)")

@@ -8,6 +8,7 @@ from rigd.beam.modes import (
     modes,
     participation,
     poles,
+    undamped_frequencies_rad_s,
 )
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.realisation import Realisation, RealisationError, realise
@@ -32,4 +33,5 @@ __all__ = [
     "realise",
     "transfer",
     "transfer_and_gradient",
+    "undamped_frequencies_rad_s",
 ]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rigd.beam.parameters import Beam, Damping
 
-Real = NDArray[np.floating]
+Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _HOMOTOPY_STEPS = (8, 64)
@@ -40,8 +40,6 @@ class Mode:
     """``sqrt(p_1 p_2)``."""
     damping_ratio: float
     """``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``: above 1 if over-damped."""
-    participation_m3: float
-    """a_i²; times rho, the mode's share of the beam's moment of inertia."""
 
 
 def clamped_free_eigenvalues(n: int) -> Real:
@@ -57,6 +55,13 @@ def clamped_free_eigenvalues(n: int) -> Real:
         tanh = (1 - decay * decay) / (1 + decay * decay)
         d -= (np.sin(d) - sign * sech) / (np.cos(d) + sign * sech * tanh)
     return middle + d
+
+
+def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
+    """First `n` natural frequencies of the beam without damping, shape (n,), in rad/s."""
+    z = clamped_free_eigenvalues(n)
+    frequencies: Real = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
+    return frequencies
 
 
 def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
@@ -76,7 +81,11 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
 
 
 def participation(beam: Beam, n: int) -> Real:
-    """First `n` factors ``a_i² = 4 L³ / z_i⁴`` in m³; all of them add up to L³/3."""
+    """First `n` factors ``a_i² = 4 L³ / z_i⁴``, shape (n,), in m³.
+
+    Times rho, a factor is the mode's share of the rigid beam's moment of inertia: all of them add
+    up to L³/3.
+    """
     factors: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
     return factors
 
@@ -126,7 +135,6 @@ def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
 
 def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     """First `n` modes of the beam; raises as `poles` does."""
-    shares = participation(beam, n)
     found = []
     for i, (first, second) in enumerate(poles(beam, damping, n)):
         natural = float(np.sqrt((first * second).real))
@@ -137,7 +145,6 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
                 frequency_hz=float(abs(first.imag) / (2 * np.pi)),
                 natural_frequency_rad_s=natural,
                 damping_ratio=float((-first - second).real / (2 * natural)),
-                participation_m3=float(shares[i]),
             )
         )
     return tuple(found)

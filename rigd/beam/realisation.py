@@ -22,7 +22,7 @@ from rigd.beam.modes import clamped_free_eigenvalues, poles_for_eigenvalues
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.transfer_function import TransferGrid
 
-Real = NDArray[np.floating]
+Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 ERROR_BAND_HZ = (0.05, 100.0)
@@ -70,8 +70,6 @@ class Realisation:
     """Largest ``|realised - exact| / |exact|`` found over `ERROR_BAND_HZ`."""
     poles_rad_s: Complex
     """(m,): of a conjugate pair the one in the upper half plane, then the real ones."""
-    residues_kg_m2_per_s: Complex
-    """(m,): residues of G/s² at those poles."""
 
     def transfer(self, s: ArrayLike) -> Complex:
         """G(s) as realised, in N·m/rad, of the shape of `s` (rad/s)."""
@@ -257,10 +255,8 @@ def _state_space(poles: Complex, coefficients: Real, error: float) -> Realisatio
     a[rest, rest] = real
     b = np.ones(n)
     b[even + 1] = 0.0
-    c = coefficients[:-3]
-    residues = np.concatenate([0.5 * (c[even] + 1j * c[even + 1]), c[rest]])
     inertia, viscosity, stiffness = (float(value) for value in coefficients[-3:])
-    return Realisation(a, b, c, inertia, viscosity, stiffness, error, poles, residues)
+    return Realisation(a, b, coefficients[:-3], inertia, viscosity, stiffness, error, poles)
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:

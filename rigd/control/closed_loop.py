@@ -6,23 +6,20 @@ moment. Friction, quantisation and the torque limit are left out, noise too. A s
 at the very moment a new torque takes effect sees the old one.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from math import exp, floor, pi, sqrt
-from typing import Any
+from math import exp, floor, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
     Beam,
-    CoupledModel,
     Damping,
     Realisation,
-    clamped_free_eigenvalues,
     couple,
     propagator,
     realise,
+    undamped_frequencies_rad_s,
 )
 from rigd.control.design import ControlDesignError, ControlSettings, design_pid
 from rigd.control.pid import derivative_coefficients, lowpass_coefficients
@@ -124,7 +121,7 @@ class ClosedLoop:
 
     def least_damped(self) -> complex:
         """Return the pole with the lowest damping ratio, in rad/s."""
-        return complex(self.poles_rad_s[np.argmin(_damping_ratio(self.poles_rad_s))])
+        return complex(min(self.poles_rad_s, key=_damping_ratio))
 
     def simulate(self, reference_rad: Real) -> LoopResponse:
         """Return the response to a reference from rest, exact at the ticks.
@@ -295,27 +292,14 @@ def check_stability(loop: ClosedLoop) -> str | None:
         If the loop grows faster than `MAX_GROWTH_PER_S`, or would do so but for the beam's own
         damping (`MAX_DAMPING_TAKEN`).
     """
-    settings = loop.model.settings
-    if settings.feedforward_gain < 0.5:
-        remedy = (
-            f"control.feedforward_gain = {settings.feedforward_gain:g} leaves the beam to the "
-            "integral action, set it to 1"
-        )
-    else:
-        remedy = (
-            f"change control.pole_rad_s = {settings.pole_rad_s:g} rad/s, bring "
-            f"control.feedforward_gain = {settings.feedforward_gain:g} nearer to 1, or shorten the "
-            "delays of command and readings"
-        )
+    remedy = _remedy(loop.model.settings)
     growth = loop.growth_per_s
-    if growth > 0.0:
-        finding = (
-            "The closed loop of motor, beam and delays is unstable (spectral radius "
-            f"{loop.spectral_radius:.7f}): {_describe(loop.poles_rad_s[0])} grows at "
-            f"{growth:.2g} /s"
-        )
-        if growth > MAX_GROWTH_PER_S:
-            raise ControlDesignError(f"{finding}; {remedy}.")
+    finding = (
+        "The closed loop of motor, beam and delays is unstable (spectral radius "
+        f"{loop.spectral_radius:.7f}): {_describe(loop.poles_rad_s[0])} grows at {growth:.2g} /s"
+    )
+    if growth > MAX_GROWTH_PER_S:
+        raise ControlDesignError(f"{finding}; {remedy}.")
     if loop.model.beam is not None:
         light = close_loop(_with_light_beam(loop.model, loop.model.beam))
         pole = light.least_damped()
@@ -333,17 +317,26 @@ def check_stability(loop: ClosedLoop) -> str | None:
     )
 
 
-def _with_light_beam(model: LoopModel, beam: Beam) -> LoopModel:
-    first_mode_rad_s = (
-        float(clamped_free_eigenvalues(1)[0]) ** 2
-        / beam.length_m**2
-        / sqrt(beam.density_over_stiffness)
+def _remedy(settings: ControlSettings) -> str:
+    if settings.feedforward_gain < 0.5:
+        return (
+            f"control.feedforward_gain = {settings.feedforward_gain:g} leaves the beam to the "
+            "integral action, set it to 1"
+        )
+    return (
+        f"change control.pole_rad_s = {settings.pole_rad_s:g} rad/s, bring "
+        f"control.feedforward_gain = {settings.feedforward_gain:g} nearer to 1, or shorten the "
+        "delays of command and readings"
     )
+
+
+def _with_light_beam(model: LoopModel, beam: Beam) -> LoopModel:
+    first_mode_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
     return replace(model, damping=Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s))
 
 
-def _damping_ratio(pole_rad_s: Any) -> Any:  # noqa: ANN401
-    return -np.real(pole_rad_s) / np.abs(pole_rad_s)
+def _damping_ratio(pole_rad_s: complex) -> float:
+    return -pole_rad_s.real / abs(pole_rad_s)
 
 
 def _describe(pole_rad_s: complex) -> str:
@@ -378,40 +371,53 @@ class _Plant:
         # whole period of delay the command after it is the tick's own: the input column, last.
         before = n + whole
         after = before - 1 if whole else size
+        switch_s = part * period_s
         extended = np.zeros((size, size + 1))
 
         def advance(duration_s: float) -> tuple[Real, int]:
             """State (n, size + 1) a time after a tick, and the column of the torque then."""
-            return _advance(coupled, duration_s, part * period_s, (n, size + 1), before, after)
+            state, column = np.eye(n, size + 1), before
+            for stretch_s, acting in (
+                (min(duration_s, switch_s), before),
+                (duration_s - switch_s, after),
+            ):
+                if stretch_s > 0.0:
+                    phi, gamma = propagator(coupled, stretch_s)
+                    state = phi @ state
+                    state[:, acting] += gamma
+                    column = acting
+            return state, column
+
+        def read(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
+            """Row (size + 1,) of what a sensor reads a time after a tick."""
+            state, column = advance(since_tick_s)
+            reading: Real = row @ state
+            reading[column] += per_torque
+            return reading
 
         extended[:n] = advance(period_s)[0]
         extended[n, size] = 1.0
         for command in range(1, commands):
             extended[n + command, n + command - 1] = 1.0
 
-        def sense(row: Real, per_torque: float, state: Real, column: int) -> Real:
-            reading: Real = row @ state
-            reading[column] += per_torque
-            return reading
-
-        now = np.eye(n, size + 1)
-        self.angle = sense(coupled.angle, 0.0, now, before)[:size]
-        self.velocity = sense(coupled.velocity, 0.0, now, before)[:size]
-        sensor = (coupled.sensor_torque, coupled.sensor_torque_per_torque)
-        self.sensor_torque = sense(*sensor, now, before)[:size]
+        angle = (coupled.angle, 0.0)
+        sensor_torque = (coupled.sensor_torque, coupled.sensor_torque_per_torque)
+        self.angle = read(*angle)[:size]
+        self.velocity = read(coupled.velocity, 0.0)[:size]
+        self.sensor_torque = read(*sensor_torque)[:size]
 
         measured = []
         first = n + commands
-        for (_, fraction), length, row, undelayed in (
-            (angle_chain, lengths[0], (coupled.angle, 0.0), self.angle),
-            (torque_chain, lengths[1], sensor, self.sensor_torque),
+        for (_, fraction), length, quantity, undelayed in (
+            (angle_chain, lengths[0], angle, self.angle),
+            (torque_chain, lengths[1], sensor_torque, self.sensor_torque),
         ):
             if length == 0:
                 measured.append(undelayed)
                 continue
             # The chain's first link: the reading of the last tick, or one from the period since.
-            age = 1.0 - fraction if fraction > 0.0 else 0.0
-            extended[first] = sense(*row, *advance(age * period_s))
+            since_tick = 1.0 - fraction if fraction > 0.0 else 0.0
+            extended[first] = read(*quantity, since_tick * period_s)
             for link in range(first + 1, first + length):
                 extended[link, link - 1] = 1.0
             measured.append(np.eye(size)[first + length - 1])
@@ -419,35 +425,6 @@ class _Plant:
         self.measured_angle, self.measured_torque = measured
         self.a = extended[:, :size]
         self.b = extended[:, size]
-
-
-def _advance(
-    coupled: CoupledModel,
-    duration_s: float,
-    switch_s: float,
-    shape: tuple[int, int],
-    before: int,
-    after: int,
-) -> tuple[Real, int]:
-    """Propagate from a tick under the torque of column `before`, from the switch on `after`."""
-    n = shape[0]
-    state = np.eye(*shape)
-    torque = before
-    for end_s, column in _stretches(duration_s, switch_s, before, after):
-        phi, gamma = propagator(coupled, end_s)
-        state = phi @ state
-        state[:n, column] += gamma
-        torque = column
-    return state, torque
-
-
-def _stretches(
-    duration_s: float, switch_s: float, before: int, after: int
-) -> Iterator[tuple[float, int]]:
-    if switch_s > 0.0:
-        yield min(duration_s, switch_s), before
-    if duration_s > switch_s:
-        yield duration_s - switch_s, after
 
 
 def _split(delay_s: float, period_s: float, key: str) -> tuple[int, float]:

@@ -6,9 +6,10 @@ blocks, which is why the control loop may do so.
 
 import contextlib
 import mmap
-import os
 from enum import IntEnum
 from typing import Self
+
+from rigd.engine.ring import reserve
 
 
 class Phase(IntEnum):
@@ -63,7 +64,7 @@ class Board:
     @classmethod
     def create(cls, fd: int) -> Self:
         """Lay out a board of zeros in shared memory."""
-        os.ftruncate(fd, 8 * len(Word))
+        reserve(fd, 8 * len(Word))
         return cls(fd)
 
     def __getitem__(self, word: Word) -> int:

@@ -1,6 +1,5 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on."""
 
-import signal
 from dataclasses import asdict, dataclass
 
 from rigd.control import PidController, design_pid
@@ -13,6 +12,7 @@ from rigd.engine.cycle import Cycle
 from rigd.engine.procedure import Procedure, SessionEnd
 from rigd.engine.process import Parent
 from rigd.engine.realtime import collect_no_garbage, obtain
+from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.safety import LimitWatch
@@ -31,6 +31,8 @@ class ControlJob:
 
 def main() -> None:
     """Run as ``python -m rigd.engine.control``."""
+    stop = StopRequest()
+    stop.catch()
     parent = Parent()
     job: ControlJob = parent.receive_job()
     channels = attach_channels(job.channels)
@@ -45,7 +47,7 @@ def main() -> None:
         parent.send(finished="fault", reason=str(error), counts={}, results={})
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    conduct(job, devices, clock, channels, parent, obtained)
+    conduct(job, devices, clock, channels, parent, stop, obtained)
 
 
 def conduct(
@@ -54,6 +56,7 @@ def conduct(
     clock: Clock,
     channels: Channels,
     parent: Parent,
+    stop: StopRequest,
     obtained: dict[str, str],
 ) -> None:
     """Run one session on `devices`, whatever happens, to a disabled drive and a final message.
@@ -64,7 +67,7 @@ def conduct(
         What to run.
     devices
         Not yet connected.
-    clock, channels, parent
+    clock, channels, parent, stop
         As for :class:`rigd.engine.procedure.Procedure`.
     obtained
         The real-time settings that were granted, for the file.
@@ -83,9 +86,7 @@ def conduct(
         devices.drive.connect()
         devices.sensor.connect()
         calibration = devices.sensor.calibration()
-        procedure = Procedure(job.profile, job.excitation, cycle, clock, channels, parent)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: procedure.interrupt())
+        procedure = Procedure(job.profile, job.excitation, cycle, clock, channels, parent, stop)
         tare = procedure.tare()
         devices.drive.enable()
         procedure.hold()
@@ -98,11 +99,13 @@ def conduct(
         procedure.check_tare()
     except SessionEnd as end:
         outcome, reason = end.outcome, end.reason
-    except DeviceError as error:
+    except (DeviceError, OSError) as error:
         outcome, reason = "fault", str(error)
     finally:
         devices.drive.disable()
         channels.board[Word.PHASE] = Phase.OFF
+        devices.drive.close()
+        devices.sensor.close()
     if recorded and reason:
         # What happens after the last tick does not make the record any less complete.
         outcome, reason = "complete", f"After the record: {reason}"

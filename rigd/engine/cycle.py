@@ -7,6 +7,7 @@ from rigd.session.format import Status
 
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
+_STALE = _ANGLE_STALE | _WRENCH_STALE
 _WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
 _TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
 _LIMIT_WARNING = int(Status.LIMIT_WARNING)
@@ -54,6 +55,7 @@ class Cycle:
         self.coupling_torque_nm = 0.0
         self.torque_command_nm = 0.0
         self.flags = _TORQUE_OFF
+        self._were_stale = False
 
     def observe(self, due_ns: int) -> None:
         """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
@@ -82,11 +84,17 @@ class Cycle:
         """Do a whole tick; where a limit is violated the torque is off when this returns."""
         self.observe(due_ns)
         flags = self.flags & ~_TORQUE_OFF
-        violation = self.watch.check(reference_rad, self.angle_rad, self.raw_wrench)
+        watch = self.watch
+        violation = watch.check(reference_rad, self.angle_rad, self.raw_wrench)
+        if flags & _STALE or self._were_stale:
+            stale = watch.check_stale(bool(flags & _ANGLE_STALE), bool(flags & _WRENCH_STALE))
+            violation = violation or stale
+            self._were_stale = bool(flags & _STALE)
         if violation is not None:
             self.torque_off()
+            self.flags |= _LIMIT_WARNING
             return violation
-        if self.watch.warning:
+        if watch.warning:
             flags |= _LIMIT_WARNING
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)

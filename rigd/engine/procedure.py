@@ -17,6 +17,7 @@ from rigd.engine.events import Event, Level, write_event
 from rigd.engine.metronome import Metronome
 from rigd.engine.process import Parent
 from rigd.engine.sample_log import SampleLog
+from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 
@@ -25,6 +26,8 @@ _SETTLE_S = 0.5
 _LOOK_EVERY = 64
 """Ticks between two looks at whether everybody is still there and keeps up."""
 _GO_POLL_S = 0.0002
+_SWINGING = 2.0
+"""Spread of the torque after a session, over that before it, from which on the beam is swinging."""
 
 
 class SessionEnd(Exception):
@@ -49,6 +52,8 @@ class Procedure:
         Where samples, the controller's terms and events go.
     parent
         The supervisor.
+    stop
+        The signals that this process received itself.
     """
 
     def __init__(
@@ -59,6 +64,7 @@ class Procedure:
         clock: Clock,
         channels: Channels,
         parent: Parent,
+        stop: StopRequest,
     ) -> None:
         self._profile = profile
         self._excitation = excitation
@@ -67,19 +73,16 @@ class Procedure:
         self._channels = channels
         self._board = channels.board
         self._parent = parent
+        self._stop = stop
         self._rate_hz = profile.rig.rate_hz
         self._metronome = Metronome(clock, self._rate_hz)
         late_ns = int(profile.realtime.late_us * 1000)
         self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
         self._start_angle_rad = 0.0
-        self._interrupted = False
+        self._rest_spread_nm = 0.0
         self.counts = self._log.counts
         self.results: dict[str, str] = {}
         """What the record's outcome has to tell beside the counts."""
-
-    def interrupt(self) -> None:
-        """Ask for a stop at the next tick; safe in a signal handler."""
-        self._interrupted = True
 
     def tare(self) -> dict[str, str]:
         """Average the sensor at rest, before the drive is enabled.
@@ -115,6 +118,9 @@ class Procedure:
             )
         mean = [float(value) for value in wrenches.mean(axis=0)]
         spread = [float(value) for value in wrenches.std(axis=0, ddof=1)]
+        self._rest_spread_nm = float(
+            np.std(wrenches @ np.array(self._profile.rig.sensor.projection))
+        )
         self._cycle.tare = (mean[0], mean[1], mean[2], mean[3], mean[4], mean[5])
         return {"tare_s": repr(settings.tare_s), "start_angle_rad": repr(self._start_angle_rad)} | {
             f"tare_{what}_{axis}": repr(value)
@@ -153,7 +159,7 @@ class Procedure:
         reference = (self._start_angle_rad + self._excitation.reference_rad).tolist()
         total = len(reference)
         metronome, cycle, log, board = self._metronome, self._cycle, self._log, self._board
-        counts, virtual = self.counts, self._clock.virtual
+        counts, virtual, signals = self.counts, self._clock.virtual, self._stop
         stop, scheduled = board.word(Word.STOP), board.word(Word.SCHEDULED)
         metronome.restart()
         wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
@@ -165,35 +171,36 @@ class Procedure:
         last = -1
         first_ns = last_ns = 0
         end: SessionEnd | None = None
-        while end is None:
+        while end is None and last < total - 1:
             missed = metronome.wait()
             tick = metronome.tick
-            if missed or tick >= total:
-                tick = min(tick, total)
-                missed = tick - last - 1
+            if missed:
+                missed = min(tick, total) - last - 1
                 counts.missed += missed
                 board[Word.MISSED] = counts.missed
-                if tick == total:
-                    counts.scheduled = total
+                end = self._missed_too_many(missed, min(tick, total))
+                if tick >= total:
+                    last = total - 1
                     break
-                end = self._missed_too_many(missed, tick)
             if end is None and (
-                stop[0] or counts.lost or self._interrupted or tick % _LOOK_EVERY == 0
+                stop[0] or counts.lost or signals.requested or tick % _LOOK_EVERY == 0
             ):
                 end = self._stop_reason()
             if end is None:
                 end = self._step(reference[tick])
             else:
-                cycle.observe(metronome.due_ns)
-                cycle.torque_off()
+                self._observe_switched_off()
             log.write(tick, reference[tick], missed, wait=virtual or end is not None)
             scheduled[0] = tick + 1
             last_ns = metronome.t_ns + metronome.lateness_ns
             if last < 0:
                 first_ns = last_ns
             last = tick
+        counts.scheduled = last + 1
+        if counts.lost and end is None:
+            end = self._stop_reason()
         if end is not None:
-            counts.scheduled = last + 1
+            cycle.torque_off()
         self._take_stock(wall_ns, before_ns, last_ns - first_ns)
         if end is not None:
             raise end
@@ -212,8 +219,14 @@ class Procedure:
         """Average the sensor again, the drive disabled, to see how far its zero has moved."""
         self._rest(_SETTLE_S)
         wrenches, _ = self._rest(self._profile.session.tare_s)
-        drift = wrenches.mean(axis=0) - np.array(self._cycle.tare)
-        drift_nm = float(drift @ np.array(self._profile.rig.sensor.projection))
+        torque = wrenches @ np.array(self._profile.rig.sensor.projection)
+        if torque.std() > _SWINGING * self._rest_spread_nm:
+            self._say(
+                "info", "The beam still swings: the zero of the coupling torque was not checked."
+            )
+            return
+        zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
+        drift_nm = float(torque.mean() - zero_nm)
         self.results["tare_drift_nm"] = repr(drift_nm)
         limit_nm = self._profile.session.tare_drift_nm
         if abs(drift_nm) > limit_nm:
@@ -235,10 +248,18 @@ class Procedure:
         """Control one tick; where that ends the session, the torque is off."""
         try:
             violation = self._cycle.step(self._metronome.due_ns, reference_rad)
-        except DeviceError as error:
+        except (DeviceError, OSError) as error:
             self._cycle.lose_readings()
             return SessionEnd("fault", str(error))
         return None if violation is None else SessionEnd("fault", str(violation))
+
+    def _observe_switched_off(self) -> None:
+        """Switch off, and read once more for the last sample if the devices still answer."""
+        self._cycle.torque_off()
+        try:
+            self._cycle.observe(self._metronome.due_ns)
+        except (DeviceError, OSError):
+            self._cycle.lose_readings()
 
     def _rest(self, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Read without torque; raw wrenches (n, 6) and angles (n,)."""
@@ -261,7 +282,7 @@ class Procedure:
 
     def _stop_reason(self) -> SessionEnd | None:
         stop = self._board[Word.STOP]
-        if self._interrupted or stop == Stop.OPERATOR:
+        if self._stop.requested or stop == Stop.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
         if stop == Stop.NO_RECORDER:
             return SessionEnd("fault", "The recorder process ended during the session.")

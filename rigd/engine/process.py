@@ -10,17 +10,20 @@ import json
 import os
 import pickle
 import select
-import signal
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from typing import Any
+
+from rigd.engine.signals import held_back
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,
 and would disturb the loop."""
 _SIZE = struct.Struct("<Q")
+_WRITE_PATIENCE_S = 5.0
 
 Message = dict[str, Any]
 
@@ -44,17 +47,26 @@ class Child:
 
     def __init__(self, name: str, module: str, fds: Sequence[int]) -> None:
         self.name = name
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", module],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=fds,
-            env=os.environ | SINGLE_THREADED,
-        )
+        with held_back():
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", module],
+                bufsize=0,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=fds,
+                env=os.environ | SINGLE_THREADED,
+            )
+        os.set_blocking(self._stdin_fd, False)
         self._lines = LineReader(self._stdout_fd)
 
     def start(self, job: object) -> None:
-        """Hand over its job."""
+        """Hand over its job.
+
+        Raises
+        ------
+        ChildError
+            If it does not take it.
+        """
         data = pickle.dumps(job)
         self._write(_SIZE.pack(len(data)) + data)
 
@@ -77,6 +89,10 @@ class Child:
             how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
             raise ChildError(f"The {self.name} process was {how}.") from None
 
+    def kill(self) -> None:
+        """End it at once; the next :meth:`poll` tells."""
+        self._process.kill()
+
     def stop(self, grace_s: float) -> None:
         """End it: close its input and wait; then terminate; then kill."""
         if self._process.stdin is not None and not self._process.stdin.closed:
@@ -97,11 +113,22 @@ class Child:
         assert self._process.stdout is not None
         return self._process.stdout.fileno()
 
-    def _write(self, data: bytes) -> None:
+    @property
+    def _stdin_fd(self) -> int:
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # poll() tells how it ended
-            self._process.stdin.write(data)
-            self._process.stdin.flush()
+        return self._process.stdin.fileno()
+
+    def _write(self, data: bytes) -> None:
+        rest = memoryview(data)
+        deadline = time.monotonic() + _WRITE_PATIENCE_S
+        while rest:
+            patience_s = max(0.0, deadline - time.monotonic())
+            if not select.select([], [self._stdin_fd], [], patience_s)[1]:
+                raise ChildError(f"The {self.name} process does not listen.")
+            try:
+                rest = rest[os.write(self._stdin_fd, rest) :]
+            except BrokenPipeError:
+                return  # poll() tells how it ended
 
 
 class LineReader:
@@ -146,28 +173,23 @@ class Parent:
         return pickle.loads(self._read(size))
 
     def _read(self, size: int) -> bytes:
-        data = b""
+        data = bytearray()
         while len(data) < size:
             part = os.read(self._fd, size - len(data))
             if not part:
                 sys.exit(0)
             data += part
-        return data
+        return bytes(data)
 
     def poll(self, timeout_s: float) -> Message | None:
         """Return the next message, or None; raises EOFError if the supervisor is gone."""
         return self._lines.next(timeout_s)
 
     def send(self, **message: object) -> None:
-        """Send one short message."""
-        sys.stdout.write(json.dumps(message) + "\n")
-        sys.stdout.flush()
+        """Send one short message; nobody may be left to hear it."""
+        with contextlib.suppress(BrokenPipeError):
+            os.write(sys.stdout.fileno(), json.dumps(message).encode() + b"\n")
 
     def alive(self) -> bool:
         """Whether the supervisor still runs; cheap enough for the loop."""
         return os.getppid() == self._pid
-
-
-def ignore_interrupt() -> None:
-    """Ctrl-C reaches every process of the terminal; the supervisor alone decides what it means."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigd.engine import signals
 from rigd.engine.board import Phase, Word
 from rigd.engine.channels import Channels, ChannelSpecs, attach_channels
 from rigd.engine.events import EVENT_SIZE, read_events
-from rigd.engine.process import Message, Parent, ignore_interrupt
+from rigd.engine.process import Message, Parent
 from rigd.session import SessionError, SessionWriter
 from rigd.session.format import SAMPLE_SIZE
 
@@ -33,7 +34,7 @@ class RecorderJob:
 
 def main() -> None:
     """Run as ``python -m rigd.engine.recorder``."""
-    ignore_interrupt()
+    signals.ignore()
     parent = Parent()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)
@@ -55,11 +56,8 @@ def main() -> None:
 
 def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
     recorder = _Recorder(channels, writer)
-    header: Message | None = None
     while True:
-        if header is not None and not recorder.begun and channels.board[Word.START_UTC_NS]:
-            recorder.begin(header)
-        moved = recorder.begun and recorder.transfer()
+        moved = recorder.transfer()
         try:
             message = parent.poll(0.0 if moved else _IDLE_S)
         except EOFError:
@@ -68,7 +66,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
         if message is None:
             continue
         if "begin" in message:
-            header = message["begin"]
+            recorder.header = message["begin"]
             parent.send(armed=True)
         elif "close" in message:
             if not recorder.begun:
@@ -85,9 +83,11 @@ class _Recorder:
         self._channels = channels
         self._writer = writer
         self._recorded = 0
+        self.header: Message | None = None
+        """What the file is to say of the session, as soon as the supervisor has told."""
         self.begun = False
 
-    def begin(self, header: Message) -> None:
+    def _begin(self, header: Message) -> None:
         segments = {name: (first, end) for name, (first, end) in header["segments"].items()}
         attachments = {name: text.encode() for name, text in header["attachments"].items()}
         self._writer.begin(
@@ -97,6 +97,10 @@ class _Recorder:
 
     def transfer(self) -> bool:
         """Move what is there into the file; say whether there was anything."""
+        if not self.begun:
+            if self.header is None or not self._channels.board[Word.START_UTC_NS]:
+                return False
+            self._begin(self.header)
         events = self._channels.events.take(16)
         for event in read_events(events):
             self._writer.log(event.t_ns, event.level, event.message)
@@ -120,6 +124,8 @@ class _Recorder:
             "recorded": self._recorded,
             "lost": scheduled - accounted,
         }
+        if counts["lost"] and outcome["outcome"] == "complete":
+            outcome = {**outcome, "outcome": "fault", "reason": "Samples were lost on their way."}
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
         return self._writer.close(counted), counts
 
@@ -128,7 +134,7 @@ class _Recorder:
         board = self._channels.board
         deadline = time.monotonic() + _ORPHAN_PATIENCE_S
         while board[Word.PHASE] != Phase.OFF and time.monotonic() < deadline:
-            if self.begun and self.transfer():
+            if self.transfer():
                 deadline = time.monotonic() + _ORPHAN_PATIENCE_S
             time.sleep(_IDLE_S)
         if not self.begun:

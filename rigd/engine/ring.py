@@ -53,7 +53,7 @@ class Ring:
     @classmethod
     def create(cls, record_size: int, capacity: int, fd: int) -> Self:
         """Lay out an empty ring in the memory of `fd`, from :func:`shared_memory_fd`."""
-        os.ftruncate(fd, HEADER_SIZE + capacity * record_size)
+        reserve(fd, HEADER_SIZE + capacity * record_size)
         return cls(RingSpec(fd, record_size, capacity))
 
     @property
@@ -124,7 +124,7 @@ class Observer:
         start = HEADER_SIZE + place * ring.record_size
         block = bytes(ring.buffer[start : start + count * ring.record_size])
         self._cursor += count
-        if ring.written - (self._cursor - count) > ring.capacity:
+        if ring.written - (self._cursor - count) >= ring.capacity:
             # The producer lapped the copy: none of it can be trusted.
             self.dropped += count
             return b""
@@ -138,3 +138,17 @@ def shared_memory_fd() -> int:
         fd = os.dup(file.fileno())
     os.set_inheritable(fd, True)
     return fd
+
+
+def reserve(fd: int, size: int) -> None:
+    """Give shared memory its size, all of it at once.
+
+    Raises
+    ------
+    OSError
+        If there is not enough: better now than as a bus error when it is written to.
+    """
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(fd, 0, size)
+    else:
+        os.ftruncate(fd, size)

@@ -86,15 +86,15 @@ class SampleLog:
             flags |= _AFTER_MISSED
         if self.counts.lost:
             flags |= _AFTER_LOST
-        if lateness_ns > self._late_ns:
-            flags |= _LATE
-            self.counts.late += 1
-            self._board[Word.LATE] = self.counts.late
         offset = ring.slot()
         if offset < 0 and (not wait or (offset := self._wait_for_room()) < 0):
             self.counts.lost += 1
             self._board[Word.LOST] = self.counts.lost
             return
+        if lateness_ns > self._late_ns:
+            flags |= _LATE
+            self.counts.late += 1
+            self._board[Word.LATE] = self.counts.late
         t_ns = metronome.t_ns
         pack_sample_into(
             self._buffer,

@@ -9,8 +9,9 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
+from rigd.engine import signals
 from rigd.engine.board import Board, Word
-from rigd.engine.process import Parent, ignore_interrupt
+from rigd.engine.process import Parent
 from rigd.engine.ring import Observer, Ring
 from rigd.live.feed import Feed
 from rigd.live.server import ServerError
@@ -25,7 +26,7 @@ _STUCK_S = 20
 
 def main() -> None:
     """Run as ``python -m rigd.live.publisher``."""
-    ignore_interrupt()
+    signals.ignore(but=(signal.SIGTERM,))
     # What the SDK has to say about a server that is gone is no news to the operator.
     os.environ["RUST_LOG"] = "off"
     parent = Parent()

@@ -108,6 +108,10 @@ def describe(path: Path) -> SessionInfo:
         )
     ticks = session.samples["tick"]
     span = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
+    # Ticks that are missing at the end leave no gap; only the outcome knows of them.
+    scheduled = (session.outcome or {}).get("scheduled", "")
+    if scheduled.isdecimal():
+        span = max(span, int(scheduled))
     return SessionInfo(
         path=path,
         size_bytes=path.stat().st_size,

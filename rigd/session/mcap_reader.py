@@ -27,13 +27,10 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
 from rigd.session.format import Buffer
-from rigd.session.mcap_writer import MAGIC
+from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
 
 MAX_CHUNK_BYTES: Final = 256 << 20
 MAX_TOTAL_BYTES: Final = 2 << 30
-
-MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
-"""Opcode, length, channel, sequence, log time, publish time: what precedes a message's data."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.

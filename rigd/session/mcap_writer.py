@@ -37,7 +37,11 @@ COMPRESSION: Final = "lz4"
 _CHUNK_HEAD: Final = struct.Struct(f"<BQ QQQI I{len(COMPRESSION)}s Q")
 _INDEX_HEAD: Final = struct.Struct("<BQ HI")
 _FOOTER_HEAD: Final = struct.Struct("<BQ QQ")
-_RECORD_HEAD_SIZE: Final = 9  # opcode and length
+RECORD_HEAD_SIZE: Final = 9
+"""Opcode and length of a record, which the length does not count."""
+
+MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
+"""Opcode, length, channel, sequence, log time, publish time: what precedes a message's data."""
 
 INDEX_DTYPE: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 """One entry of a message index: where in the uncompressed chunk a message's record begins."""
@@ -138,7 +142,7 @@ class McapWriter:
         name = COMPRESSION.encode()
         head = _CHUNK_HEAD.pack(
             Opcode.CHUNK,
-            _CHUNK_HEAD.size - _RECORD_HEAD_SIZE + len(compressed),
+            _CHUNK_HEAD.size - RECORD_HEAD_SIZE + len(compressed),
             start,
             end,
             len(records),
@@ -155,7 +159,7 @@ class McapWriter:
         for channel, index in indexes.items():
             index_offsets[channel] = index_position + index_length
             entries = index.tobytes()
-            length = _INDEX_HEAD.size - _RECORD_HEAD_SIZE + len(entries)
+            length = _INDEX_HEAD.size - RECORD_HEAD_SIZE + len(entries)
             parts += [
                 _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, length, channel, len(entries)),
                 entries,

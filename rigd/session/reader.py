@@ -2,7 +2,7 @@
 
 import mmap
 import stat
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -22,7 +22,8 @@ from rigd.session.format import (
     is_fixed_layout,
     to_native,
 )
-from rigd.session.mcap_reader import MESSAGE_HEAD, McapContents, McapError, read_mcap
+from rigd.session.mcap_reader import McapContents, McapError, read_mcap
+from rigd.session.mcap_writer import MESSAGE_HEAD
 from rigd.session.schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -61,8 +62,13 @@ class _Layout:
     types: dict[str, str]
     required: tuple[str, ...]
     """Fields that a schema cannot leave out; any other absent one reads as 0."""
-    wire_dtype: np.dtype[np.void]
+    record_dtype: np.dtype[np.void]
+    """A message record in the file: its ``head``, then the ``wire`` form."""
     dtype: np.dtype[np.void]
+
+
+def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
+    return np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", wire_dtype)])
 
 
 _SAMPLES: Final = _Layout(
@@ -70,7 +76,7 @@ _SAMPLES: Final = _Layout(
     SAMPLE_SCHEMA,
     SAMPLE_TYPES,
     ("t_ns", "tick", "angle_rad", "coupling_torque_nm"),
-    SAMPLE_WIRE_DTYPE,
+    _record_dtype(SAMPLE_WIRE_DTYPE),
     SAMPLE_DTYPE,
 )
 _CONTROLS: Final = _Layout(
@@ -78,7 +84,7 @@ _CONTROLS: Final = _Layout(
     CONTROL_SCHEMA,
     CONTROL_TYPES,
     ("t_ns", "tick"),
-    CONTROL_WIRE_DTYPE,
+    _record_dtype(CONTROL_WIRE_DTYPE),
     CONTROL_DTYPE,
 )
 
@@ -323,38 +329,37 @@ def _decode_topic(path: Path, contents: McapContents, layout: _Layout) -> npt.ND
         for channel in contents.channels.values()
         if channel.topic == layout.topic
     }
-    record_dtype = np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", layout.wire_dtype)])
     native = np.empty(contents.count(layout.topic), layout.dtype)
-    places: list[int] = []  # of the messages that are not of the fixed layout
-    rows: list[tuple[float, ...]] = []  # and their fields
+    others: dict[int, tuple[float, ...]] = {}  # place → fields of what is not of the fixed layout
     start = 0
     for run in contents.runs[layout.topic]:
-        fixed_run = has_fixed_schema[run.channel] and run.size == record_dtype.itemsize
-        decode: Callable[[bytes], Message] | None = None
+        is_fixed = has_fixed_schema[run.channel] and run.size == layout.record_dtype.itemsize
         for block in run.blocks():
-            count = len(block) // run.size
-            others: Iterable[int] = range(count)
-            if fixed_run:
-                wire = np.frombuffer(block, record_dtype)["wire"]
-                fixed = is_fixed_layout(wire, layout.types)
-                to_native(wire, layout.types, native[start : start + count])
-                others = () if fixed.all() else np.flatnonzero(~fixed).tolist()
-            for i in others:
-                decode = decode or _message_class(path, contents, run.channel).FromString
+            out = native[start : start + len(block) // run.size]
+            places = _take_fixed(block, layout, out) if is_fixed else range(len(out))
+            for i in places:
+                decode = _message_class(path, contents, run.channel).FromString
                 data = block[i * run.size + MESSAGE_HEAD.size : (i + 1) * run.size]
                 message = _decoded(path, layout.topic, decode, data)
-                places.append(start + i)
-                rows.append(tuple([getattr(message, name, 0) for name in layout.types]))
-            start += count
-    if rows:
+                others[start + i] = tuple([getattr(message, name, 0) for name in layout.types])
+            start += len(out)
+    if others:
         try:
-            native[places] = np.array(rows, layout.dtype)
+            native[list(others)] = np.array(list(others.values()), layout.dtype)
         except OverflowError as error:
             raise SessionError(
                 f"{path}: a message of {layout.topic} holds a number that its field cannot take "
                 f"({error}). Whoever writes the file must keep to the types of the format."
             ) from None
     return native
+
+
+def _take_fixed(block: bytes, layout: _Layout, out: npt.NDArray[np.void]) -> Sequence[int]:
+    """Decode message records of the fixed length into `out`; return the places of wrong layout."""
+    wire = np.frombuffer(block, layout.record_dtype)["wire"]
+    to_native(wire, layout.types, out)
+    fixed = is_fixed_layout(wire, layout.types)
+    return () if fixed.all() else np.flatnonzero(~fixed).tolist()
 
 
 def _decoded(

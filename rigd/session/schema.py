@@ -4,7 +4,7 @@ An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` th
 and everything it refers to.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Final
 
 from rigd.session.format import CONTROL_TYPES, SAMPLE_TYPES
@@ -94,8 +94,11 @@ def schema_data(schema_name: str) -> bytes:
     return FileDescriptorSet(file=files).SerializeToString(deterministic=True)
 
 
+@lru_cache(maxsize=16)
 def message_class(schema_name: str, data: bytes) -> "type[Message]":
     """Return the class that decodes the messages of a protobuf schema.
+
+    It takes as long to build as dozens of messages to decode, so the last few are kept.
 
     Parameters
     ----------
@@ -131,7 +134,6 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     return message_factory.GetMessageClass(descriptor)
 
 
-@cache
 def event_class() -> "type[Message]":
     """Return the message class of ``foxglove.Log`` as this package writes it."""
     return message_class(EVENT_SCHEMA, schema_data(EVENT_SCHEMA))

@@ -4,12 +4,13 @@ import contextlib
 import errno
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from mcap.opcode import Opcode
 
 import rigd
 from rigd.session.errors import SessionError, SessionExistsError
@@ -20,7 +21,7 @@ from rigd.session.format import (
     SAMPLE_WIRE_DTYPE,
     Buffer,
 )
-from rigd.session.mcap_writer import INDEX_DTYPE, McapWriter
+from rigd.session.mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
 from rigd.session.schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -41,7 +42,7 @@ CHUNK_SAMPLES: Final = 250
 SYNC_INTERVAL_S: Final = 1.0
 """Wall time between two syncs to the disk: what a dead host loses on top."""
 
-_MESSAGE_HEAD: Final = [
+_MESSAGE_HEAD_FIELDS: Final = [
     ("opcode", "u1"),
     ("length", "<u8"),
     ("channel", "<u2"),
@@ -49,9 +50,7 @@ _MESSAGE_HEAD: Final = [
     ("log_time", "<u8"),
     ("publish_time", "<u8"),
 ]
-_MESSAGE_OPCODE: Final = 5
-_HEAD_SIZE: Final = np.dtype(_MESSAGE_HEAD).itemsize
-_RECORD_HEAD_SIZE: Final = 9  # opcode and length, which the length does not count
+"""`MESSAGE_HEAD` as numpy has it."""
 
 _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
 _URGENT: Final = ("error", "fatal")
@@ -61,9 +60,9 @@ def _fixed_records(
     wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
 ) -> npt.NDArray[np.void]:
     """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
-    records = np.empty(wire.shape, [*_MESSAGE_HEAD, ("data", wire.dtype)])
-    records["opcode"] = _MESSAGE_OPCODE
-    records["length"] = records.dtype.itemsize - _RECORD_HEAD_SIZE
+    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
+    records["opcode"] = Opcode.MESSAGE
+    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
     records["channel"] = channel
     records["sequence"] = wire["tick"]
     records["log_time"] = wire["t_ns"] + start_utc_ns
@@ -77,6 +76,22 @@ def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.v
     index["log_time"] = records["log_time"]
     index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
     return index
+
+
+def _event_records(
+    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
+) -> tuple[bytes, npt.NDArray[np.void]]:
+    """Make message records of events (log time, message), and their index."""
+    records = b""
+    index = np.empty(len(events), INDEX_DTYPE)
+    for i, (log_time, data) in enumerate(events):
+        index[i] = (log_time, offset + len(records))
+        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
+        records += MESSAGE_HEAD.pack(
+            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
+        )
+        records += data
+    return records, index
 
 
 def _fsync_directory(path: Path) -> None:
@@ -290,6 +305,8 @@ class SessionWriter:
 
     def abandon(self) -> None:
         """Write what has arrived and leave the ``.part`` as it is, without an end."""
+        if self._stream.closed:
+            return
         try:
             if not self._failed:
                 with self._explained():
@@ -346,23 +363,10 @@ class SessionWriter:
                 indexes[channel] = _fixed_index(records, offset)
                 offset += records.nbytes
         if self._events:
-            index = np.empty(len(self._events), INDEX_DTYPE)
-            for i, (log_time, data) in enumerate(self._events):
-                head = np.array(
-                    (
-                        _MESSAGE_OPCODE,
-                        _HEAD_SIZE - _RECORD_HEAD_SIZE + len(data),
-                        self._event_channel,
-                        self._event_count + i,
-                        log_time,
-                        log_time,
-                    ),
-                    _MESSAGE_HEAD,
-                )
-                parts += [head.tobytes(), data]
-                index[i] = (log_time, offset)
-                offset += _HEAD_SIZE + len(data)
-            indexes[self._event_channel] = index
+            events, indexes[self._event_channel] = _event_records(
+                self._events, self._event_channel, self._event_count, offset
+            )
+            parts.append(events)
             self._event_count += len(self._events)
         if indexes:
             mcap.add_chunk(b"".join(parts), indexes)

@@ -1,6 +1,6 @@
 """Frequency response estimates from sampled records: Welch (H1, H2, Hv) and whole-record FFT."""
 
-from rigd.spectral.response import FrequencyResponse, SpectralError
+from rigd.spectral.response import Estimator, FrequencyResponse, SpectralError
 from rigd.spectral.welch import (
     PAPER_NFFT,
     PAPER_OVERLAP,
@@ -15,6 +15,7 @@ __all__ = [
     "PAPER_NFFT",
     "PAPER_OVERLAP",
     "PAPER_SEGMENT_LENGTH",
+    "Estimator",
     "FrequencyResponse",
     "SpectralError",
     "fft_response",

@@ -65,11 +65,19 @@ def test_follows_a_curved_valley():
     np.testing.assert_allclose(found.x, 1.0, atol=1e-8)
 
 
-def test_rests_on_a_bound_and_moves_along_it():
-    low, high = np.array([-2.0, -2.0]), np.array([0.5, 2.0])
-    found = minimise(rosenbrock, np.array([-1.2, 1.0]), low, high, relative_tolerance=1e-14)
-    np.testing.assert_allclose(found.x, [0.5, 0.25], atol=1e-8)
-    assert found.x[0] == high[0]
+@pytest.mark.parametrize(("low", "high", "rest"), [(-2.0, 0.5, 0.5), (1.5, 3.0, 1.5)])
+def test_rests_on_a_bound_and_moves_along_it(low, high, rest):
+    found = minimise(
+        rosenbrock,
+        np.array([1.0, -3.0]),
+        np.array([low, -4.0]),
+        np.array([high, 4.0]),
+        relative_tolerance=1e-14,
+    )
+    np.testing.assert_allclose(found.x, [rest, rest**2], atol=1e-8)
+    assert found.x[0] == rest
+    # Once the bound is known to hold, the other unknown is a linear problem.
+    assert found.evaluations < 12
 
 
 def test_start_outside_is_brought_inside():

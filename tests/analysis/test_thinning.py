@@ -19,6 +19,10 @@ def test_weights_are_shared_out(n, count, seed):
     index, share = thinned(measured, every, count)
     assert index.size == share.size <= max(count, 1)
     assert (np.diff(index) > 0).all()
+    # Every point counts for the chosen one that is nearest, of two the later.
+    distance = np.abs(np.arange(n)[:, None] - index[::-1])
+    owner = index.size - 1 - np.argmin(distance, axis=1)
+    np.testing.assert_allclose(share, np.bincount(owner, every, index.size), rtol=1e-9)
     assert share.sum() == pytest.approx(1.0)
     assert (share > 0).all()
     if count >= n:

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.structures import STRUCTURES
-from analysis.unknowns import Unknowns, undamped_frequencies_rad_s
+from analysis.unknowns import Unknowns
+from rigd.beam import undamped_frequencies_rad_s
 
 
 @pytest.mark.parametrize("name", STRUCTURES)

@@ -96,8 +96,9 @@ def test_any_shape(shape):
     g, gradient = transfer_and_gradient(s, PAPER_BEAM, damping, ["zeta", "gamma"])
     assert transfer(s, PAPER_BEAM, damping).shape == g.shape == shape
     assert gradient.shape == (2, *shape)
-    one_by_one = np.array([transfer(x, PAPER_BEAM, damping) for x in s.ravel()]).reshape(shape)
-    np.testing.assert_allclose(g, one_by_one, rtol=1e-12)
+    some = slice(None, None, 37 if s.size > 100 else 1)
+    one_by_one = [transfer(x, PAPER_BEAM, damping) for x in s.ravel()[some]]
+    np.testing.assert_allclose(g.ravel()[some], one_by_one, rtol=1e-12)
 
 
 @given(beam=beams, damping=dampings)

@@ -41,6 +41,7 @@ def start_rigd(tmp_path):
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,
+                start_new_session=True,  # a process group of its own, as in a terminal
             )
         )
         return started[-1]

@@ -125,12 +125,29 @@ def test_real_time_keeps_its_books(rigd, tmp_path):
     assert np.count_nonzero(late) == session["late"]
 
 
-@pytest.mark.parametrize("interrupt", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_stops_with_the_torque_off_and_a_complete_file(start_rigd, tmp_path, interrupt):
+def to_all(process, number):
+    """As a terminal or a service manager does: the whole process group gets it."""
+    os.killpg(process.pid, number)
+
+
+def to_one(process, number):
+    process.send_signal(number)
+
+
+@pytest.mark.parametrize("send", [to_all, to_one])
+@pytest.mark.parametrize(
+    "interrupt",
+    [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP],
+)
+def test_every_stop_leaves_the_torque_off_and_a_complete_file(
+    start_rigd, tmp_path, interrupt, send
+):
     process = start_rigd("run", "chirp", "--json", "--duration", "60")
     part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    wait_for(lambda: part.stat().st_size > 100_000)
-    process.send_signal(interrupt)
+    wait_for(lambda: part.stat().st_size > 50_000)
+    for _ in range(3):  # an impatient operator presses again
+        send(process, interrupt)
+        time.sleep(0.05)
     output, errors = process.communicate(timeout=20)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
@@ -145,16 +162,61 @@ def test_ctrl_c_stops_with_the_torque_off_and_a_complete_file(start_rigd, tmp_pa
     assert not list(tmp_path.glob("sessions/*.part"))
 
 
-def test_a_stop_before_the_record_leaves_no_file(start_rigd, tmp_path):
+@pytest.mark.parametrize("after_s", [0.1, 0.2, 0.3, 0.45, 0.7])
+def test_a_stop_before_the_record_leaves_no_file(start_rigd, tmp_path, after_s):
     process = start_rigd("run", "chirp", "--json")
-    wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    process.send_signal(signal.SIGINT)
+    time.sleep(after_s)
+    to_all(process, signal.SIGINT)
     output, errors = process.communicate(timeout=20)
     assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert not list(tmp_path.glob("sessions/*"))
+    if output:  # it had come as far as to have something to say
+        for session in json.loads(output)["sessions"]:
+            assert session["path"] is None
+            assert session["scheduled"] == 0
+
+
+def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
+    process = start_rigd("run", "chirp", "--json", "--fast", "--repeat", "50", *SHORT)
+    wait_for(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
+    to_all(process, signal.SIGINT)
+    output, errors = process.communicate(timeout=20)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    sessions = json.loads(output)["sessions"]
+    assert 2 <= len(sessions) < 50
+    written = {session["path"] for session in sessions if session["path"]}
+    assert written == {f"sessions/{path.name}" for path in tmp_path.glob("sessions/*")}
+    for path in written:
+        read_session(tmp_path / path)
+
+
+def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, tmp_path):
+    process = start_rigd("run", "chirp", "--json", "--duration", "60")
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    wait_for(lambda: part.stat().st_size > 50_000)
+    os.kill(child_of(process.pid, "rigd.engine.control"), signal.SIGSTOP)
+    to_one(process, signal.SIGINT)
+    output, errors = process.communicate(timeout=30)
+    assert process.returncode == 130, errors
     (session,) = json.loads(output)["sessions"]
-    assert session["path"] is None
-    assert session["scheduled"] == 0
-    assert not list((tmp_path / "sessions").iterdir())
+    assert session["outcome"] == "fault"
+    assert "was killed" in session["reason"]
+    record = read_session(tmp_path / session["path"])
+    assert len(record.samples) == session["recorded"]
+
+
+def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, tmp_path):
+    process = start_rigd("run", "hold", "--duration", "2")
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    part.with_suffix("").write_text("somebody else's")
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert "Traceback" not in errors
+    assert "not overwritten" in errors
+    assert part.with_suffix("").read_text() == "somebody else's"
+    assert part.exists()
 
 
 @pytest.mark.parametrize(

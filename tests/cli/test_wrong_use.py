@@ -60,6 +60,7 @@ def test_a_bad_profile_is_refused(rigd, tmp_path, change):
         (("--profile", "nowhere"), ("nowhere", "sim")),
         (("--no-such-option",), ("--no-such-option",)),
         (("--output", "taken"), ("taken",)),
+        (("--note", "two\nlines"), ("--note",)),
     ],
 )
 def test_an_absurd_option_is_refused(rigd, tmp_path, arguments, words):

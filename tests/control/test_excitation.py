@@ -123,6 +123,7 @@ def test_csv_of_one_column_is_one_angle_a_tick(tmp_path, heading):
         ("time_s,angle_rad\n0,0\n1\n", "line 3 has no value in the column angle_rad"),
         ("time_s,angle_rad\n1,0\n1,1\n", "line 3: time_s = 1 s does not come after"),
         ("time_s,angle_rad\n0,0\n1e9,1\n", "7200 s is the most"),
+        ("time_s,angle_rad\n-1e308,0\n1e308,1\n", "7200 s is the most"),
         ("angle_rad\n1.0\n", "has 1 angles"),
     ],
 )

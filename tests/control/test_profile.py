@@ -48,6 +48,29 @@ def test_shipped_profile_is_stable(profile):
     assert check_stability(close_loop(profile.loop_model())) is None
 
 
+def test_the_loop_is_made_of_the_rigs_own_values(profile):
+    rig = profile.rig
+    rig = dataclasses.replace(
+        rig,
+        actuation=dataclasses.replace(rig.actuation, delay_s=1e-4),
+        encoder=dataclasses.replace(rig.encoder, delay_s=2e-4),
+        sensor=dataclasses.replace(rig.sensor, delay_s=3e-4, tool_inertia_kg_m2=1e-5),
+    )
+    model = dataclasses.replace(profile, rig=rig).loop_model()
+    assert (model.actuation_delay_s, model.angle_delay_s, model.torque_delay_s) == (
+        1e-4,
+        2e-4,
+        3e-4,
+    )
+    assert model.tool_inertia_kg_m2 == 1e-5
+    assert (model.motor_inertia_kg_m2, model.viscous_nm_s_per_rad) == (
+        rig.motor.inertia_kg_m2,
+        rig.motor.viscous_nm_s_per_rad,
+    )
+    assert (model.rate_hz, model.beam, model.damping) == (rig.rate_hz, rig.beam, rig.damping)
+    assert model.settings is profile.control
+
+
 def test_every_number_has_a_source(profile):
     sources = profile.sources
     assert sources["beam.length_m"] == "paper"

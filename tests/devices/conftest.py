@@ -1,6 +1,5 @@
 """Every backend there is, opened but not connected."""
 
-
 import pytest
 
 from rigd.devices.registry import open_devices

@@ -13,6 +13,7 @@ from rigd.engine.clocks import VirtualClock
 from rigd.engine.control import ControlJob, conduct
 from rigd.engine.events import read_events
 from rigd.engine.ring import shared_memory_fd
+from rigd.engine.signals import StopRequest
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 from rigd.session.format import decode_controls, decode_samples
@@ -25,14 +26,16 @@ class WatchedDrive:
     inner: object
     fault_at: int | None = None
     fault: object = None
+    stale_at: int | None = None
     reads: int = 0
+    held_rad: float = 0.0
     enabled: bool = False
     torque_nm: float = 0.0
     torques: list = field(default_factory=list)
 
     @property
     def angle_stale(self):
-        return self.inner.angle_stale
+        return self.stale_at is not None and self.reads >= self.stale_at
 
     def connect(self):
         self.inner.connect()
@@ -47,6 +50,9 @@ class WatchedDrive:
     def read_angle(self):
         self.reads += 1
         angle_rad = self.inner.read_angle()
+        if self.angle_stale:
+            return self.held_rad
+        self.held_rad = angle_rad
         if self.fault_at is not None and self.reads >= self.fault_at:
             return self.fault(angle_rad)
         return angle_rad
@@ -100,6 +106,7 @@ class Session:
         )
         self.board = self.channels.board
         self.parent = FakeParent()
+        self.stop = StopRequest()
         devices = open_devices(self.profile.rig)
         self.drive = WatchedDrive(devices.drive)
         self.devices = Devices(self.drive, devices.sensor, simulated=True)
@@ -108,7 +115,7 @@ class Session:
 
     def run(self):
         job = ControlJob(self.profile, self.excitation, self.channels.specs, fast=True)
-        conduct(job, self.devices, self.clock, self.channels, self.parent, {})
+        conduct(job, self.devices, self.clock, self.channels, self.parent, self.stop, {})
         return self
 
     @property

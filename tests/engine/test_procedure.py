@@ -115,6 +115,7 @@ class StopAt(VirtualClock):
         (lambda s: s.board.__setitem__(Word.STOP, Stop.OPERATOR), "stopped", "operator"),
         (lambda s: s.board.__setitem__(Word.STOP, Stop.NO_RECORDER), "fault", "recorder"),
         (lambda s: setattr(s.parent, "living", False), "fault", "supervising"),
+        (lambda s: s.stop.request(), "stopped", "operator"),
     ],
 )
 @pytest.mark.parametrize("at_s", [0.3, 1.2, 3.0])
@@ -182,6 +183,55 @@ def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
         with pytest.raises(ZeroDivisionError):
             session.run()
     session.assert_safe()
+
+
+@pytest.mark.parametrize("read", [1200, 1600, 3000])
+def test_an_encoder_that_falls_silent_does_not_let_the_motor_run_away(make_session, read):
+    session = make_session()
+    session.drive.stale_at = read
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert "without a new angle" in session.finished["reason"]
+    assert session.drive.reads == read + 3  # three are let through
+    samples = session.samples
+    if samples is not None:
+        assert_books_balance(session, samples)
+        stale = samples["status"] & Status.ANGLE_STALE
+        assert np.flatnonzero(stale).size == min(4, len(samples))
+        last = Status(int(samples["status"][-1]))
+        assert Status.TORQUE_OFF | Status.LIMIT_WARNING in last
+
+
+def test_single_stale_angles_are_held_and_flagged(make_session):
+    session = make_session()
+    stale = set(range(2000, 5000, 10)) | set(range(2001, 5000, 10))
+    type(session.drive).angle_stale, kept = (
+        property(lambda drive: drive.reads in stale),
+        type(session.drive).angle_stale,
+    )
+    try:
+        session.run()
+    finally:
+        type(session.drive).angle_stale = kept
+    assert session.finished["finished"] == "complete"
+    assert np.flatnonzero(session.samples["status"] & Status.ANGLE_STALE).size == len(stale)
+
+
+def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session):
+    def fail(angle_rad):
+        raise OSError("the line is dead")
+
+    session = make_session()
+    session.clock = StopAt(3_000_000_000, session.stop.request)
+    session.drive.fault_at, session.drive.fault = 3000, fail
+    session.run()
+    session.assert_safe()
+    samples = session.samples
+    assert session.finished["finished"] == "stopped"
+    assert samples["status"][-1] & Status.TORQUE_OFF
+    assert samples["torque_command_nm"][-1] == 0.0
+    assert_books_balance(session, samples)
 
 
 def test_it_refuses_to_start_while_the_motor_moves(make_session):
@@ -271,5 +321,48 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
     assert session.finished["counts"] == {"scheduled": 16_002, "missed": 0, "late": 0, "lost": 1}
     assert_books_balance(session, samples)
     assert samples["tick"][-2:].tolist() == [15_999, 16_001]
+    assert session.drive.torques[-1] != 0.0
     assert samples["status"][-1] & Status.AFTER_LOST
     assert samples["status"][-1] & Status.TORQUE_OFF
+
+
+def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
+    profile = make_session().profile
+    session = make_session(
+        clock=LateAt({}),
+        excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=15.001, rest_s=1.0),
+    )
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert session.finished["counts"]["lost"] == 1
+    assert_books_balance(session, session.samples)
+
+
+def test_ticks_missed_up_to_the_end_are_judged_like_all_others(make_session):
+    # The last 100 ticks of the record and some beyond.
+    session = make_session(clock=LateAt({6_400_000_000: 150_000_000}))
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert "missed" in session.finished["reason"]
+    counts = session.finished["counts"]
+    assert counts["scheduled"] == 5000
+    assert counts["missed"] == 101
+    assert_books_balance(session, session.samples)
+
+
+def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
+    from rigd.excitation import step
+
+    profile = make_session().profile
+    session = make_session(
+        excitation=step(
+            rate_hz=profile.rig.rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0
+        )
+    )
+    session.run()
+    assert session.finished["finished"] == "complete"
+    assert any("still swings" in event.message for event in session.events)
+    assert not any(event.level == "warning" for event in session.events)
+    assert "tare_drift_nm" not in session.finished["results"]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.record import load_record
-from analysis.welch_route import WelchSettings, analyse
+from analysis.settings import WelchSettings
+from analysis.welch_route import analyse
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionWriter
 from rigd.session.format import SAMPLE_SIZE, pack_sample_into

@@ -41,6 +41,9 @@ def test_modes_and_peaks(content):
         assert mode["natural_frequency_rad_s"] == pytest.approx(281.6, abs=1.0)
         assert mode["peak_frequency_deviation_rad_s"] < 1.0
     assert [peak["mode"] for peak in content["peaks"]] == [1, 2, 3]
+    assert [peak["frequency_hz"] for peak in content["peaks"]] == pytest.approx(
+        [2.57, 16.01, 44.8], rel=5e-3
+    )
     assert content["peaks"][1]["magnitude_db"] == pytest.approx(30.6, abs=0.3)
 
 
@@ -49,6 +52,9 @@ def test_files_versions_and_errors(content):
     assert file["settings"]["segments"] == 8
     assert file["settings"]["bins"] == 7907
     assert file["settings"]["nfft"] == 160_000
+    assert (file["samples"], file["rate_hz"]) == (136_000, 1000.0)
+    assert (file["sweep_first"], file["sweep_end"]) == (1000, 121_000)
+    assert file["beam_length_m"] == 0.98
     assert file["gaps"]["missing_ticks"] == 0
     assert file["warnings"] == []
     assert set(content["versions"]) >= {"rigd", "python", "numpy"}

@@ -11,7 +11,8 @@ from analysis.report import style
 from analysis.report.frf_figure import frf_figure
 from analysis.report.signals_figure import signals_figure
 from analysis.report.torque_figure import best_model, torque_figure
-from analysis.welch_route import WelchSettings, analyse
+from analysis.settings import WelchSettings
+from analysis.welch_route import analyse
 
 
 def pixels(figure, path):
@@ -67,6 +68,10 @@ def test_one_panel_a_type(paper_analysis):
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert [t.split()[1] for t in titles if t.startswith("Type")] == ["I", "III", "VI"]
     assert titles[-1] == "Coherence"
+    # Noise about 180° must not jump to the other edge of the panel.
+    phase_deg = np.concatenate([line.get_ydata() for line in figure.axes[1].get_lines()[:4]])
+    assert phase_deg.max() > 180.0
+    assert phase_deg.min() > -90.0
     lines = figure.axes[0].get_lines()
     assert [len(line.get_xdata()) > 100 for line in lines[:4]] == [True] * 4
 

@@ -156,6 +156,14 @@ def test_a_rate_that_the_time_stamps_contradict_is_refused(tmp_path, write_sessi
         load_record(path)
 
 
+def test_a_span_that_is_all_but_empty_is_refused(tmp_path, write_session, short_signals):
+    """Its grid would take tens of gigabytes."""
+    two = short_signals.decimated([0, 1])
+    path = write_session(tmp_path / "a.mcap", two, ticks=[0, 2**32 - 1], segments={})
+    with pytest.raises(RecordError, match=r"a\.mcap: only 2 of the 4294967296 ticks"):
+        load_record(path)
+
+
 def test_ticks_out_of_order_are_refused(tmp_path, write_session, short_signals):
     ticks = np.arange(5000)
     ticks[2000] = 1999

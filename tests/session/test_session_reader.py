@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from google.protobuf import message_factory
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -99,6 +100,21 @@ def test_fixed_and_other_encodings_mix_in_any_order(kit, tmp_path, kinds, chunk_
         extra="/other" if extra else None,
     )
     np.testing.assert_array_equal(read_session(path).samples, samples)
+
+
+def test_a_schema_is_interpreted_once_however_the_messages_vary(kit, tmp_path, monkeypatch):
+    """Zeros left out make lengths differ, so that hardly two messages are taken together."""
+    samples = kit.make_samples(300)
+    samples["fx_n"][::2] = 0.0
+    path = kit.write_foreign(tmp_path / "f.mcap", encoded(samples))
+    built = []
+    get_class = message_factory.GetMessageClass
+    monkeypatch.setattr(
+        message_factory, "GetMessageClass", lambda d: built.append(d) or get_class(d)
+    )
+    message_class.cache_clear()
+    np.testing.assert_array_equal(read_session(path).samples, samples)
+    assert len(built) == 1
 
 
 def test_fields_in_another_order_and_unknown_ones_are_decoded(kit, tmp_path):

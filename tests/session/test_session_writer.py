@@ -39,6 +39,7 @@ def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
     for record, message in decoded["/rig/sample"]:
         assert record.log_time == record.publish_time == kit.START_UTC_NS + message.t_ns
         assert record.sequence == message.tick
+    assert [record.sequence for record, _ in decoded["/rig/event"]] == [0, 1]
     record, event = decoded["/rig/event"][0]
     assert event.timestamp.ToNanoseconds() == record.log_time == kit.START_UTC_NS - 5_000_000
     counts = {summary.channels[i].topic: n for i, n in

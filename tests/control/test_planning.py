@@ -1,0 +1,88 @@
+"""What a session will do, predicted and judged before anything moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.control import ControlDesignError, PidController, close_loop, design_pid
+from rigd.excitation import chirp, step
+from rigd.planning import RefusedError, plan_session, predict
+
+
+def test_the_papers_chirp_stays_within_the_shipped_limits(profile):
+    plan = plan_session(profile, chirp(rate_hz=1000.0))
+    assert plan.warnings == ()
+    assert plan.prediction.peak_torque_nm == pytest.approx(0.41, abs=0.01)
+    assert plan.prediction.peak_angle_rad == pytest.approx(0.025, rel=0.01)
+
+
+def test_ten_times_the_amplitude_saturates_and_may_be_forced(profile):
+    excitation = chirp(rate_hz=1000.0, amplitude_rad=0.25)
+    with pytest.raises(RefusedError, match=r"peak torque of 3\.8.* exceeds 0\.9 N·m .*--force"):
+        plan_session(profile, excitation)
+    plan = plan_session(profile, excitation, force=True)
+    assert any("will be clipped and flagged" in warning for warning in plan.warnings)
+    assert not any("--force" in warning for warning in plan.warnings)
+
+
+def test_predicted_saturation_is_what_the_controller_does(profile):
+    """A step just below and just above the limit, tick by tick on the reference's jump."""
+    model = profile.loop_model()
+    gains = design_pid(2e-3, 0.02, 80.0)
+    for amplitude in (0.05, 0.09):
+        prediction = predict(close_loop(model), step(rate_hz=1000.0, amplitude_rad=amplitude))
+        controller = PidController(gains, model.settings, 1000.0, 0.9)
+        controller.step(0.0, 0.0, 0.0)
+        controller.step(amplitude, 0.0, 0.0)
+        assert controller.saturated == (prediction.peak_torque_nm > 0.9)
+        assert prediction.peak_torque_nm >= abs(controller.unlimited_torque_nm) - 1e-12
+
+
+def test_angle_speed_and_tracking_can_never_be_forced(profile):
+    with pytest.raises(RefusedError) as refusal:
+        plan_session(profile, step(rate_hz=1000.0, amplitude_rad=2.0), force=True)
+    for key in ("limits.angle_rad", "limits.velocity_rad_s", "limits.tracking_error_rad"):
+        assert key in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "projection", [(0, 0, 0, 0, 0, 1.0), (0, 0, 0, 0, 0, -2.0), (0, 0.03, 0, 0, 0, 0.5)]
+)
+def test_the_sensor_s_range_bounds_the_coupling_torque(profile, projection):
+    excitation = chirp(rate_hz=1000.0, duration_s=20.0)
+    response = close_loop(profile.loop_model()).simulate(excitation.reference_rad)
+    peak = float(np.max(np.abs(response.coupling_torque_nm)))
+    weight = sum(p * p for p in projection)
+    # The largest wrench that this torque makes on each axis, a little more and a little less.
+    for factor, refused in ((0.99, True), (1.01, False)):
+        ranges = tuple(factor * peak * abs(p) / weight if p else 1.0 for p in projection)
+        rig = replace(
+            profile.rig,
+            sensor=replace(profile.rig.sensor, projection=projection, range=ranges),
+        )
+        narrow = replace(profile, rig=rig)
+        if refused:
+            with pytest.raises(RefusedError, match=r"coupling torque .*sensor\.range"):
+                plan_session(narrow, excitation)
+            assert plan_session(narrow, excitation, force=True).warnings
+        else:
+            assert plan_session(narrow, excitation).warnings == ()
+
+
+def test_a_prediction_that_is_no_number_is_refused(profile, monkeypatch):
+    import rigd.planning
+
+    broken = replace(
+        predict(close_loop(profile.loop_model()), chirp(rate_hz=1000.0, duration_s=1.0)),
+        peak_angle_rad=float("nan"),
+    )
+    monkeypatch.setattr(rigd.planning, "predict", lambda loop, excitation: broken)
+    with pytest.raises(RefusedError, match="nan rad"):
+        plan_session(profile, chirp(rate_hz=1000.0, duration_s=1.0), force=True)
+
+
+def test_an_unstable_loop_is_refused(profile):
+    without = replace(profile, control=replace(profile.control, feedforward_gain=0.0))
+    with pytest.raises(ControlDesignError, match="feedforward_gain"):
+        plan_session(without, chirp(rate_hz=1000.0, duration_s=1.0), force=True)
