@@ -61,7 +61,10 @@ def main() -> None:
 
 @app.command(epilog=_EPILOG)
 def analyze(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Session files (.mcap).")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE", readable=False, help="Session files (.mcap)."),
+    ],
     method: Annotated[
         Method, typer.Option(help="welch: the paper's; all: every method there is.")
     ] = Method.ALL,

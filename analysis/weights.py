@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 WeightingFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Weighting = str | WeightingFunction
 
+_LARGEST_POWER = 10
+"""Beyond it, a handful of points at one end of the band would have all the weight."""
+
 
 class WeightingError(ValueError):
     """A weighting that does not exist, or that is not positive and finite where it is used."""
@@ -46,10 +49,7 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
                 "frequencies; it must give one value for each."
             )
     else:
-        # Relative to the largest, so that no power of omega overflows.
-        with np.errstate(over="ignore", invalid="ignore"):
-            ln_p = _exponent(weighting) * np.log(omega_rad_s)
-            p = np.exp(ln_p - ln_p.max())
+        p = omega_rad_s ** _exponent(weighting)
     total = float(p.sum())
     if not (math.isfinite(total) and total > 0 and float(p.min()) >= 0):
         raise WeightingError(
@@ -83,9 +83,10 @@ def _exponent(weighting: str) -> float:
         exponent = float(power)
     except ValueError:
         exponent = math.nan
-    if base != "omega" or not separator or not math.isfinite(exponent):
+    if base != "omega" or not separator or not abs(exponent) <= _LARGEST_POWER:
         raise WeightingError(
             f"There is no weighting {weighting!r}; choose const, omega (which is 1/omega) or "
-            "omega^K with a number K, such as omega^-0.5."
+            f"omega^K with a number K from -{_LARGEST_POWER} to {_LARGEST_POWER}, such as "
+            "omega^-0.5."
         )
     return exponent

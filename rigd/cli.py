@@ -33,8 +33,8 @@ EXIT_WRONG_USE = 2
 EXIT_INTERRUPTED = 130
 
 Amplitude = Annotated[float, typer.Option("--amplitude", help="Amplitude, rad.")]
-StartHz = Annotated[float, typer.Option("--start-hz", help="Lowest frequency, Hz.")]
-StopHz = Annotated[float, typer.Option("--stop-hz", help="Highest frequency, Hz.")]
+StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the band starts, Hz.")]
+StopHz = Annotated[float, typer.Option("--stop-hz", help="Frequency where the band ends, Hz.")]
 Duration = Annotated[float, typer.Option("--duration", help="Duration of the excitation, s.")]
 Rest = Annotated[float, typer.Option("--rest", help="Rest before it, s.")]
 RingDown = Annotated[float, typer.Option("--ring-down", help="Holding after it, s.")]
@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"rigd: {message}", err=True)
+    typer.echo(f"Error: {message}", err=True)
     raise typer.Exit(code)
 
 
@@ -252,7 +252,10 @@ def multisine(
 def file(
     rate_hz: float,
     path: Annotated[
-        Path, typer.Argument(metavar="CSV", help="Columns time_s and angle_rad, or one of angles.")
+        Path,
+        typer.Argument(
+            metavar="CSV", readable=False, help="Columns time_s and angle_rad, or one of angles."
+        ),
     ],
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
@@ -268,7 +271,7 @@ def file(
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="A session file.")],
+    path: Annotated[Path, typer.Argument(metavar="FILE", readable=False, help="A session file.")],
     as_json: Annotated[
         bool, typer.Option("--json", help="Write one JSON document to standard output.")
     ] = False,

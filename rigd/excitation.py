@@ -318,6 +318,8 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
                 "times in seconds so, or leave angle_rad alone."
             )
         rows = rows[1:]
+    elif len(header) == 1 and ";" in header[0]:
+        raise ExcitationError(f"{path}: separates its columns by semicolons; use commas.")
     elif len(header) == 1:
         angle_column, time_column = 0, None
     else:

@@ -111,7 +111,10 @@ def _fit(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
         "frf": analysis.settings.estimator,
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
-        "std": None if fit.std is None else dict(fit.std),
+        # What a structure fixes is not known exactly: it was not asked for.
+        "std": None
+        if fit.std is None
+        else {name: std if name in fit.structure.free else None for name, std in fit.std.items()},
         "cost": fit.cost,
         "at_bounds": list(fit.at_bounds),
         "indices": asdict(model.indices),

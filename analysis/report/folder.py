@@ -38,7 +38,8 @@ def report_folders(files: Sequence[Path], report: Path | None) -> list[Path]:
     """
     if report is None:
         taken: set[Path] = set()
-        return [_free(file.with_name(f"{file.stem}.report"), taken) for file in files]
+        # A folder given for a file may have no name of its own ("." or "/").
+        return [_free(file.parent / f"{file.stem}.report", taken) for file in files]
     if report.exists() and not (report.is_dir() and not any(report.iterdir())):
         raise OutputExistsError(
             f"--report {report} exists and is not an empty folder; choose another name or move it "

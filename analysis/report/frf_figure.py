@@ -49,7 +49,8 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     height_in = 3.75 * rows + 1.15 + head_in
     figure = style.new_figure(
         width_in, height_in, f"{analysis.record.path.name} — frequency response",
-        f"coupling torque over motor angle  ·  {_estimate_text(analysis)}",
+        f"coupling torque over motor angle  ·  {_estimate_text(analysis)}  ·  "
+        "MSE, WMSE in (N·m/rad)²",
     )  # fmt: skip
     grid = figure.add_gridspec(
         rows + 1, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,

@@ -38,7 +38,8 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
         13.0, 8.0, f"{record.path.name} — torque, measured and modelled",
         f"type {model.fit.structure.name}, weights {model.fit.weighting} (lowest WMSE)  ·  exact "
         f"model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  residual "
-        f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * share:.3g} % of the torque",
+        f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * share:.3g} % of the torque, the bias of "
+        "Welch's estimate included",
     )  # fmt: skip
     moments = resonance_moments(record, len(analysis.peaks))
     grid = figure.add_gridspec(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Lt
+from annotated_types import Ge, Gt, Le, Lt
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Damping:
     coefficient, for a damping that is absent.
     """
 
-    zeta: Annotated[float, Ge(0)] = 0.0
+    zeta: Annotated[float, Ge(0), Le(1)] = 0.0
     alpha: Annotated[float, Ge(0), Lt(2)] = 1.0
     gamma: Annotated[float, Ge(0)] = 0.0
     lambda_: Annotated[float, Ge(0), Lt(2)] = 1.0

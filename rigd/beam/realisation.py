@@ -33,6 +33,7 @@ MAX_GROWTH_PER_S = 1e-2
 undamped beam, whose poles lie on the imaginary axis but for rounding and the fit's error."""
 
 _MODES_UP_TO_HZ = 1200.0
+_MOST_MODES = 300
 _HEAVY_DAMPING = 0.8
 """Damping ratio from which a pair beyond the band is left out: with the real poles next to it, it
 would only offer huge residues that cancel in the band."""
@@ -98,8 +99,8 @@ def realise(beam: Beam, damping: Damping, *, max_relative_error: float = 1e-3) -
     ------
     RealisationError
         If the error is larger, naming the error achieved; if the realisation would make a
-        frictionless motor unstable; or if the exact beam itself is not passive: negative
-        coefficients, orders outside 0…2.
+        frictionless motor unstable; if the exact beam itself is not passive: negative
+        coefficients, orders outside 0…2; or if the beam has more than 300 modes to realise.
     """
     _check_passive(damping)
     poles = _poles(beam, damping)
@@ -143,6 +144,12 @@ def _poles(beam: Beam, damping: Damping) -> Complex:
     reach = (2 * np.pi * _MODES_UP_TO_HZ) ** 2 * beam.density_over_stiffness
     # Damping may shift the highest modes down, so a few more are looked at than the undamped count.
     count = int(1.25 * reach**0.25 * beam.length_m / np.pi) + 3
+    if count > _MOST_MODES:
+        raise RealisationError(
+            f"{beam} has some {count} modes below {_MODES_UP_TO_HZ:g} Hz, more than the "
+            f"{_MOST_MODES} that are realised; check the units of its length, density and "
+            "stiffness."
+        )
     pairs = poles_for_eigenvalues(clamped_free_eigenvalues(count), beam, damping)
     pairs = pairs[~np.isnan(pairs[:, 0])]
     oscillating = pairs[:, 0].imag > 0

@@ -29,7 +29,7 @@ class Motor:
 class Encoder:
     """Incremental encoder, referred to the output shaft."""
 
-    resolution_rad: NonNegative
+    resolution_rad: Annotated[float, Ge(0), Le(0.1)]
     """Zero: the angle is not quantised (tests of the linear loop)."""
     delay_s: NonNegative = 0.0
     """Age of the angle at the tick that asks for it."""

@@ -2,10 +2,12 @@
 
 import difflib
 from collections.abc import Iterator, Mapping
+from math import pi
 from typing import Any
 
 from pydantic_core import ErrorDetails
 
+from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.profile.settings import SECTIONS, SOURCES, TEXTS, keys
 
@@ -32,6 +34,9 @@ _UNITS_OF_SIX = {
     "simulation.offset": "N, N, N, N·m, N·m, N·m",
 }
 
+_FIRST_MODE_HZ = 0.1, 100.0
+"""Of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
+
 
 def no_source(key: str, source: object) -> str:
     """Complain about a number whose source is absent or made up."""
@@ -55,6 +60,23 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"motor.peak_torque_nm = {peak:g} N·m is below motor.rated_torque_nm = {rated:g} N·m; "
             "the peak is at least the rated torque."
+        )
+    first_mode_hz = float(
+        undamped_frequencies_rad_s(
+            Beam(
+                values["beam.length_m"],
+                values["beam.density_kg_per_m"],
+                values["beam.bending_stiffness_n_m2"],
+            ),
+            1,
+        )[0]
+    ) / (2 * pi)
+    low_hz, high_hz = _FIRST_MODE_HZ
+    if not low_hz <= first_mode_hz <= high_hz:
+        yield (
+            f"beam.length_m, beam.density_kg_per_m and beam.bending_stiffness_n_m2 give a first "
+            f"mode at {first_mode_hz:.3g} Hz, outside {low_hz:g} to {high_hz:g} Hz; check their "
+            "units."
         )
     if not any(values["sensor.projection"]):
         yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."

@@ -287,7 +287,7 @@ class _Reader:
         """Compare the summary, if there is one, with what was found."""
         data = self._data
         if not self.contents.complete:
-            raise _DamageError("ends in the middle of its summary")
+            raise _DamageError("ends in the middle of its summary, or something was appended to it")
         footer = len(data) - len(MAGIC) - _FOOTER.size
         *_, summary_start, _, crc = _FOOTER.unpack_from(data, footer)
         if summary_start not in (0, start) or (summary_start == 0 and footer != start):

@@ -23,7 +23,7 @@ def test_omega_weights_are_a_mean_over_a_logarithmic_axis():
     assert weights(OMEGA, "omega") @ e == pytest.approx(mean, rel=1e-3)
 
 
-@given(power=st.floats(-100, 100))
+@given(power=st.floats(-10, 10))
 def test_any_power(power):
     w = weights(OMEGA, f"omega^{power!r}")
     assert w.sum() == pytest.approx(1.0)
@@ -77,8 +77,7 @@ def test_function_of_the_wrong_shape():
         weights(OMEGA, lambda _omega: np.array(1.0))
 
 
-@pytest.mark.parametrize("power", ["1e6", "-1e6", "350", "-350"])
-def test_power_beyond_all_measure_weighs_the_end_of_the_band(power):
-    w = weights(OMEGA, f"omega^{power}")
-    assert w.sum() == pytest.approx(1.0)
-    assert np.argmax(w) == (0 if power.startswith("-") else OMEGA.size - 1)
+@pytest.mark.parametrize("power", ["1e6", "-1e6", "10.1", "-11", "nan", "inf"])
+def test_a_power_that_leaves_one_end_of_the_band_only_is_refused(power):
+    with pytest.raises(WeightingError, match=r"from -10 to 10"):
+        weights(OMEGA, f"omega^{power}")

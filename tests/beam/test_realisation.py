@@ -139,3 +139,9 @@ def test_refusal_of_what_would_make_a_motor_unstable(monkeypatch):
 def test_active_beams_are_refused(damping):
     with pytest.raises(RealisationError, match="creates energy"):
         realise(PAPER_BEAM, damping)
+
+
+def test_a_beam_of_too_many_modes_is_refused_at_once():
+    millimetres_for_metres = Beam(980.0, 4.7e-3, 0.090275)
+    with pytest.raises(RealisationError, match=r"modes below 1200 Hz.*units"):
+        realise(millimetres_for_metres, Damping())

@@ -9,6 +9,10 @@ PROFILE_CHANGES = {
     "out of range": ("value = 2.0e-3, source", "value = -2.0e-3, source", "inertia_kg_m2"),
     "not a number": ("value = 0.98", "value = nan", "length_m"),
     "a word": ("value = 0.98", "value = 'long'", "length_m"),
+    "millimetres": ("value = 0.98", "value = 980", "length_m"),
+    "grams": ("{ value = 4.7e-3", "{ value = 4.7", "density_kg_per_m"),
+    "coarse encoder": ("value = 7.0e-5", "value = 7.0", "resolution_rad"),
+    "absurd damping": ("zeta = { value = 7.1e-5", "zeta = { value = 7.1", "zeta"),
     "no source": ("{ value = 0.98, source = \"paper\" }", "0.98", "length_m"),
     "unstable beam": ("zeta = { value = 7.1e-5", "zeta = { value = -7.1e-5", "zeta"),
     "unstable loop": (
@@ -91,3 +95,8 @@ def test_info_on_what_is_no_session_file(rigd, tmp_path, content):
     assert_refused(rigd("info", path), 1, "broken.mcap")
     if content is not None:
         assert path.read_bytes() == content
+
+
+def test_a_plain_word_in_the_wrong_place_is_explained(rigd, tmp_path):
+    (tmp_path / "reference.csv").write_text("time_s;angle_rad\n0;0\n1;0.1\n")
+    assert_refused(rigd("run", "file", "reference.csv", "--fast"), 2, "semicolons", "commas")

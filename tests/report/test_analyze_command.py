@@ -138,6 +138,12 @@ def test_a_file_that_is_no_session_is_refused(paper_file, tmp_path, kind):
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.parametrize("folder", [".", "/", ""])
+def test_a_folder_in_place_of_a_file_is_refused(tmp_path, folder):
+    refused(run(folder, cwd=tmp_path), 1, folder)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_session_too_short_for_the_segments_says_what_fits(
     write_session, short_signals, tmp_path
 ):
