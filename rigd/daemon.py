@@ -15,10 +15,9 @@ from pathlib import Path
 from rigd import __version__
 from rigd.crew import Crew
 from rigd.engine.board import Phase, Stop, Word
-from rigd.engine.control import ControlJob
 from rigd.engine.events import Event, read_events
+from rigd.engine.jobs import ControlJob, RecorderJob
 from rigd.engine.process import ChildError, Message
-from rigd.engine.recorder import RecorderJob
 from rigd.engine.ring import Observer
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation

@@ -11,7 +11,8 @@ from rigd.beam.modes import (
     undamped_frequencies_rad_s,
 )
 from rigd.beam.parameters import Beam, Damping
-from rigd.beam.realisation import Realisation, RealisationError, realise
+from rigd.beam.realisation import RealisationError, realise
+from rigd.beam.state_space import Realisation
 from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rigd.beam.realisation import Realisation
+    from rigd.beam.state_space import Realisation
 
     Real = NDArray[np.float64]
 

@@ -12,14 +12,13 @@ the fit has a faint tail beyond its band, because an approximation can be accura
 still not be passive, and then motor and beam together are unstable.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rigd.beam.coupled import couple
 from rigd.beam.modes import clamped_free_eigenvalues, poles_for_eigenvalues
 from rigd.beam.parameters import Beam, Damping
+from rigd.beam.state_space import Realisation, basis
 from rigd.beam.transfer_function import TransferGrid
 
 Real = NDArray[np.float64]
@@ -51,40 +50,6 @@ class RealisationError(ValueError):
     """The damping cannot be realised to the error asked for, or not stably."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Realisation:
-    """State space ``x' = a x + b θ''``, ``Γ = c x + D θ'' + V θ' + K θ`` for G = Γ/θ.
-
-    `a` is block diagonal: 2 × 2 blocks for the complex pairs, then the real poles.
-    """
-
-    a: Real
-    """(n, n) in 1/s."""
-    b: Real
-    """(n,), dimensionless."""
-    c: Real
-    """(n,) in N·m."""
-    direct_inertia_kg_m2: float
-    direct_viscosity_nm_s_per_rad: float
-    direct_stiffness_nm_per_rad: float
-    relative_error: float
-    """Largest ``|realised - exact| / |exact|`` found over `ERROR_BAND_HZ`."""
-    poles_rad_s: Complex
-    """(m,): of a conjugate pair the one in the upper half plane, then the real ones."""
-
-    def transfer(self, s: ArrayLike) -> Complex:
-        """G(s) as realised, in N·m/rad, of the shape of `s` (rad/s)."""
-        points = np.asarray(s, dtype=np.complex128)
-        columns = _basis(points.ravel(), self.poles_rad_s)
-        direct = (
-            self.direct_inertia_kg_m2,
-            self.direct_viscosity_nm_s_per_rad,
-            self.direct_stiffness_nm_per_rad,
-        )
-        g: Complex = columns @ np.concatenate([self.c, direct])
-        return g.reshape(points.shape)
-
-
 def realise(beam: Beam, damping: Damping, *, max_relative_error: float = 1e-3) -> Realisation:
     """Real-time realisation of the beam.
 
@@ -112,7 +77,7 @@ def realise(beam: Beam, damping: Damping, *, max_relative_error: float = 1e-3) -
     s = 1j * omega[apart]
     exact = TransferGrid(s).evaluate(beam, damping)
     scale = weight[apart] / exact
-    coefficients = _fit(_basis(s, poles) * scale[:, None], weight[apart].astype(np.complex128))
+    coefficients = _fit(basis(s, poles) * scale[:, None], weight[apart].astype(np.complex128))
 
     error = _relative_error(beam, damping, poles, zeros, coefficients)
     if not error <= max_relative_error:
@@ -196,22 +161,6 @@ def _clusters(landmarks: Complex, points: int) -> Real:
     return frequency
 
 
-def _basis(s: Complex, poles: Complex) -> Complex:
-    """Columns whose combination with ``c, D, V, K`` is G: shape (len(s), n + 3)."""
-    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
-    s2 = (s * s)[:, None]
-    columns = np.empty((s.size, 2 * upper.size + real.size + 3), dtype=np.complex128)
-    shifted = s[:, None] - upper.real
-    determinant = shifted * shifted + upper.imag**2
-    columns[:, 0 : 2 * upper.size : 2] = s2 * shifted / determinant
-    columns[:, 1 : 2 * upper.size : 2] = -s2 * upper.imag / determinant
-    columns[:, 2 * upper.size : -3] = s2 / (s[:, None] - real)
-    columns[:, -3] = s2[:, 0]
-    columns[:, -2] = s
-    columns[:, -1] = 1
-    return columns
-
-
 def _fit(columns: Complex, target: Complex) -> Real:
     """Real least squares with the last three unknowns (D, V, K) not negative."""
     matrix = np.concatenate([columns.real, columns.imag])
@@ -239,7 +188,7 @@ def _relative_error(
     omega = 2 * np.pi * frequency[(frequency >= low) & (frequency <= high)]
     s = 1j * omega[_apart(omega, poles, zeros)]
     exact = TransferGrid(s).evaluate(beam, damping)
-    return float(np.max(np.abs(_basis(s, poles) @ coefficients / exact - 1)))
+    return float(np.max(np.abs(basis(s, poles) @ coefficients / exact - 1)))
 
 
 def _apart(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:

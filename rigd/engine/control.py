@@ -1,32 +1,21 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.registry import open_devices
 from rigd.engine.board import Phase, Word
-from rigd.engine.channels import Channels, ChannelSpecs, attach_channels
+from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.clocks import Clock, RealClock, VirtualClock
 from rigd.engine.cycle import Cycle
+from rigd.engine.jobs import ControlJob
 from rigd.engine.procedure import Procedure, SessionEnd
 from rigd.engine.process import Parent
 from rigd.engine.realtime import collect_no_garbage, obtain
 from rigd.engine.signals import StopRequest
-from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.safety import LimitWatch
-
-
-@dataclass(frozen=True, slots=True)
-class ControlJob:
-    """What the control process is told at its start."""
-
-    profile: Profile
-    excitation: Excitation
-    channels: ChannelSpecs
-    fast: bool
-    """Run under the virtual clock."""
 
 
 def main() -> None:

@@ -8,28 +8,20 @@ stopped, and closes the file itself.
 import contextlib
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.engine import signals
 from rigd.engine.board import Phase, Word
-from rigd.engine.channels import Channels, ChannelSpecs, attach_channels
+from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.events import EVENT_SIZE, read_events
+from rigd.engine.jobs import RecorderJob
 from rigd.engine.process import Message, Parent
 from rigd.session import SessionError, SessionWriter
 from rigd.session.format import SAMPLE_SIZE
 
 _BLOCK = 250
-_IDLE_S = 0.002
+_IDLE_S = 0.005
 _ORPHAN_PATIENCE_S = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderJob:
-    """What the recorder is told at its start."""
-
-    path: Path
-    channels: ChannelSpecs
 
 
 def main() -> None:

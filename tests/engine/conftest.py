@@ -10,8 +10,9 @@ from rigd.devices.registry import open_devices
 from rigd.engine.board import Phase, Word
 from rigd.engine.channels import create_channels
 from rigd.engine.clocks import VirtualClock
-from rigd.engine.control import ControlJob, conduct
+from rigd.engine.control import conduct
 from rigd.engine.events import read_events
+from rigd.engine.jobs import ControlJob
 from rigd.engine.ring import shared_memory_fd
 from rigd.engine.signals import StopRequest
 from rigd.excitation import chirp
