@@ -2,10 +2,10 @@
 
 import shutil
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+import typer
 
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
@@ -41,6 +41,9 @@ _PHASES = {
 # Uncompressed, with the controller's terms and the index; a file never takes more.
 _BYTES_PER_TICK = 180
 _BYTES_SPARE = 1_000_000
+
+
+Tell = Callable[[str], None]
 
 
 class ForegroundError(Exception):
@@ -90,7 +93,7 @@ def run_in_foreground(
     ForegroundError
         If a session is refused (wrong use) or cannot be run.
     """
-    console = Console(stderr=quiet_stdout, highlight=False, soft_wrap=True)
+    tell: Tell = partial(typer.echo, err=quiet_stdout)
     results: list[SessionResult] = []
     excitation: Excitation | None = None
     try:
@@ -100,7 +103,7 @@ def run_in_foreground(
                 if excitation is None:
                     excitation = build(profile.rig.rate_hz)
                     plan = plan_session(profile, excitation, force=force)
-                    _tell_plan(console, profile, excitation, plan)
+                    _tell_plan(tell, profile, excitation, plan)
                 if stop.requested:
                     break
                 _lay_out(crew, profile.rig.rate_hz)
@@ -113,10 +116,10 @@ def run_in_foreground(
                     notes=tuple((name, text) for name, text in notes.items() if text),
                 )
                 if live:
-                    console.print(start_live(crew, order))
-                with _ProgressView(console, excitation.reference_rad.size) as view:
+                    tell(start_live(crew, order))
+                with _ProgressView(excitation.reference_rad.size) as view:
                     results.append(run_session(order, crew, stop, view.update))
-            _tell_result(console, results[-1])
+            _tell_result(tell, results[-1])
             if not results[-1].went_well:
                 break
     except (
@@ -184,38 +187,41 @@ def _seeded(profile: Profile, number: int) -> Profile:
     return profile if simulation is None else with_seed(profile, simulation.seed + number)
 
 
-def _tell_plan(console: Console, profile: Profile, excitation: Excitation, plan: Plan) -> None:
+def _tell_plan(tell: Tell, profile: Profile, excitation: Excitation, plan: Plan) -> None:
     duration_s = excitation.reference_rad.size / profile.rig.rate_hz
     predicted, limits = plan.prediction, profile.limits
-    console.print(f"{excitation.kind} on {profile.name}: {duration_s:g} s of record.")
-    console.print(
+    tell(f"{excitation.kind} on {profile.name}: {duration_s:g} s of record.")
+    tell(
         f"Predicted peaks: angle {predicted.peak_angle_rad:.4f} of {limits.angle_rad:g} rad, "
         f"speed {predicted.peak_velocity_rad_s:.2f} of {limits.velocity_rad_s:g} rad/s, "
         f"torque {predicted.peak_torque_nm:.2f} of {profile.rig.motor.peak_torque_nm:g} N·m."
     )
     for warning in plan.warnings:
-        console.print(f"Warning: {warning}")
+        tell(f"Warning: {warning}")
 
 
-def _tell_result(console: Console, result: SessionResult) -> None:
+def _tell_result(tell: Tell, result: SessionResult) -> None:
     counts = (
         f"{result.scheduled} ticks scheduled = {result.recorded} recorded + {result.missed} "
         f"missed + {result.lost} lost; {result.late} late."
     )
     if result.path is None:
-        console.print(f"{result.outcome}: no record. {result.reason}")
+        tell(f"{result.outcome}: no record. {result.reason}")
     else:
-        console.print(f"{result.outcome}: {counts}{' ' + result.reason if result.reason else ''}")
+        tell(f"{result.outcome}: {counts}{' ' + result.reason if result.reason else ''}")
         if result.live_dropped:
-            console.print(f"The live view missed {result.live_dropped} samples; the file has them.")
-        console.print(str(result.path))
+            tell(f"The live view missed {result.live_dropped} samples; the file has them.")
+        tell(str(result.path))
 
 
 class _ProgressView:
     """One line that says how far the session is and how long it still takes."""
 
-    def __init__(self, console: Console, ticks: int) -> None:
-        self._console = console
+    def __init__(self, ticks: int) -> None:
+        # Only now: the processes of the session are on their way.
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -239,7 +245,9 @@ class _ProgressView:
         """Show where the session is, and what it has to say."""
         for event in events:
             if event.level in ("warning", "error", "fatal"):
-                self._console.print(f"{event.level.capitalize()}: {event.message}")
+                self._progress.console.print(
+                    f"{event.level.capitalize()}: {event.message}", markup=False, highlight=False
+                )
         self._progress.update(
             self._task,
             description=_PHASES[state.phase],

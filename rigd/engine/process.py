@@ -24,6 +24,7 @@ SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL
 and would disturb the loop."""
 _SIZE = struct.Struct("<Q")
 _WRITE_PATIENCE_S = 5.0
+_SILENT_GRACE_S = 1.0
 
 Message = dict[str, Any]
 
@@ -100,13 +101,23 @@ class Child:
                 self._process.stdin.close()
         for end in (self._process.terminate, self._process.kill):
             try:
-                self._process.wait(grace_s)
+                self._process.wait(_SILENT_GRACE_S if self._falls_silent(grace_s) else 0.0)
                 break
             except subprocess.TimeoutExpired:
                 end()
         self._process.wait()
         if self._process.stdout is not None:
             self._process.stdout.close()
+
+    def _falls_silent(self, patience_s: float) -> bool:
+        """Wait until its output ends, which is noticed at once; waiting for a process polls."""
+        deadline = time.monotonic() + patience_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            if select.select([self._stdout_fd], [], [], left_s)[0] and not os.read(
+                self._stdout_fd, 65536
+            ):
+                return True
+        return False
 
     @property
     def _stdout_fd(self) -> int:
