@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 demo: $(VENV)/ready
 	rm -rf demo
 	$(BIN)/rigd run chirp --profile sim --fast --output demo
-	$(BIN)/analyze demo/*.mcap --report demo/report --json demo/report/fits.json
+	$(BIN)/analyze demo/*.mcap --report demo/report
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto

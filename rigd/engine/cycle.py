@@ -86,10 +86,7 @@ class Cycle:
         flags = self.flags & ~_TORQUE_OFF
         watch = self.watch
         violation = watch.check(reference_rad, self.angle_rad, self.raw_wrench)
-        if flags & _STALE or self._were_stale:
-            stale = watch.check_stale(bool(flags & _ANGLE_STALE), bool(flags & _WRENCH_STALE))
-            violation = violation or stale
-            self._were_stale = bool(flags & _STALE)
+        violation = violation or self.check_stale()
         if violation is not None:
             self.torque_off()
             self.flags |= _LIMIT_WARNING
@@ -104,6 +101,14 @@ class Cycle:
             flags |= _TORQUE_SATURATED
         self.flags = flags
         return None
+
+    def check_stale(self) -> Violation | None:
+        """Say whether a device has been silent for too long, after the reading of a tick."""
+        flags = self.flags
+        if not (flags & _STALE or self._were_stale):
+            return None
+        self._were_stale = bool(flags & _STALE)
+        return self.watch.check_stale(bool(flags & _ANGLE_STALE), bool(flags & _WRENCH_STALE))
 
     def torque_off(self) -> None:
         """Zero the torque and disable the drive, whatever state it is in."""

@@ -270,6 +270,9 @@ class Procedure:
             metronome.wait()
             self._check_stop()
             cycle.observe(metronome.due_ns)
+            silent = cycle.check_stale()
+            if silent is not None:
+                raise SessionEnd("fault", str(silent))
             wrenches.append(cycle.raw_wrench)
             angles.append(cycle.angle_rad)
         return np.array(wrenches), np.array(angles)

@@ -185,7 +185,7 @@ def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
     session.assert_safe()
 
 
-@pytest.mark.parametrize("read", [1200, 1600, 3000])
+@pytest.mark.parametrize("read", [20, 1200, 1600, 3000])
 def test_an_encoder_that_falls_silent_does_not_let_the_motor_run_away(make_session, read):
     session = make_session()
     session.drive.stale_at = read
