@@ -246,7 +246,10 @@ class _ProgressView:
         for event in events:
             if event.level in ("warning", "error", "fatal"):
                 self._progress.console.print(
-                    f"{event.level.capitalize()}: {event.message}", markup=False, highlight=False
+                    f"{event.level.capitalize()}: {event.message}",
+                    markup=False,
+                    highlight=False,
+                    soft_wrap=True,
                 )
         self._progress.update(
             self._task,

@@ -9,10 +9,11 @@ from rigd.engine.board import Phase, Word
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.clocks import Clock, RealClock, VirtualClock
 from rigd.engine.cycle import Cycle
+from rigd.engine.events import Event, write_event
 from rigd.engine.jobs import ControlJob
 from rigd.engine.procedure import Procedure, SessionEnd
 from rigd.engine.process import Parent
-from rigd.engine.realtime import collect_no_garbage, obtain
+from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine.signals import StopRequest
 from rigd.profile import Profile
 from rigd.safety import LimitWatch
@@ -68,6 +69,7 @@ def conduct(
         _controller(job.profile),
         LimitWatch(job.profile.limits, rig.sensor.range, rig.rate_hz),
     )
+    _warn_of_refusals(channels, obtained)
     outcome, reason = "complete", ""
     recorded = False
     procedure: Procedure | None = None
@@ -101,6 +103,13 @@ def conduct(
     counts = asdict(procedure.counts) if procedure is not None else {}
     results = procedure.results if procedure is not None else {}
     parent.send(finished=outcome, reason=reason, counts=counts, results=results)
+
+
+def _warn_of_refusals(channels: Channels, obtained: dict[str, str]) -> None:
+    refused = [f"{name} ({text})" for name, text in obtained.items() if text.startswith(REFUSED)]
+    if refused:
+        message = f"The system did not grant {', '.join(refused)}: more ticks will be late."
+        write_event(channels.events, Event(0, "warning", message))
 
 
 def _controller(profile: Profile) -> PidController:

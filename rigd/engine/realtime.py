@@ -5,6 +5,9 @@ import gc
 import os
 from collections.abc import Callable
 
+REFUSED = "refused: "
+"""How the report on a setting begins that was not granted."""
+
 _MCL_CURRENT_AND_FUTURE = 3
 _PR_SET_TIMERSLACK = 29
 
@@ -48,7 +51,7 @@ def _attempt(setting: Callable[[], str]) -> str:
     try:
         return setting()
     except (OSError, AttributeError, ValueError) as error:
-        return f"refused: {error}"
+        return f"{REFUSED}{error}"
 
 
 def _lock_memory(libc: ctypes.CDLL) -> str:

@@ -108,6 +108,7 @@ class Session:
         self.board = self.channels.board
         self.parent = FakeParent()
         self.stop = StopRequest()
+        self.obtained = {}
         devices = open_devices(self.profile.rig)
         self.drive = WatchedDrive(devices.drive)
         self.devices = Devices(self.drive, devices.sensor, simulated=True)
@@ -116,7 +117,7 @@ class Session:
 
     def run(self):
         job = ControlJob(self.profile, self.excitation, self.channels.specs, fast=True)
-        conduct(job, self.devices, self.clock, self.channels, self.parent, self.stop, {})
+        conduct(job, self.devices, self.clock, self.channels, self.parent, self.stop, self.obtained)
         return self
 
     @property

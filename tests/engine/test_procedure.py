@@ -366,3 +366,12 @@ def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
     assert any("still swings" in event.message for event in session.events)
     assert not any(event.level == "warning" for event in session.events)
     assert "tare_drift_nm" not in session.finished["results"]
+
+
+def test_settings_that_were_not_granted_are_told_and_logged(make_session):
+    session = make_session()
+    session.obtained = {"clock": "real", "memory": "refused: no", "scheduling": "refused: never"}
+    session.run()
+    [warning] = [event for event in session.events if event.level == "warning"]
+    assert "memory (refused: no), scheduling (refused: never)" in warning.message
+    assert session.parent.messages[0]["realtime"] == session.obtained

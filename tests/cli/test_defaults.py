@@ -1,0 +1,39 @@
+"""The command line's defaults are the excitations' own."""
+
+import inspect
+
+import pytest
+
+from rigd import cli, excitation
+
+OTHER_NAMES = {
+    "amplitude": "amplitude_rad",
+    "duration": "duration_s",
+    "rest": "rest_s",
+    "ring_down": "ring_down_s",
+    "taper": "taper_s",
+    "period": "period_s",
+    "phase_seed": "seed",
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "function"),
+    [
+        (cli.chirp, excitation.chirp),
+        (cli.hold, excitation.hold),
+        (cli.step, excitation.step),
+        (cli.multisine, excitation.multisine),
+        (cli.file, excitation.from_csv),
+    ],
+)
+def test_defaults_agree(command, function):
+    options = {
+        OTHER_NAMES.get(name, name): parameter.default
+        for name, parameter in inspect.signature(command).parameters.items()
+    }
+    parameters = {
+        name: parameter.default
+        for name, parameter in inspect.signature(function).parameters.items()
+    }
+    assert options == parameters
