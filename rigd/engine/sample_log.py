@@ -96,6 +96,7 @@ class SampleLog:
             self.counts.late += 1
             self._board[Word.LATE] = self.counts.late
         t_ns = metronome.t_ns
+        fx, fy, fz, tx, ty, tz = cycle.wrench
         pack_sample_into(
             self._buffer,
             offset,
@@ -105,7 +106,12 @@ class SampleLog:
             cycle.angle_rad,
             cycle.torque_command_nm,
             cycle.coupling_torque_nm,
-            *cycle.wrench,
+            fx,
+            fy,
+            fz,
+            tx,
+            ty,
+            tz,
             flags,
             lateness_ns,
             self._clock.now_ns() - metronome.due_ns - lateness_ns,
