@@ -1,0 +1,242 @@
+"""The excitations that are computed: chirp, hold, step, random-phase multisine."""
+
+from collections.abc import Mapping
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.excitation.options import (
+    ExcitationError,
+    finite,
+    frequency,
+    not_negative,
+    positive,
+    whole_ticks,
+    within_a_turn,
+)
+from rigd.excitation.record import Excitation, assemble, lay_out_segments
+
+FloatArray = NDArray[np.float64]
+
+
+def chirp(
+    *,
+    rate_hz: float,
+    amplitude_rad: float = 0.025,
+    start_hz: float = 0.05,
+    stop_hz: float = 50.0,
+    duration_s: float = 120.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+    taper_s: float = 0.0,
+) -> Excitation:
+    """Linear sweep ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, t from the sweep's first tick.
+
+    The defaults are the paper's experiment (Section 5).
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    amplitude_rad
+        Amplitude A.
+    start_hz, stop_hz
+        Frequencies f0 at the sweep's first tick and f1 at its end; f1 < f0 sweeps downwards.
+    duration_s
+        Length T of the sweep.
+    rest_s, ring_down_s
+        Time before and after the sweep.
+    taper_s
+        Raised-cosine fade at both ends of the sweep; 0, as in the paper, leaves it as it is.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite, out of range, or does not fit the rate.
+    """
+    positive("amplitude_rad", amplitude_rad, "rad")
+    within_a_turn("amplitude_rad", amplitude_rad)
+    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    frequency("stop_hz", stop_hz, rate_hz)
+    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    t = _sweep_time(segments, rate_hz)
+    phase = 2.0 * pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2.0 * duration_s))
+    sweep = amplitude_rad * np.sin(phase) * _taper(t, duration_s, taper_s)
+    parameters = {
+        "amplitude_rad": amplitude_rad,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "taper_s": taper_s,
+    }
+    return assemble("chirp", parameters, rate_hz, segments, sweep)
+
+
+def hold(
+    *, rate_hz: float, duration_s: float = 10.0, rest_s: float = 1.0, ring_down_s: float = 0.0
+) -> Excitation:
+    """Hold the start angle, for noise and drift.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite or out of range.
+    """
+    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    parameters = {"duration_s": duration_s, "rest_s": rest_s, "ring_down_s": ring_down_s}
+    sweep = np.zeros(segments["sweep"][1] - segments["sweep"][0])
+    return assemble("hold", parameters, rate_hz, segments, sweep)
+
+
+def step(
+    *,
+    rate_hz: float,
+    amplitude_rad: float = 0.025,
+    duration_s: float = 10.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+) -> Excitation:
+    """Step by ``amplitude_rad`` (either sign) at the sweep's first tick.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite or out of range.
+    """
+    finite("amplitude_rad", amplitude_rad, "rad")
+    if amplitude_rad == 0.0:
+        raise ExcitationError(
+            "amplitude_rad = 0 rad is no step; give an angle other than zero, or use hold."
+        )
+    within_a_turn("amplitude_rad", amplitude_rad)
+    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    parameters = {
+        "amplitude_rad": amplitude_rad,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+    }
+    sweep = np.full(segments["sweep"][1] - segments["sweep"][0], amplitude_rad)
+    return assemble("step", parameters, rate_hz, segments, sweep)
+
+
+def multisine(
+    *,
+    rate_hz: float,
+    amplitude_rad: float = 0.025,
+    start_hz: float = 0.05,
+    stop_hz: float = 50.0,
+    period_s: float = 20.0,
+    duration_s: float = 120.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+    taper_s: float = 0.0,
+    seed: int = 0,
+) -> Excitation:
+    """Random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
+
+    The period is turned so that it begins at its smallest magnitude (a shift in time: the
+    spectrum's magnitude stays flat), and scaled to the peak ``amplitude_rad``. The crest factor
+    reached, peak over rms, is reported in ``parameters["crest_factor"]``.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    amplitude_rad
+        Largest magnitude of the reference.
+    start_hz, stop_hz
+        The band.
+    period_s
+        Period; a whole number of ticks, and of it a whole number makes ``duration_s``.
+    duration_s
+        Length of the sweep segment.
+    rest_s, ring_down_s
+        Time before and after it.
+    taper_s
+        Raised-cosine fade at both ends of the whole sweep; the periods in it are then not equal.
+    seed
+        Of the phases: equal seeds give equal references.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is not finite, out of range, or does not fit the others.
+    """
+    positive("amplitude_rad", amplitude_rad, "rad")
+    within_a_turn("amplitude_rad", amplitude_rad)
+    frequency("start_hz", start_hz, rate_hz, zero_allowed=True)
+    frequency("stop_hz", stop_hz, rate_hz)
+    positive("period_s", period_s, "s")
+    if seed < 0:
+        raise ExcitationError(f"seed = {seed} is negative; give a whole number from 0 on.")
+    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    ticks = whole_ticks("period_s", period_s, rate_hz)
+    periods = round(duration_s / period_s)
+    if periods < 1 or abs(periods * period_s - duration_s) > 1e-9 * duration_s:
+        raise ExcitationError(
+            f"duration_s = {duration_s:g} s is not a whole number of periods of "
+            f"period_s = {period_s:g} s; choose for example {max(periods, 1) * period_s:g} s."
+        )
+    period = amplitude_rad * _random_phase_period(ticks, period_s, (start_hz, stop_hz), seed)
+    crest_factor = amplitude_rad / float(np.sqrt(np.mean(period**2)))
+    t = _sweep_time(segments, rate_hz)
+    sweep = np.tile(period, periods) * _taper(t, duration_s, taper_s)
+    parameters = {
+        "amplitude_rad": amplitude_rad,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "period_s": period_s,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "taper_s": taper_s,
+        "seed": seed,
+        "crest_factor": crest_factor,
+    }
+    return assemble("multisine", parameters, rate_hz, segments, sweep)
+
+
+def _random_phase_period(
+    ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
+) -> FloatArray:
+    """One period of every harmonic in the band, shape (ticks,), of peak 1, from near zero on."""
+    frequency_hz = np.arange(1, ticks // 2) / period_s
+    tolerance_hz = 1e-9 * band_hz[1]
+    inside = (frequency_hz >= band_hz[0] - tolerance_hz) & (
+        frequency_hz <= band_hz[1] + tolerance_hz
+    )
+    harmonics = 1 + np.flatnonzero(inside)
+    if harmonics.size == 0:
+        raise ExcitationError(
+            f"No harmonic of period_s = {period_s:g} s lies between start_hz = {band_hz[0]:g} Hz "
+            f"and stop_hz = {band_hz[1]:g} Hz; take a longer period or a wider band."
+        )
+    spectrum = np.zeros(ticks // 2 + 1, dtype=complex)
+    phases = 2 * pi * np.random.default_rng(seed).random(harmonics.size)
+    spectrum[harmonics] = np.exp(1j * phases)
+    period: FloatArray = np.fft.irfft(spectrum, ticks)
+    period = np.roll(period, -int(np.argmin(np.abs(period))))
+    period /= np.max(np.abs(period))
+    return period
+
+
+def _sweep_time(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
+    first, end = segments["sweep"]
+    return np.arange(end - first) / rate_hz
+
+
+def _taper(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
+    not_negative("taper_s", taper_s)
+    if taper_s == 0.0:
+        return 1.0
+    if 2.0 * taper_s > duration_s:
+        raise ExcitationError(
+            f"taper_s = {taper_s:g} s at both ends does not fit into duration_s = "
+            f"{duration_s:g} s; choose at most {duration_s / 2:g} s."
+        )
+    edge = np.minimum(t, duration_s - t) / taper_s
+    return 0.5 - 0.5 * np.cos(pi * np.minimum(edge, 1.0))
