@@ -1,8 +1,10 @@
 """The command line of the rig: ``rigd``."""
 
 import inspect
+import io
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -43,9 +45,11 @@ Taper = Annotated[float, typer.Option("--taper", help="Fade in and out over this
 
 def main() -> None:
     """Entry point of ``rigd``."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that does not know "·" or "²" gets a "?" instead of an error.
-        stream.reconfigure(errors="replace")  # type: ignore[union-attr]
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         app()
     except KeyboardInterrupt:
@@ -118,7 +122,14 @@ def run_sessions(
     stop.catch()
     os.environ.update(SINGLE_THREADED)
     # Before anything else: its processes import while this one does, and while it plans.
-    crew = Crew(live=live)
+    try:
+        crew = Crew(live=live)
+    except OSError as error:
+        _fail(
+            f"The processes of a session cannot be started ({error.strerror}); look at the limits "
+            "of open files and of shared memory (/dev/shm).",
+            EXIT_FAILED,
+        )
     from rigd.foreground import ForegroundError, run_in_foreground
 
     try:
@@ -137,11 +148,13 @@ def run_sessions(
             quiet_stdout=as_json,
         )
     except ForegroundError as error:
+        if as_json and error.results:
+            _write_json(error.results)
         _fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
     finally:
         ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
     if as_json:
-        typer.echo(json.dumps({"sessions": [_as_json(result) for result in results]}))
+        _write_json(results)
     if stop.requested:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not all(result.went_well for result in results):
@@ -287,6 +300,13 @@ def info(
     except SessionError as error:
         _fail(str(error), EXIT_FAILED)
     typer.echo(json.dumps(found.as_dict()) if as_json else "\n".join(found.lines()))
+
+
+def _write_json(results: "list[SessionResult]") -> None:
+    try:
+        typer.echo(json.dumps({"sessions": [_as_json(result) for result in results]}))
+    except OSError as error:
+        _fail(f"The JSON document cannot be written ({error.strerror}).", EXIT_FAILED)
 
 
 def _as_json(result: "SessionResult") -> dict[str, object]:

@@ -28,6 +28,9 @@ from rigd.session.writer import PART_SUFFIX
 _POLL_S = 0.05
 _PATIENCE_S = 5.0
 _LIVE_PATIENCE_S = 10.0
+_SLOW_PATIENCE_S = 30.0
+"""For connecting devices and for switching them off, which may take its time."""
+_TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
 
 class SessionFailedError(Exception):
@@ -102,7 +105,8 @@ def run_session(order: Order, crew: Crew, stop: StopRequest, watcher: Watcher) -
     Raises
     ------
     SessionFailedError
-        If the file cannot be opened or written, or a process died; the drive is then disabled.
+        If the file cannot be opened or written, or a process died. The drive is off when the
+        crew has been left; :func:`what_is_kept` then tells what there is of the session.
     """
     session = _Session(order, crew, watcher)
     stop.on_request = session.stop
@@ -110,10 +114,8 @@ def run_session(order: Order, crew: Crew, stop: StopRequest, watcher: Watcher) -
         session.stop()
     try:
         return session.run()
-    except (ChildError, SessionFailedError) as error:
-        part = order.path.with_name(order.path.name + PART_SUFFIX)
-        kept = f" What was recorded is in {part}." if part.exists() else ""
-        raise SessionFailedError(f"{error} The drive is disabled.{kept}") from None
+    except ChildError as error:
+        raise SessionFailedError(str(error)) from None
     finally:
         stop.on_request = _nothing
 
@@ -147,21 +149,23 @@ class _Session:
     def _listen_to_control(self) -> Message:
         """Wait for the control process's next message, watching the others meanwhile."""
         recorder_lost: str | None = None
-        deadline: float | None = None
+        deadline, phase = 0.0, -1
         while True:
             try:
                 answer = self._crew.control.poll(_POLL_S)
             except ChildError as error:
                 return self._control_died(str(error))
             self._report()
-            if self._board[Word.STOP] != Stop.NO:
-                deadline = deadline or time.monotonic() + _PATIENCE_S
-                if answer is None and time.monotonic() > deadline:
-                    # It hangs: a drive's own watchdog is all that is left, and this calls it.
-                    self._crew.control.kill()
-                    return self._control_died(
-                        f"The control process did not stop within {_PATIENCE_S:g} s and was killed."
-                    )
+            if self._board[Word.STOP] == Stop.NO or self._board[Word.PHASE] != phase:
+                phase = self._board[Word.PHASE]
+                patience_s = _PATIENCE_S if phase in _TORQUE_PHASES else _SLOW_PATIENCE_S
+                deadline = time.monotonic() + patience_s
+            elif answer is None and time.monotonic() > deadline:
+                # It hangs: a drive's own watchdog is all that is left, and this calls it.
+                self._crew.control.kill()
+                return self._control_died(
+                    f"The control process did not stop within {patience_s:g} s and was killed."
+                )
             if answer is not None:
                 if recorder_lost is not None:
                     raise SessionFailedError(recorder_lost)
@@ -288,6 +292,14 @@ def start_live(crew: Crew, order: Order) -> str:
     if "url" in answer:
         return f"Live view: {answer['url']}"
     return f"No live view: {answer['error']} The session goes on without it."
+
+
+def what_is_kept(path: Path) -> str:
+    """Say what there is of a session that failed, once its processes have ended."""
+    part = path.with_name(path.name + PART_SUFFIX)
+    if part.exists():
+        return f"What was recorded is in {part}."
+    return f"Its file is {path}." if path.exists() else "There is no file of it."
 
 
 def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:

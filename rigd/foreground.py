@@ -1,7 +1,8 @@
 """Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
 
+import contextlib
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from rigd.daemon import (
     choose_path,
     run_session,
     start_live,
+    what_is_kept,
     with_seed,
 )
 from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
@@ -49,9 +51,13 @@ Tell = Callable[[str], None]
 class ForegroundError(Exception):
     """No session, or no further one; the message is for the operator."""
 
-    def __init__(self, message: str, *, wrong_use: bool) -> None:
+    def __init__(
+        self, message: str, *, wrong_use: bool, results: Sequence[SessionResult] = ()
+    ) -> None:
         super().__init__(message)
         self.wrong_use = wrong_use
+        self.results = list(results)
+        """The sessions before."""
 
 
 def run_in_foreground(
@@ -93,7 +99,8 @@ def run_in_foreground(
     ForegroundError
         If a session is refused (wrong use) or cannot be run.
     """
-    tell: Tell = partial(typer.echo, err=quiet_stdout)
+    tell: Tell = partial(_tell, err=quiet_stdout)
+    path: Path | None = None
     results: list[SessionResult] = []
     excitation: Excitation | None = None
     try:
@@ -108,10 +115,11 @@ def run_in_foreground(
                     break
                 _lay_out(crew, profile.rig.rate_hz)
                 _make_room(folder, excitation)
+                path = choose_path(folder, excitation.kind, number + 1 if repeat > 1 else None)
                 order = Order(
                     profile=_seeded(profile, number),
                     excitation=excitation,
-                    path=choose_path(folder, excitation.kind, number + 1 if repeat > 1 else None),
+                    path=path,
                     fast=fast,
                     notes=tuple((name, text) for name, text in notes.items() if text),
                 )
@@ -132,8 +140,14 @@ def run_in_foreground(
     ) as error:
         raise ForegroundError(str(error), wrong_use=True) from error
     except SessionFailedError as error:
-        raise ForegroundError(str(error), wrong_use=False) from error
+        kept = "" if path is None else f" The drive is disabled. {what_is_kept(path)}"
+        raise ForegroundError(f"{error}{kept}", wrong_use=False, results=results) from error
     return results
+
+
+def _tell(text: str, *, err: bool) -> None:
+    with contextlib.suppress(OSError):  # the terminal is gone; the session is not
+        typer.echo(text, err=err)
 
 
 def _lay_out(crew: Crew, rate_hz: float) -> None:
@@ -235,14 +249,20 @@ class _ProgressView:
         self._task = self._progress.add_task("preparing", total=ticks, counts="")
 
     def __enter__(self) -> "_ProgressView":
-        self._progress.start()
+        with contextlib.suppress(OSError):
+            self._progress.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        with contextlib.suppress(OSError):
+            self._progress.stop()
 
     def update(self, state: SessionProgress, events: list[Event]) -> None:
         """Show where the session is, and what it has to say."""
+        with contextlib.suppress(OSError):
+            self._show(state, events)
+
+    def _show(self, state: SessionProgress, events: list[Event]) -> None:
         for event in events:
             if event.level in ("warning", "error", "fatal"):
                 self._progress.console.print(

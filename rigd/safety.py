@@ -132,6 +132,8 @@ class LimitWatch:
         reference_rad: float,
         angle_rad: float,
         wrench: tuple[float, float, float, float, float, float],
+        *,
+        angle_stale: bool = False,
     ) -> Violation | None:
         """Check one tick's readings, before they are used.
 
@@ -141,6 +143,8 @@ class LimitWatch:
             Relative to the rig's zero.
         wrench
             fx, fy, fz (N), tx, ty, tz (N·m).
+        angle_stale
+            The angle is an old one: no speed is taken from it.
 
         Returns
         -------
@@ -149,8 +153,12 @@ class LimitWatch:
         """
         moved = angle_rad - self._previous_angle_rad
         elapsed = self._elapsed
-        self._previous_angle_rad = angle_rad
-        self._elapsed = 1
+        if angle_stale:
+            # The next new angle will have moved over this tick as well.
+            self._elapsed = elapsed + 1
+        else:
+            self._previous_angle_rad = angle_rad
+            self._elapsed = 1
         a, e, v = self._angle_warning, self._error_warning, self._step_warning * elapsed
         w0, w1, w2, w3, w4, w5 = self._wrench_warnings
         fx, fy, fz, tx, ty, tz = wrench

@@ -56,6 +56,7 @@ class Cycle:
         self.torque_command_nm = 0.0
         self.flags = _TORQUE_OFF
         self._were_stale = False
+        self._commanding = False
 
     def observe(self, due_ns: int) -> None:
         """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
@@ -85,7 +86,12 @@ class Cycle:
         self.observe(due_ns)
         flags = self.flags & ~_TORQUE_OFF
         watch = self.watch
-        violation = watch.check(reference_rad, self.angle_rad, self.raw_wrench)
+        violation = watch.check(
+            reference_rad,
+            self.angle_rad,
+            self.raw_wrench,
+            angle_stale=bool(flags & _ANGLE_STALE),
+        )
         violation = violation or self.check_stale()
         if violation is not None:
             self.torque_off()
@@ -95,6 +101,7 @@ class Cycle:
             flags |= _LIMIT_WARNING
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
+        self._commanding = True
         self._drive.command(torque_nm)
         self.torque_command_nm = torque_nm
         if controller.saturated:
@@ -111,8 +118,10 @@ class Cycle:
         return self.watch.check_stale(bool(flags & _ANGLE_STALE), bool(flags & _WRENCH_STALE))
 
     def torque_off(self) -> None:
-        """Zero the torque and disable the drive, whatever state it is in."""
-        self._drive.disable()
+        """Zero the torque and disable the drive, once: a real one takes its time."""
+        if self._commanding:
+            self._commanding = False
+            self._drive.disable()
         self.torque_command_nm = 0.0
         self.flags |= _TORQUE_OFF
 

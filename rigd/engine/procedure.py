@@ -26,6 +26,7 @@ _SETTLE_S = 0.5
 _LOOK_EVERY = 64
 """Ticks between two looks at whether everybody is still there and keeps up."""
 _GO_POLL_S = 0.0002
+_GO_PATIENCE_S = 10.0
 _SWINGING = 2.0
 """Spread of the torque after a session, over that before it, from which on the beam is swinging."""
 
@@ -78,6 +79,8 @@ class Procedure:
         self._metronome = Metronome(clock, self._rate_hz)
         late_ns = int(profile.realtime.late_us * 1000)
         self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
+        # Made a list now: of a long session that takes many periods.
+        self._relative_reference: list[float] = excitation.reference_rad.tolist()
         self._start_angle_rad = 0.0
         self._rest_spread_nm = 0.0
         self.counts = self._log.counts
@@ -139,9 +142,20 @@ class Procedure:
             self._tick(self._start_angle_rad)
 
     def wait_for_go(self) -> None:
-        """Go on holding until the recorder is ready; virtual time stands still meanwhile."""
+        """Go on holding until the recorder is ready; virtual time stands still meanwhile.
+
+        Raises
+        ------
+        SessionEnd
+            If nobody says so in time: the supervisor may be there and yet do nothing.
+        """
         self._board[Word.PHASE] = Phase.READY
+        deadline = time.monotonic() + _GO_PATIENCE_S
         while not self._board[Word.GO]:
+            if time.monotonic() > deadline:
+                raise SessionEnd(
+                    "fault", f"The supervisor did not start the record within {_GO_PATIENCE_S:g} s."
+                )
             if self._clock.virtual:
                 self._check_stop()
                 time.sleep(_GO_POLL_S)
@@ -154,9 +168,10 @@ class Procedure:
         Raises
         ------
         SessionEnd
-            If it ends early. The last sample is then one with the torque off.
+            If it ends early. The last sample is then one with the torque off, unless the record
+            ends in ticks that were missed or lost.
         """
-        reference = (self._start_angle_rad + self._excitation.reference_rad).tolist()
+        reference, start_rad = self._relative_reference, self._start_angle_rad
         total = len(reference)
         metronome, cycle, log, board = self._metronome, self._cycle, self._log, self._board
         counts, virtual, signals = self.counts, self._clock.virtual, self._stop
@@ -187,16 +202,17 @@ class Procedure:
             ):
                 end = self._stop_reason()
             if end is None:
-                end = self._step(reference[tick])
+                end = self._step(start_rad + reference[tick])
             else:
                 self._observe_switched_off()
-            log.write(tick, reference[tick], missed, wait=virtual or end is not None)
+            wait = virtual or end is not None
+            log.write(tick, start_rad + reference[tick], missed, wait=wait)
             scheduled[0] = tick + 1
             last_ns = metronome.t_ns + metronome.lateness_ns
             if last < 0:
                 first_ns = last_ns
             last = tick
-        counts.scheduled = last + 1
+        counts.scheduled = scheduled[0] = last + 1
         if counts.lost and end is None:
             end = self._stop_reason()
         if end is not None:

@@ -50,7 +50,7 @@ class Child:
         self.name = name
         with held_back():
             self._process = subprocess.Popen(
-                [sys.executable, "-m", module],
+                [sys.executable, "-m", module, str(os.getpid())],
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -170,13 +170,16 @@ class LineReader:
 
 
 class Parent:
-    """The supervisor, as a child sees it."""
+    """The supervisor, as a child sees it; its process id is the child's only argument.
+
+    (Asking for the parent at the start would be too late for one that has died already.)
+    """
 
     def __init__(self) -> None:
         # Read without a buffer: what follows the job must stay in the pipe for select to see it.
         self._fd = sys.stdin.fileno()
         self._lines = LineReader(self._fd)
-        self._pid = os.getppid()
+        self._pid = int(sys.argv[1])
 
     def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
         """Wait for the job; ends the process quietly if the supervisor ends without one."""

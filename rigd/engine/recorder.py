@@ -61,6 +61,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
             recorder.header = message["begin"]
             parent.send(armed=True)
         elif "close" in message:
+            recorder.transfer()
             if not recorder.begun:
                 writer.discard()
                 parent.send(discarded=True)

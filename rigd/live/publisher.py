@@ -27,6 +27,9 @@ _STUCK_S = 20
 def main() -> None:
     """Run as ``python -m rigd.live.publisher``."""
     signals.ignore(but=(signal.SIGTERM,))
+    # The watchdog's signal works whatever this process was started with.
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))
     # What the SDK has to say about a server that is gone is no news to the operator.
     os.environ["RUST_LOG"] = "off"
     parent = Parent()

@@ -11,6 +11,9 @@ import pytest
 
 from rigd.session import Status, read_controls, read_session
 
+# Sessions in real time share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
 SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")
 
 
@@ -240,6 +243,30 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, tmp_path, victim, 
     else:
         assert part.exists()
         assert "recorder process was killed" in output + errors
+
+
+def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, tmp_path):
+    process = start_rigd("run", "hold", "--json", "--duration", "1", "--repeat", "3")
+    wait_for(lambda: list(tmp_path.glob("sessions/*-01.mcap")))
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*-02.mcap.part"), None))
+    wait_for(lambda: part.stat().st_size > 1000)
+    os.kill(child_of(process.pid, "rigd.engine.recorder"), signal.SIGKILL)
+    output, errors = process.communicate(timeout=30)
+    assert process.returncode == 1
+    (session,) = json.loads(output)["sessions"]
+    assert session["outcome"] == "complete"
+    assert str(part.name) in errors
+
+
+def test_a_long_record_starts_without_a_gap(start_rigd, tmp_path):
+    process = start_rigd("run", "hold", "--duration", "3600", "--rest", "0")
+    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    wait_for(lambda: part.stat().st_size > 30_000)
+    to_one(process, signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130, errors
+    (path,) = tmp_path.glob("sessions/*.mcap")
+    assert read_session(path).samples["tick"][0] <= 2
 
 
 def test_a_dead_supervisor_ends_the_session_safely(start_rigd, tmp_path):

@@ -123,3 +123,18 @@ def test_a_fresh_reading_starts_the_count_of_stale_ones_again(watch):
         assert watch.check_stale(True, False) is None
         assert watch.check_stale(False, True) is None
         assert watch.check_stale(False, False) is None
+
+
+def test_the_speed_after_stale_angles_is_taken_over_all_of_the_time(watch):
+    """A shaft at 9 of 10 rad/s, of which three angles do not arrive."""
+    step = 9.0 / 1000
+    watch.reset(0.0)
+    assert watch.check(0.0, step, REST) is None
+    for _ in range(3):
+        assert watch.check(0.0, step, REST, angle_stale=True) is None
+    assert watch.check(0.0, 5 * step, REST) is None
+    watch.reset(0.0)
+    assert watch.check(0.0, step, REST, angle_stale=True) is None
+    faster = watch.check(0.0, 2.5 * step, REST)
+    assert faster is not None
+    assert faster.channel == "speed"

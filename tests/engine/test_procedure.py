@@ -205,7 +205,10 @@ def test_an_encoder_that_falls_silent_does_not_let_the_motor_run_away(make_sessi
 
 def test_single_stale_angles_are_held_and_flagged(make_session):
     session = make_session()
+    # Two in a row, and fast: at 0.16 rad/s the new angle after them is no overspeed either.
     stale = set(range(2000, 5000, 10)) | set(range(2001, 5000, 10))
+    limits = replace(session.profile.limits, velocity_rad_s=1.0)
+    session.profile = replace(session.profile, limits=limits)
     type(session.drive).angle_stale, kept = (
         property(lambda drive: drive.reads in stale),
         type(session.drive).angle_stale,
@@ -375,3 +378,25 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
     assert session.parent.messages[0]["realtime"] == session.obtained
+
+
+def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):
+    monkeypatch.setattr("rigd.engine.procedure._GO_PATIENCE_S", 0.2)
+    session = make_session()
+    session.board[Word.GO] = 0
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert "did not start the record" in session.finished["reason"]
+    assert session.finished["counts"]["scheduled"] == 0
+
+
+def test_the_drive_is_disabled_once_by_the_cycle_and_once_more_at_the_end(make_session):
+    session = make_session()
+    session.clock = StopAt(3_000_000_000, session.stop.request)
+    calls = []
+    disable = session.drive.disable
+    session.drive.disable = lambda: (calls.append(1), disable())
+    session.run()
+    session.assert_safe()
+    assert len(calls) == 2

@@ -74,7 +74,7 @@ class Publisher:
     def __init__(self, ring: Ring, linger_s: float = 0.0, **environment: str) -> None:
         self.board = Board.create(shared_memory_fd())
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "rigd.live.publisher"],
+            [sys.executable, "-m", "rigd.live.publisher", str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

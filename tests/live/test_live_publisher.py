@@ -16,6 +16,9 @@ from rigd.engine.board import Board
 from rigd.engine.ring import shared_memory_fd
 from rigd.live.job import LiveJob
 
+# Sessions in real time share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 LISTENING = "0A"
 
@@ -165,8 +168,8 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(
         [
             sys.executable,
             "-c",
-            "import subprocess, sys; child = subprocess.Popen("
-            "[sys.executable, '-m', 'rigd.live.publisher'], stdin=0, stdout=1, "
+            "import os, subprocess, sys; child = subprocess.Popen("
+            "[sys.executable, '-m', 'rigd.live.publisher', str(os.getpid())], stdin=0, stdout=1, "
             f"pass_fds={fds}); sys.stderr.write(f'{{child.pid}}\\n'); child.wait()",
         ],
         stdin=subprocess.PIPE,
@@ -266,7 +269,7 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
 
 def test_no_job_means_no_work():
     publisher = subprocess.run(
-        [sys.executable, "-m", "rigd.live.publisher"],
+        [sys.executable, "-m", "rigd.live.publisher", str(os.getpid())],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         check=True,

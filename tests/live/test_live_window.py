@@ -11,6 +11,9 @@ import pytest
 
 from rigd.view import PLOTS, WINDOW_S
 
+# Sessions in real time share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 
 
