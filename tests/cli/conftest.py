@@ -49,4 +49,4 @@ def start_rigd(tmp_path):
     yield start
     for process in started:
         process.kill()
-        process.communicate()
+        print(*process.communicate())  # what it said, where a test failed without asking

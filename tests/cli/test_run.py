@@ -18,7 +18,7 @@ SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", 
 
 
 def the_session(done):
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     (session,) = json.loads(done.stdout)["sessions"]
     return session
 

@@ -87,6 +87,12 @@ class FakeParent:
         return self.living
 
 
+def strict(profile):
+    """The limits on missed ticks that a rig would have."""
+    limits = replace(profile.limits, missed_ticks_in_a_row=50, missed_percent=2.0)
+    return replace(profile, limits=limits)
+
+
 class Session:
     """One session, run to its end in this process.
 
@@ -94,7 +100,7 @@ class Session:
     """
 
     def __init__(self, clock=None, profile=None, excitation=None):
-        self.profile = profile or load_profile("sim")
+        self.profile = profile or strict(load_profile("sim"))
         self.excitation = excitation or chirp(
             rate_hz=self.profile.rig.rate_hz,
             duration_s=4.0,
