@@ -49,4 +49,5 @@ def start_rigd(tmp_path):
     yield start
     for process in started:
         process.kill()
-        print(*process.communicate())  # what it said, where a test failed without asking
+        # What it said helps where a test failed without asking.
+        sys.stdout.write("\n".join(process.communicate()))
