@@ -48,9 +48,8 @@ class Word(IntEnum):
     MISSED = 5
     LATE = 6
     LOST = 7
-    PUBLISHED = 8
     # Written by the live publisher
-    LIVE_DROPPED = 9
+    LIVE_DROPPED = 8
 
 
 class Board:
