@@ -7,7 +7,7 @@ import signal
 def main() -> None:
     """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    from rigd.cli import main as run
+    from rigd.cli.app import main as run
 
     run()
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _GRACE_S = 5.0
 _LIVE_GRACE_S = 2.0
-_DESCRIPTORS = 4
+_DESCRIPTORS = 5
 
 
 class Crew:

@@ -225,6 +225,11 @@ class _Session:
             "tool_inertia_kg_m2": repr(rig.sensor.tool_inertia_kg_m2),
             "angle_delay_s": repr(rig.encoder.delay_s),
             "torque_delay_s": repr(rig.sensor.delay_s),
+            "actuation_delay_s": repr(rig.actuation.delay_s),
+            "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
+            "drive": rig.devices.drive,
+            "sensor": rig.devices.sensor,
+            "simulated": str(ready["simulated"]).lower(),
             "profile": order.profile.name,
             "software": f"rigd {__version__}",
             "host": platform.node(),
@@ -232,7 +237,13 @@ class _Session:
             **ready["ready"],
             **dict(order.notes),
         }
-        if rig.simulation is not None:
+        if rig.acquisition is not None:
+            metadata["acquisition_mode"] = rig.acquisition.mode
+            metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
+        if rig.ati_serial is not None:
+            metadata["sensor_filter"] = rig.ati_serial.filter
+            metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+        if rig.devices.drive == "sim" and rig.simulation is not None:
             metadata["simulation_seed"] = str(rig.simulation.seed)
         return {
             "metadata": metadata,

@@ -22,7 +22,7 @@ from rigd.daemon import (
     what_is_kept,
     with_seed,
 )
-from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
+from rigd.devices.registry import Reality, UnknownDeviceError, check_selection, reality
 from rigd.engine.board import Phase
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
@@ -74,6 +74,7 @@ def run_in_foreground(
     live: bool,
     force: bool,
     quiet_stdout: bool,
+    prepare: Callable[[Profile], Profile] | None = None,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
 
@@ -93,6 +94,8 @@ def run_in_foreground(
         As on the command line. Each session of a series has its own seed, counted up.
     quiet_stdout
         Tell the operator on standard error, because standard output is for a document.
+    prepare
+        Changes the profile before it is planned with.
 
     Raises
     ------
@@ -104,7 +107,11 @@ def run_in_foreground(
     results: list[SessionResult] = []
     excitation: Excitation | None = None
     try:
-        profile = _load(profile_name, fast=fast, seed=seed)
+        profile, moving = _load(profile_name, fast=fast, seed=seed)
+        if prepare is not None:
+            profile = prepare(profile)
+        if moving in (Reality.SIMULATOR, Reality.LOCK_STEP):
+            tell(f"No hardware: {profile.name} is simulated ({moving.value}).")
         for number in range(repeat):
             with crew if number == 0 else Crew(live=live) as crew:
                 if excitation is None:
@@ -177,23 +184,24 @@ def _make_room(folder: Path, excitation: Excitation) -> None:
         )
 
 
-def _load(name: str, *, fast: bool, seed: int | None) -> Profile:
+def _load(name: str, *, fast: bool, seed: int | None) -> tuple[Profile, Reality]:
     profile = load_profile(name)
     check_selection(profile.rig.devices)
-    simulated = is_simulated(profile.rig.devices)
-    if fast and not simulated:
+    moving = reality(profile.rig)
+    if fast and not moving.any_clock:
         raise RefusedError(
-            f"--fast: the rig of {profile.path} is real, and real time cannot be skipped; leave "
-            "the option out."
+            f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
+            "skipped; leave the option out."
+            + (" Or start rigd simulate with --lock-step." if moving is Reality.SIMULATOR else "")
         )
     if seed is not None:
-        if profile.rig.simulation is None:
+        if moving is not Reality.SIMULATED:
             raise RefusedError(
-                f"--seed: the rig of {profile.path} is real, its noise has no seed; leave the "
-                "option out."
+                f"--seed: the noise of {moving.value} of {profile.path} is not made here; leave "
+                "the option out."
             )
         profile = with_seed(profile, seed)
-    return profile
+    return profile, moving
 
 
 def _seeded(profile: Profile, number: int) -> Profile:

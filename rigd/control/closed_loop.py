@@ -89,6 +89,20 @@ class LoopResponse:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Cut:
+    """A signal at which the loop can be opened: it is read from the state and acts on the next.
+
+    Of the closed loop's matrix, ``outer(action, reading)`` is the part that goes through it.
+    """
+
+    name: str
+    action: Real
+    """(n,): what one unit of the signal adds to the next state."""
+    reading: Real
+    """(n,): the signal is ``reading · x``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ClosedLoop:
     """``x[k+1] = a x[k] + b r[k]``, ``y[k] = c x[k] + d r[k]`` from the reference.
 
@@ -106,6 +120,8 @@ class ClosedLoop:
     """(5,)."""
     model: LoopModel
     """What it was made of."""
+    cuts: tuple[Cut, ...]
+    """The torque command, the angle and the coupling torque as the controller reads them."""
     poles_rad_s: Complex
     """Its modes as poles in continuous time, the fastest growing (or slowest decaying) first."""
 
@@ -237,22 +253,33 @@ def close_loop(model: LoopModel) -> ClosedLoop:
 
     a = np.zeros((n + 4, n + 4))
     b = np.zeros(n + 4)
-    measured = np.zeros(n + 4)
-    measured[:n] = plant.measured_angle
+    measured_angle, measured_torque, command = np.zeros((3, n + 4))
+    measured_angle[:n] = plant.measured_angle
+    measured_torque[:n] = plant.measured_torque
+    command[:n] = plant.b
 
     # The integral carries Ki T/2 of the last error, the derivative its decayed last step.
-    torque = -(kp + 0.5 * ki_t + gain_d) * measured
-    torque[:n] += settings.feedforward_gain * plant.measured_torque
-    torque[[integral, derivative]] = 1.0
+    torque_from_angle = -(kp + 0.5 * ki_t + gain_d)
     torque_from_reference = kp * b_p + 0.5 * ki_t + gain_d * b_d
+    torque = torque_from_angle * measured_angle + settings.feedforward_gain * measured_torque
+    torque[[integral, derivative]] = 1.0
+
+    from_angle = torque_from_angle * command
+    from_angle[integral] = -ki_t
+    from_angle[derivative] = -(decay_d - 1.0) * gain_d
+    cuts = (
+        Cut("torque command", command, torque),
+        Cut("angle reading", from_angle, measured_angle),
+        Cut("torque reading", settings.feedforward_gain * command, measured_torque),
+    )
 
     a[:n, :n] = plant.a
     a[:n] += np.outer(plant.b, torque)
     b[:n] = plant.b * torque_from_reference
-    a[integral] = -ki_t * measured
+    a[integral] = -ki_t * measured_angle
     a[integral, integral] += 1.0
     b[integral] = ki_t
-    a[derivative] = -(decay_d - 1.0) * gain_d * measured
+    a[derivative] = -(decay_d - 1.0) * gain_d * measured_angle
     a[derivative, derivative] += decay_d
     b[derivative] = (decay_d - 1.0) * gain_d * b_d
 
@@ -275,7 +302,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     eigenvalues = np.linalg.eigvals(a).astype(complex)
     # Delays leave eigenvalues at zero: they have died out after a few ticks.
     poles = np.log(eigenvalues[np.abs(eigenvalues) > _DEAD]) * model.rate_hz
-    return ClosedLoop(a, b, c, d, model, poles[np.argsort(-poles.real)])
+    return ClosedLoop(a, b, c, d, model, cuts, poles[np.argsort(-poles.real)])
 
 
 def check_stability(loop: ClosedLoop) -> str | None:

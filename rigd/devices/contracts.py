@@ -26,6 +26,8 @@ class Drive(Protocol):
 
     angle_stale: bool
     """The last angle read is not the one of the last latch."""
+    angle_time_ns: int
+    """When the last angle read was latched, as far as the host knows; ``time.monotonic_ns``."""
 
     def connect(self) -> None:
         """Open the line and verify identity and configuration; no torque.
@@ -51,8 +53,14 @@ class Drive(Protocol):
     def read_angle(self) -> float:
         """Return the latched angle in rad, at the output shaft."""
 
-    def command(self, torque_nm: float) -> None:
-        """Set the torque in N·m at the output shaft, held until the next command."""
+    def command(self, torque_nm: float) -> float:
+        """Set the torque in N·m at the output shaft, held until the next command.
+
+        Returns
+        -------
+        float
+            The torque as it was sent: what the drive's steps and limits make of it.
+        """
 
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises."""
@@ -66,6 +74,8 @@ class WrenchSensor(Protocol):
 
     wrench_stale: bool
     """The last wrench read is not the answer to the last request."""
+    wrench_time_ns: int
+    """When the last wrench read was asked for, or arrived if it is streamed; likewise."""
     wrench_saturated: bool
     """An axis of the last wrench is at the end of its range."""
 

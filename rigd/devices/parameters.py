@@ -4,7 +4,7 @@ The ranges (``Gt``, ``Ge``, …) are enforced where a profile is loaded (:mod:`r
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen
 
@@ -78,6 +78,108 @@ class Selection:
 
 
 @dataclass(frozen=True, slots=True)
+class CanBus:
+    """The CAN bus that the devices share, as python-can names it."""
+
+    interface: Annotated[str, MinLen(1)]
+    """"socketcan", or another interface of python-can."""
+    channel: Annotated[str, MinLen(1)]
+    bitrate_bit_s: Annotated[int, Ge(10_000), Le(1_000_000)]
+
+
+@dataclass(frozen=True, slots=True)
+class Acquisition:
+    """Which replies a tick works with."""
+
+    mode: Literal["same_tick", "previous_tick"]
+    """A tick waits for the replies to its own requests, or takes those of the tick before."""
+    deadline_us: Annotated[float, Gt(0)]
+    """How long after its start a tick waits for its own replies; then the last ones stand."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoDrive:
+    """A CiA 402 drive on CANopen, in cyclic synchronous torque mode."""
+
+    node_id: Annotated[int, Ge(1), Le(127)]
+    vendor_id: Annotated[int, Ge(0), Le(0xFFFFFFFF)]
+    """Identity object 1018:1 as it has to be; 0 accepts any."""
+    product_code: Annotated[int, Ge(0), Le(0xFFFFFFFF)]
+    """1018:2; 0 accepts any."""
+    direction: Annotated[int, Ge(-1), Le(1)]
+    """1, or -1 where the drive counts and pushes the other way round."""
+    gear_ratio: Positive
+    """Motor turns per turn of the output shaft; only to compare 6076 with the rated torque."""
+    rated_torque_unit_nm: NonNegative
+    """What one count of 6076 is, at the motor's shaft; 0 does not compare it."""
+    torque_delivery: Literal["at_sync", "on_arrival"]
+    """When a torque takes effect: RPDO of type 1, or of type 255."""
+    heartbeat_period_s: Annotated[float, Gt(0), Le(1)]
+    """How often the loop sends its own heartbeat."""
+    heartbeat_timeout_s: Annotated[float, Gt(0), Le(5)]
+    """After how long without it the drive acts (object 1016)."""
+    drive_heartbeat_period_s: Annotated[float, Gt(0), Le(1)]
+    """Object 1017 of the drive."""
+    drive_heartbeat_timeout_s: Annotated[float, Gt(0), Le(5)]
+    """After how long without the drive's heartbeat the loop stops."""
+    host_node_id: Annotated[int, Ge(1), Le(127)]
+    """Of this computer's own heartbeat."""
+    abort_option: Annotated[int, Ge(0), Le(3)]
+    """Object 6007, what the drive does on a lost connection: 1 fault, 2 disable, 3 quick stop."""
+    communication_error_option: Annotated[int, Ge(0), Le(2)]
+    """Object 1029:1: 0 to pre-operational, 1 no change, 2 stopped."""
+    enable_timeout_s: Annotated[float, Gt(0), Le(10)]
+    """How long each step up to operation enabled may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class AtiCan:
+    """An ATI sensor behind a NETCANOEM box."""
+
+    base_id: Annotated[int, Ge(0), Le(0x7F)]
+    """The seven upper bits of its CAN identifiers."""
+    calibration: Annotated[int, Ge(0), Le(15)]
+    """Index of the active calibration."""
+    serial_number: str
+    """As the sensor has to answer; empty accepts any."""
+    saturation_counts: Annotated[int, Gt(0), Le(32767)]
+    """Magnitude of a raw gauge from which on the sensor is saturated."""
+
+
+@dataclass(frozen=True, slots=True)
+class AtiSerial:
+    """An ATI Digital F/T sensor on a serial line."""
+
+    port: Annotated[str, MinLen(1)]
+    baud: Annotated[int, Gt(0)]
+    stream_hz: Positive
+    """Records a second that the sensor streams."""
+    filter: Literal["mean", "triangle"]
+    """Of the records down to one a tick: mean of one tick's, or triangle over two ticks'."""
+    calibration: Annotated[int, Ge(1), Le(16)]
+    """Number of the calibration block that is loaded."""
+    serial_number: str
+    """As the sensor has to answer; empty accepts any."""
+    saturation_counts: Annotated[int, Gt(0), Le(32767)]
+    """Magnitude of a raw gauge from which on the sensor is saturated."""
+
+    def records_per_tick(self, rate_hz: float) -> int:
+        """Whole number of records that belong to one tick."""
+        return max(1, round(self.stream_hz / rate_hz))
+
+    def weights(self, rate_hz: float) -> tuple[float, ...]:
+        """Return the decimating filter, oldest record first; the weights sum to one."""
+        n = self.records_per_tick(rate_hz)
+        if self.filter == "mean":
+            return (1.0 / n,) * n
+        return tuple((n - abs(n - 1 - i)) / n**2 for i in range(2 * n - 1))
+
+    def filter_delay_s(self, rate_hz: float) -> float:
+        """Group delay of the decimating filter, behind the newest record."""
+        return 0.5 * (len(self.weights(rate_hz)) - 1) / self.stream_hz
+
+
+@dataclass(frozen=True, slots=True)
 class RigParameters:
     """Everything a driver may need to know of the rig it belongs to."""
 
@@ -90,3 +192,10 @@ class RigParameters:
     actuation: Actuation
     devices: Selection
     simulation: Simulation | None = field(default=None)
+    name: str = "rig"
+    """Of the profile: by it a driver finds the simulated rig that stands in for this one."""
+    can: CanBus | None = field(default=None)
+    acquisition: Acquisition | None = field(default=None)
+    cia402: ServoDrive | None = field(default=None)
+    ati_can: AtiCan | None = field(default=None)
+    ati_serial: AtiSerial | None = field(default=None)

@@ -2,19 +2,39 @@
 
 import importlib
 from collections.abc import Callable
+from enum import Enum
+from types import ModuleType
 from typing import cast
 
 from rigd.devices.contracts import Devices
 from rigd.devices.parameters import RigParameters, Selection
+from rigd.devices.simulator import find_simulator
 
-# A simulated drive and a simulated sensor share one plant, so drivers are opened by the pair.
+# Drive and sensor share a plant or a bus, so drivers are opened by the pair.
 _OPENERS = {
     Selection(drive="sim", sensor="sim"): ("rigd.sim.devices", "open_simulated_rig"),
+    Selection(drive="cia402", sensor="ati_can"): ("rigd.devices.wired_rig", "open_wired_rig"),
+    Selection(drive="cia402", sensor="ati_serial"): ("rigd.devices.wired_rig", "open_wired_rig"),
 }
 
 
 class UnknownDeviceError(ValueError):
     """A profile names drivers that do not exist or do not belong together."""
+
+
+class Reality(Enum):
+    """What moves when a rig is opened now."""
+
+    HARDWARE = "the hardware"
+    SIMULATED = "the simulated rig"
+    """In the process that opens it, under whatever clock."""
+    SIMULATOR = "rigd simulate, by the clock"
+    LOCK_STEP = "rigd simulate, in lock-step"
+
+    @property
+    def any_clock(self) -> bool:
+        """Whether time may be skipped."""
+        return self in (Reality.SIMULATED, Reality.LOCK_STEP)
 
 
 def check_selection(selection: Selection) -> None:
@@ -33,9 +53,19 @@ def check_selection(selection: Selection) -> None:
         )
 
 
-def is_simulated(selection: Selection) -> bool:
-    """Whether nothing real moves, so that the virtual clock may be used."""
-    return selection.drive == "sim"
+def reality(rig: RigParameters) -> Reality:
+    """Tell what would move if the devices of a rig were opened now."""
+    if rig.devices.drive == "sim":
+        return Reality.SIMULATED
+    simulator = find_simulator(rig.name)
+    if simulator is None:
+        return Reality.HARDWARE
+    return Reality.LOCK_STEP if simulator.lock_step else Reality.SIMULATOR
+
+
+def simulator() -> ModuleType:
+    """Return the module that puts a simulated rig on the wire."""
+    return importlib.import_module("rigd.sim.wire.simulate")
 
 
 def open_devices(rig: RigParameters) -> Devices:
@@ -45,6 +75,8 @@ def open_devices(rig: RigParameters) -> Devices:
     ------
     UnknownDeviceError
         If the profile names drivers that do not exist.
+    DeviceError
+        If the profile contradicts what these drivers can do.
     """
     check_selection(rig.devices)
     module, name = _OPENERS[rig.devices]

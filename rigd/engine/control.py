@@ -81,7 +81,12 @@ def conduct(
         tare = procedure.tare()
         devices.drive.enable()
         procedure.hold()
-        parent.send(ready=tare, calibration=calibration, realtime=obtained)
+        parent.send(
+            ready=tare,
+            calibration=calibration,
+            realtime=obtained,
+            simulated=devices.simulated,
+        )
         procedure.wait_for_go()
         procedure.record()
         recorded = True
@@ -113,7 +118,7 @@ def _warn_of_refusals(channels: Channels, obtained: dict[str, str]) -> None:
 
 
 def _controller(profile: Profile) -> PidController:
-    motor = profile.rig.motor
+    motor = profile.control_motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
 

@@ -28,6 +28,8 @@ class Cycle:
 
     Attributes
     ----------
+    devices
+        As given.
     angle_rad, raw_wrench, wrench, coupling_torque_nm
         The last readings; wrench and torque are tared, the raw wrench is not.
     torque_command_nm
@@ -43,6 +45,7 @@ class Cycle:
         controller: PidController,
         watch: LimitWatch,
     ) -> None:
+        self.devices = devices
         self._drive = devices.drive
         self._sensor = devices.sensor
         self._projection = projection
@@ -102,8 +105,7 @@ class Cycle:
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
         self._commanding = True
-        self._drive.command(torque_nm)
-        self.torque_command_nm = torque_nm
+        self.torque_command_nm = self._drive.command(torque_nm)
         if controller.saturated:
             flags |= _TORQUE_SATURATED
         self.flags = flags

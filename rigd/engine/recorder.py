@@ -100,11 +100,14 @@ class _Recorder:
         controls = self._channels.controls.take(_BLOCK)
         if controls:
             self._writer.write_controls(controls)
+        timings = self._channels.timings.take(_BLOCK)
+        if timings:
+            self._writer.write_timings(timings)
         samples = self._channels.samples.take(_BLOCK)
         if samples:
             self._writer.write_samples(samples)
             self._recorded += len(samples) // SAMPLE_SIZE
-        return bool(samples or controls or len(events) >= 16 * EVENT_SIZE)
+        return bool(samples or controls or timings or len(events) >= 16 * EVENT_SIZE)
 
     def close(self, outcome: Mapping[str, str]) -> tuple[Path, dict[str, int]]:
         while self.transfer():

@@ -8,7 +8,13 @@ from rigd.engine.channels import CONTROL_DECIMATION, Channels
 from rigd.engine.clocks import Clock
 from rigd.engine.cycle import Cycle
 from rigd.engine.metronome import Metronome
-from rigd.session.format import Status, pack_control_into, pack_sample_into
+from rigd.engine.ring import Ring
+from rigd.session.format import (
+    Status,
+    pack_control_into,
+    pack_sample_into,
+    pack_timing_into,
+)
 
 _AFTER_MISSED = int(Status.AFTER_MISSED)
 _AFTER_LOST = int(Status.AFTER_LOST)
@@ -29,7 +35,7 @@ class Counts:
 
 
 class SampleLog:
-    """Writes a sample for each tick, and the controller's terms for every tenth.
+    """Writes sample and ages for each tick, and the controller's terms for every tenth.
 
     Parameters
     ----------
@@ -60,6 +66,8 @@ class SampleLog:
         self._ring = channels.samples
         self._buffer = channels.samples.buffer
         self._terms_ring = channels.controls
+        # Under the virtual clock no reading has an age.
+        self._timing_ring = None if clock.virtual else channels.timings
         self._board = channels.board
         self._late_ns = late_ns
         self.counts = Counts()
@@ -117,8 +125,25 @@ class SampleLog:
             self._clock.now_ns() - metronome.due_ns - lateness_ns,
         )
         ring.publish()
+        if self._timing_ring is not None:
+            self._write_ages(self._timing_ring, tick, t_ns)
         if tick % CONTROL_DECIMATION == 0:
             self._write_terms(tick, t_ns)
+
+    def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
+        offset = ring.slot()
+        if offset < 0:
+            return  # As with the terms.
+        due_ns, devices = self._metronome.due_ns, self._cycle.devices
+        pack_timing_into(
+            ring.buffer,
+            offset,
+            t_ns,
+            tick,
+            (due_ns - devices.drive.angle_time_ns) * 1e-9,
+            (due_ns - devices.sensor.wrench_time_ns) * 1e-9,
+        )
+        ring.publish()
 
     def _write_terms(self, tick: int, t_ns: int) -> None:
         ring, terms = self._terms_ring, self._cycle.controller

@@ -18,6 +18,8 @@ _UNITS = {
     "_kg_m2": "kg·m²",
     "_n_m2": "N·m²",
     "_percent": "%",
+    "_counts": "counts",
+    "_bit_s": "bit/s",
     "_rad_s": "rad/s",
     "_rad": "rad",
     "_nm": "N·m",
@@ -88,9 +90,6 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         )
     except ControlDesignError as error:
         yield str(error)
-    simulated = "sim" in (values["devices.drive"], values["devices.sensor"])
-    if simulated and "simulation.seed" not in values:
-        yield "section [simulation] is missing, which the simulated devices of [devices] need."
 
 
 def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
@@ -159,7 +158,9 @@ def wrong(detail: ErrorDetails) -> str:
         place = []
     where = f"{key}[{place[0]}]" if place else str(key)
     what = f"{where} = {_show(detail['input'])}{_unit(str(key))}"
-    if detail["type"] in _RANGES:
+    if detail["type"] == "literal_error":
+        remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')
+    elif detail["type"] in _RANGES:
         name, words = _RANGES[detail["type"]]
         remedy = f"must be {words} {detail['ctx'][name]:g}"
         if str(key).startswith("beam.damping."):

@@ -10,18 +10,19 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd.devices.parameters import RigParameters
-from rigd.profile import complaints
+from rigd.profile import complaints, wiring
 from rigd.profile.settings import (
     OPTIONAL_SECTIONS,
     SECTIONS,
     SOURCES,
     Profile,
     fields_of,
+    is_text,
     keys,
 )
 
@@ -65,6 +66,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
     values = _validate(values, problems)
     if not problems:
         problems.extend(complaints.contradictions(values))
+        problems.extend(wiring.contradictions(values))
     if problems:
         # An array that is too short is found once for each number it lacks.
         raise ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
@@ -85,6 +87,12 @@ def load_profile(name_or_path: str | Path) -> Profile:
             actuation=section["actuation"],
             devices=section["devices"],
             simulation=section.get("simulation"),
+            name=values["name"],
+            can=section.get("can"),
+            acquisition=section.get("acquisition"),
+            cia402=section.get("cia402"),
+            ati_can=section.get("ati_can"),
+            ati_serial=section.get("ati_serial"),
         ),
         control=section["control"],
         limits=section["limits"],
@@ -145,7 +153,7 @@ def _flatten(
 
 def _is_number(key: str) -> bool:
     """Whether a key takes a number, or six; unknown keys take nothing."""
-    return key in keys() and str not in get_args(keys()[key])
+    return key in keys() and not is_text(keys()[key])
 
 
 def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:

@@ -4,18 +4,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, MinLen
 
 from rigd.beam import Beam, Damping
 from rigd.control import ControlSettings, LoopModel
 from rigd.devices.parameters import (
+    Acquisition,
     Actuation,
+    AtiCan,
+    AtiSerial,
+    CanBus,
     Encoder,
     Motor,
     RigParameters,
     Selection,
+    ServoDrive,
     Simulation,
     WrenchSensor,
 )
@@ -70,9 +75,21 @@ SECTIONS: dict[str, type] = {
     "session": SessionSettings,
     "realtime": RealtimeSettings,
     "devices": Selection,
+    "can": CanBus,
+    "acquisition": Acquisition,
+    "cia402": ServoDrive,
+    "ati_can": AtiCan,
+    "ati_serial": AtiSerial,
     "simulation": Simulation,
 }
-OPTIONAL_SECTIONS = ("simulation",)
+WIRING = {
+    "cia402": ("can", "acquisition", "cia402"),
+    "ati_can": ("can", "acquisition", "ati_can"),
+    "ati_serial": ("acquisition", "ati_serial"),
+    "sim": ("simulation",),
+}
+"""The sections that a device of ``[devices]`` needs and that no other rig needs to have."""
+OPTIONAL_SECTIONS = tuple(dict.fromkeys(name for names in WIRING.values() for name in names))
 TEXTS = ("name", "description")
 SOURCES = ("paper", "datasheet", "measured", "assumed")
 
@@ -88,6 +105,13 @@ def keys() -> dict[str, Any]:
         hints = get_type_hints(cls, include_extras=True)
         types |= {key: hints[field] for key, field in fields_of(section)}
     return types
+
+
+def is_text(annotation: Any) -> bool:  # noqa: ANN401
+    """Whether a key of this type takes text, which has no source; all others take numbers."""
+    if get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
+    return annotation is str or get_origin(annotation) is Literal
 
 
 def fields_of(section: str) -> list[tuple[str, str]]:
@@ -113,6 +137,13 @@ class Profile:
     realtime: RealtimeSettings
     sources: Mapping[str, str]
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
+    design_motor: Motor | None = None
+    """The motor that the controller is designed for, where that is not the profile's."""
+
+    @property
+    def control_motor(self) -> Motor:
+        """The motor as the controller takes it."""
+        return self.design_motor or self.rig.motor
 
     def loop_model(self) -> LoopModel:
         """Return what the closed loop's design and prediction need to know of this rig."""
@@ -121,8 +152,8 @@ class Profile:
             rate_hz=rig.rate_hz,
             beam=rig.beam,
             damping=rig.damping,
-            motor_inertia_kg_m2=rig.motor.inertia_kg_m2,
-            viscous_nm_s_per_rad=rig.motor.viscous_nm_s_per_rad,
+            motor_inertia_kg_m2=self.control_motor.inertia_kg_m2,
+            viscous_nm_s_per_rad=self.control_motor.viscous_nm_s_per_rad,
             tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
             actuation_delay_s=rig.actuation.delay_s,
             angle_delay_s=rig.encoder.delay_s,

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rigd.session.errors import SessionError, SessionExistsError
     from rigd.session.format import SAMPLE_DTYPE, SAMPLE_SIZE, Status
     from rigd.session.info import SessionInfo, describe
-    from rigd.session.reader import Event, Session, read_controls, read_session
+    from rigd.session.reader import Event, Session, read_controls, read_session, read_timings
     from rigd.session.writer import SessionWriter
 
 __all__ = [
@@ -27,13 +27,14 @@ __all__ = [
     "describe",
     "read_controls",
     "read_session",
+    "read_timings",
 ]
 
 _HOMES = {
     "errors": ("SessionError", "SessionExistsError"),
     "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "Status"),
     "info": ("SessionInfo", "describe"),
-    "reader": ("Event", "Session", "read_controls", "read_session"),
+    "reader": ("Event", "Session", "read_controls", "read_session", "read_timings"),
     "writer": ("SessionWriter",),
 }
 

@@ -1,10 +1,10 @@
 """Byte layout of the messages of a session file: packing for the loop, decoding for the reader.
 
-Every message of ``/rig/sample`` and ``/rig/control`` is protobuf of *fixed layout*: all fields are
-``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the order below, and all are written,
-zero or not. Tags are then constant bytes and every message is equally long, so one
-``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of them, and it is still
-what any protobuf decoder understands.
+Every message of ``/rig/sample``, ``/rig/control`` and ``/rig/timing`` is protobuf of *fixed
+layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the order below,
+and all are written, zero or not. Tags are then constant bytes and every message is equally long, so
+one ``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of them, and it is
+still what any protobuf decoder understands.
 
 The control process imports this module: numpy and the standard library only.
 """
@@ -48,6 +48,14 @@ CONTROL_TYPES: Final[dict[str, str]] = {
     "unlimited_torque_nm": "double",
 }
 """Fields of ``rigd.Control`` with their protobuf types; the first has number 1."""
+
+TIMING_TYPES: Final[dict[str, str]] = {
+    "t_ns": "sfixed64",
+    "tick": "fixed32",
+    "angle_age_s": "double",
+    "wrench_age_s": "double",
+}
+"""Fields of ``rigd.Timing`` with their protobuf types; the first has number 1."""
 
 _NUMPY_TYPES: Final = {"sfixed64": "<i8", "fixed32": "<u4", "double": "<f8"}
 _WIRE_TYPES: Final = {"sfixed64": 1, "fixed32": 5, "double": 1}  # of the protobuf encoding
@@ -107,8 +115,16 @@ CONTROL_WIRE_DTYPE: Final = _wire_dtype(CONTROL_TYPES)
 """A control message as it stands in the file: each field after its tag byte ``tag_NAME``."""
 CONTROL_SIZE: Final = CONTROL_WIRE_DTYPE.itemsize
 
+TIMING_FIELDS: Final = tuple(TIMING_TYPES)
+TIMING_DTYPE: Final = _native_dtype(TIMING_TYPES)
+"""A decoded message of the readings' ages."""
+TIMING_WIRE_DTYPE: Final = _wire_dtype(TIMING_TYPES)
+"""A timing message as it stands in the file: each field after its tag byte ``tag_NAME``."""
+TIMING_SIZE: Final = TIMING_WIRE_DTYPE.itemsize
+
 _pack_sample: Final = struct.Struct("<Bq BI" + "Bd" * 10 + "BI" * 3).pack_into
 _pack_control: Final = struct.Struct("<Bq BI" + "Bd" * 6).pack_into
+_pack_timing: Final = struct.Struct("<Bq BI" + "Bd" * 2).pack_into
 
 
 def pack_sample_into(
@@ -175,13 +191,25 @@ def pack_control_into(
     # fmt: on
 
 
+def pack_timing_into(
+    buffer: bytearray | memoryview,
+    offset: int,
+    t_ns: int,
+    tick: int,
+    angle_age_s: float,
+    wrench_age_s: float,
+) -> None:
+    """Write one timing message of ``TIMING_SIZE`` bytes into `buffer` at `offset`."""
+    _pack_timing(buffer, offset, 0x09, t_ns, 0x15, tick, 0x19, angle_age_s, 0x21, wrench_age_s)
+
+
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
     """Tell which messages have every tag of the fixed layout in its place.
 
     Parameters
     ----------
     wire : array (n,) of a wire dtype
-    types : ``SAMPLE_TYPES`` or ``CONTROL_TYPES``
+    types : ``SAMPLE_TYPES``, ``CONTROL_TYPES`` or ``TIMING_TYPES``
 
     Returns
     -------
@@ -241,3 +269,8 @@ def decode_samples(block: Buffer) -> npt.NDArray[np.void]:
 def decode_controls(block: Buffer) -> npt.NDArray[np.void]:
     """Decode consecutive control messages of the fixed layout, as `decode_samples` does."""
     return _decode(block, CONTROL_TYPES, CONTROL_WIRE_DTYPE, CONTROL_DTYPE)
+
+
+def decode_timings(block: Buffer) -> npt.NDArray[np.void]:
+    """Decode consecutive timing messages of the fixed layout, as `decode_samples` does."""
+    return _decode(block, TIMING_TYPES, TIMING_WIRE_DTYPE, TIMING_DTYPE)

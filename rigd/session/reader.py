@@ -19,6 +19,9 @@ from rigd.session.format import (
     SAMPLE_DTYPE,
     SAMPLE_TYPES,
     SAMPLE_WIRE_DTYPE,
+    TIMING_DTYPE,
+    TIMING_TYPES,
+    TIMING_WIRE_DTYPE,
     is_fixed_layout,
     to_native,
 )
@@ -32,6 +35,8 @@ from rigd.session.schema import (
     FORMAT_VERSION,
     SAMPLE_SCHEMA,
     SAMPLE_TOPIC,
+    TIMING_SCHEMA,
+    TIMING_TOPIC,
     message_class,
     schema_data,
 )
@@ -86,6 +91,16 @@ _CONTROLS: Final = _Layout(
     ("t_ns", "tick"),
     _record_dtype(CONTROL_WIRE_DTYPE),
     CONTROL_DTYPE,
+)
+
+
+_TIMINGS: Final = _Layout(
+    TIMING_TOPIC,
+    TIMING_SCHEMA,
+    TIMING_TYPES,
+    ("t_ns", "tick"),
+    _record_dtype(TIMING_WIRE_DTYPE),
+    TIMING_DTYPE,
 )
 
 
@@ -190,6 +205,21 @@ def read_session(path: Path) -> Session:
     )
 
 
+def read_timings(path: Path) -> npt.NDArray[np.void]:
+    """Read the ages of the readings of a session file.
+
+    Returns
+    -------
+    array (n,) of ``TIMING_DTYPE``; empty if the file has none
+
+    Raises
+    ------
+    SessionError
+        As `read_session` does.
+    """
+    return _decode_topic(path, _load(path, (TIMING_TOPIC,)), _TIMINGS)
+
+
 def read_controls(path: Path) -> npt.NDArray[np.void]:
     """Read the controller's terms of a session file.
 
@@ -202,8 +232,7 @@ def read_controls(path: Path) -> npt.NDArray[np.void]:
     SessionError
         As `read_session` does.
     """
-    contents = _load(path, (CONTROL_TOPIC,))
-    return _decode_topic(path, contents, _CONTROLS)
+    return _decode_topic(path, _load(path, (CONTROL_TOPIC,)), _CONTROLS)
 
 
 def _quoted(text: str) -> str:

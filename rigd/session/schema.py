@@ -7,7 +7,7 @@ and everything it refers to.
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Final
 
-from rigd.session.format import CONTROL_TYPES, SAMPLE_TYPES
+from rigd.session.format import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
@@ -17,10 +17,12 @@ FORMAT_VERSION: Final = "1"
 
 SAMPLE_TOPIC: Final = "/rig/sample"
 CONTROL_TOPIC: Final = "/rig/control"
+TIMING_TOPIC: Final = "/rig/timing"
 EVENT_TOPIC: Final = "/rig/event"
 
 SAMPLE_SCHEMA: Final = "rigd.Sample"
 CONTROL_SCHEMA: Final = "rigd.Control"
+TIMING_SCHEMA: Final = "rigd.Timing"
 EVENT_SCHEMA: Final = "foxglove.Log"
 
 EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
@@ -80,7 +82,7 @@ def _event_file() -> "FileDescriptorProto":
 
 @cache
 def schema_data(schema_name: str) -> bytes:
-    """Return the serialised ``FileDescriptorSet`` of one of the three schemas of a session file."""
+    """Return the serialised ``FileDescriptorSet`` of one of the four schemas of a session file."""
     from google.protobuf import timestamp_pb2
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
@@ -89,7 +91,11 @@ def schema_data(schema_name: str) -> bytes:
         timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
         files = [timestamp, _event_file()]
     else:
-        types = {SAMPLE_SCHEMA: SAMPLE_TYPES, CONTROL_SCHEMA: CONTROL_TYPES}[schema_name]
+        types = {
+            SAMPLE_SCHEMA: SAMPLE_TYPES,
+            CONTROL_SCHEMA: CONTROL_TYPES,
+            TIMING_SCHEMA: TIMING_TYPES,
+        }[schema_name]
         files = [_fixed_layout_file(schema_name, types)]
     return FileDescriptorSet(file=files).SerializeToString(deterministic=True)
 

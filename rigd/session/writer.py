@@ -19,6 +19,8 @@ from rigd.session.format import (
     CONTROL_WIRE_DTYPE,
     SAMPLE_SIZE,
     SAMPLE_WIRE_DTYPE,
+    TIMING_SIZE,
+    TIMING_WIRE_DTYPE,
     Buffer,
 )
 from rigd.session.mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
@@ -31,6 +33,8 @@ from rigd.session.schema import (
     FORMAT_VERSION,
     SAMPLE_SCHEMA,
     SAMPLE_TOPIC,
+    TIMING_SCHEMA,
+    TIMING_TOPIC,
     event_class,
     schema_data,
 )
@@ -140,6 +144,7 @@ class SessionWriter:
         self.part = path.with_name(path.name + PART_SUFFIX)
         self._samples = bytearray()
         self._controls = bytearray()
+        self._timings = bytearray()
         self._events: list[tuple[int, bytes]] = []  # log_time, message
         self._event_count = 0
         self._start_utc_ns = 0
@@ -217,6 +222,9 @@ class SessionWriter:
             self._control_channel = mcap.add_channel(
                 CONTROL_TOPIC, CONTROL_SCHEMA, schema_data(CONTROL_SCHEMA)
             )
+            self._timing_channel = mcap.add_channel(
+                TIMING_TOPIC, TIMING_SCHEMA, schema_data(TIMING_SCHEMA)
+            )
             self._event_channel = mcap.add_channel(
                 EVENT_TOPIC, EVENT_SCHEMA, schema_data(EVENT_SCHEMA)
             )
@@ -243,6 +251,12 @@ class SessionWriter:
         They share a chunk with the samples of the same time if they are written before these.
         """
         self._controls += self._checked(block, CONTROL_SIZE)
+        with self._explained():
+            self._sync_when_due()
+
+    def write_timings(self, block: Buffer) -> None:
+        """Take n × ``TIMING_SIZE`` bytes of packed ages, as `write_controls` does."""
+        self._timings += self._checked(block, TIMING_SIZE)
         with self._explained():
             self._sync_when_due()
 
@@ -345,18 +359,25 @@ class SessionWriter:
     def _write_chunk(self, *, everything: bool) -> None:
         """Write the messages at hand as a chunk.
 
-        Controls of samples that have not arrived wait for them, unless `everything` is to go.
+        Messages beside samples that have not arrived wait for them, unless `everything` is to go.
         """
         mcap = self._begun()
         samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
         controls = np.frombuffer(self._controls, CONTROL_WIRE_DTYPE)
+        timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
         if not everything:
-            until = int(np.searchsorted(controls["t_ns"], samples["t_ns"][-1], side="right"))
-            controls = controls[:until]
+            controls, timings = (
+                beside[: np.searchsorted(beside["t_ns"], samples["t_ns"][-1], side="right")]
+                for beside in (controls, timings)
+            )
         parts: list[bytes] = []
         indexes: dict[int, npt.NDArray[np.void]] = {}
         offset = 0
-        for channel, wire in ((self._sample_channel, samples), (self._control_channel, controls)):
+        for channel, wire in (
+            (self._sample_channel, samples),
+            (self._control_channel, controls),
+            (self._timing_channel, timings),
+        ):
             if len(wire):
                 records = _fixed_records(wire, channel, self._start_utc_ns)
                 parts.append(records.tobytes())
@@ -374,6 +395,7 @@ class SessionWriter:
             self._dirty = True
         self._samples = bytearray()
         self._controls = self._controls[controls.nbytes :]
+        self._timings = self._timings[timings.nbytes :]
         self._events = []
 
     def _sync_when_due(self) -> None:

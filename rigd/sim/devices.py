@@ -1,11 +1,14 @@
 """Drive and sensor of the simulated rig: what the plant does, as the devices would show it.
 
-The drive's latch, which comes first in a tick, moves the plant on to it; periods that the loop
+The drive's latch, which comes first in a tick, moves the rig on to it; periods that the loop
 missed pass with the last torque held, as they do on a real rig.
 """
 
+from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
+from operator import mul
 
 import numpy as np
 
@@ -18,28 +21,78 @@ _NOISE_BLOCK = 4096
 
 def open_simulated_rig(rig: RigParameters) -> Devices:
     """Make the devices of a simulated rig; a seed gives the same noise again."""
-    if rig.simulation is None:
-        raise DeviceError(
-            'The profile has no section [simulation], which drive = "sim" needs; copy it from '
-            "hw_profiles/sim.toml."
-        )
-    plant = SimulatedPlant(rig)
+    simulated = SimulatedRig(rig)
     return Devices(
-        drive=SimulatedDrive(plant, rig.encoder.resolution_rad, rig.rate_hz),
-        sensor=SimulatedSensor(plant, rig.sensor, rig.simulation),
-        simulated=True,
+        drive=SimulatedDrive(simulated, rig.rate_hz), sensor=simulated.sensor, simulated=True
     )
+
+
+class SimulatedRig:
+    """Plant, encoder and sensor, moved on period by period.
+
+    A sensor that streams is sampled several times a period; then the plant goes in steps of its
+    records.
+
+    Parameters
+    ----------
+    rig
+        With a section ``simulation``; its delays are those of the plant and of the readings.
+
+    Attributes
+    ----------
+    plant, sensor
+        What moves, and what measures it.
+    records_per_period : int
+        Readings of the sensor in one period.
+    """
+
+    def __init__(self, rig: RigParameters) -> None:
+        if rig.simulation is None:
+            raise DeviceError(
+                "The profile has no section [simulation], which a simulated rig needs; copy it "
+                "from hw_profiles/sim.toml."
+            )
+        weights: tuple[float, ...] = (1.0,)
+        self.records_per_period = 1
+        if rig.ati_serial is not None:
+            weights = rig.ati_serial.weights(rig.rate_hz)
+            self.records_per_period = rig.ati_serial.records_per_tick(rig.rate_hz)
+            # The filter's own delay is part of what the profile states; the rest is the sensor's.
+            rest_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)
+            rig = replace(rig, sensor=replace(rig.sensor, delay_s=max(0.0, rest_s)))
+        rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
+        assert rig.simulation is not None
+        self.plant = SimulatedPlant(rig)
+        self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, weights)
+        self._resolution_rad = rig.encoder.resolution_rad
+
+    def advance(self, n_periods: int) -> None:
+        """Move on by whole periods, the torque held."""
+        if self.records_per_period == 1:
+            self.plant.advance(n_periods)
+            return
+        for _ in range(n_periods * self.records_per_period):
+            self.plant.advance(1)
+            self.sensor.sample()
+
+    def read_angle(self) -> float:
+        """Return the angle in whole encoder steps, in rad."""
+        angle_rad = self.plant.sensed_angle_rad
+        step_rad = self._resolution_rad
+        return round(angle_rad / step_rad) * step_rad if step_rad else angle_rad
 
 
 class SimulatedDrive:
     """Torque-controlled drive with an incremental encoder."""
 
-    def __init__(self, plant: SimulatedPlant, resolution_rad: float, rate_hz: float) -> None:
-        self._plant = plant
+    def __init__(self, rig: SimulatedRig, rate_hz: float) -> None:
+        self._rig = rig
+        self._plant = rig.plant
         self._period_ns = 1e9 / rate_hz
         self._due_ns: int | None = None
-        self._resolution_rad = resolution_rad
+        self.read_angle = rig.read_angle
         self.angle_stale = False
+        self.angle_time_ns = 0
 
     def connect(self) -> None:
         """Nothing to connect to."""
@@ -49,20 +102,15 @@ class SimulatedDrive:
         self._plant.enable()
 
     def latch(self, due_ns: int) -> None:
-        """Move the plant on to the tick at ``due_ns``."""
+        """Move the rig on to the tick at ``due_ns``."""
         if self._due_ns is not None:
-            self._plant.advance(round((due_ns - self._due_ns) / self._period_ns))
-        self._due_ns = due_ns
+            self._rig.advance(round((due_ns - self._due_ns) / self._period_ns))
+        self._due_ns = self.angle_time_ns = due_ns
 
-    def read_angle(self) -> float:
-        """Return the angle in whole encoder steps, in rad."""
-        angle_rad = self._plant.sensed_angle_rad
-        step_rad = self._resolution_rad
-        return round(angle_rad / step_rad) * step_rad if step_rad else angle_rad
-
-    def command(self, torque_nm: float) -> None:
+    def command(self, torque_nm: float) -> float:
         """Set the torque in N·m; a drive that is not enabled exerts none."""
         self._plant.command(torque_nm)
+        return torque_nm
 
     def disable(self) -> None:
         """Zero the torque, and let no command through."""
@@ -76,11 +124,28 @@ class SimulatedDrive:
 class SimulatedSensor:
     """Six-axis sensor with white noise, offset, limited resolution and range.
 
-    The coupling torque appears as the smallest wrench whose projection it is.
+    The coupling torque appears as the smallest wrench whose projection it is. Where the readings
+    are streamed, what is read is the last of them through the decimating filter.
+
+    Parameters
+    ----------
+    plant, sensor, simulation
+        What is measured, and how well.
+    weights
+        Of the last readings in what is read, oldest first; one weight: each reading is taken when
+        it is asked for.
     """
 
-    def __init__(self, plant: SimulatedPlant, sensor: WrenchSensor, simulation: Simulation) -> None:
+    def __init__(
+        self,
+        plant: SimulatedPlant,
+        sensor: WrenchSensor,
+        simulation: Simulation,
+        weights: tuple[float, ...] = (1.0,),
+    ) -> None:
         self._plant = plant
+        self._weights = weights
+        self.records: deque[Wrench] = deque(maxlen=len(weights))
         self._sensor = sensor
         self._simulation = simulation
         projection = np.array(sensor.projection)
@@ -93,7 +158,9 @@ class SimulatedSensor:
             if per_torque[axis] != 0.0
         ]
         self._rows = chain.from_iterable(self._noise())
+        self._saturated = False  # since the last that was read
         self.wrench_stale = False
+        self.wrench_time_ns = 0
         self.wrench_saturated = False
 
     def connect(self) -> None:
@@ -109,10 +176,28 @@ class SimulatedSensor:
         }
 
     def request(self, due_ns: int) -> None:
-        """Nothing to do: the drive's latch has moved the plant on."""
+        """Note the time; the drive's latch has moved the plant on."""
+        self.wrench_time_ns = due_ns
 
     def read_wrench(self) -> Wrench:
         """Return the wrench of this tick."""
+        if len(self._weights) == 1:
+            return self.measure()
+        while len(self.records) < len(self._weights):  # before the first period
+            self.sample()
+        self.wrench_saturated, self._saturated = self._saturated, False
+        fx, fy, fz, tx, ty, tz = (
+            sum(map(mul, self._weights, axis)) for axis in zip(*self.records, strict=True)
+        )
+        return fx, fy, fz, tx, ty, tz
+
+    def sample(self) -> None:
+        """Take a reading into the filter."""
+        self.records.append(self.measure())
+        self._saturated |= self.wrench_saturated
+
+    def measure(self) -> Wrench:
+        """Return a reading of this instant."""
         row = next(self._rows)
         torque_nm = self._plant.sensed_torque_nm
         saturated = False

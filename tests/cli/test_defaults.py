@@ -4,7 +4,8 @@ import inspect
 
 import pytest
 
-from rigd import cli, excitation
+from rigd import excitation
+from rigd.cli import run
 
 OTHER_NAMES = {
     "amplitude": "amplitude_rad",
@@ -20,11 +21,11 @@ OTHER_NAMES = {
 @pytest.mark.parametrize(
     ("command", "function"),
     [
-        (cli.chirp, excitation.chirp),
-        (cli.hold, excitation.hold),
-        (cli.step, excitation.step),
-        (cli.multisine, excitation.multisine),
-        (cli.file, excitation.from_csv),
+        (run.chirp, excitation.chirp),
+        (run.hold, excitation.hold),
+        (run.step, excitation.step),
+        (run.multisine, excitation.multisine),
+        (run.file, excitation.from_csv),
     ],
 )
 def test_defaults_agree(command, function):

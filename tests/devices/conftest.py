@@ -1,16 +1,33 @@
 """Every backend there is, opened but not connected."""
 
+import os
+from dataclasses import replace
+
 import pytest
 
 from rigd.devices.registry import open_devices
 from rigd.profile import load_profile
 
-
-@pytest.fixture
-def rig():
-    return load_profile("sim").rig
+HARDWARE = "RIGD_HARDWARE"
 
 
-@pytest.fixture(params=["sim"])
-def devices(request, rig):
-    return {"sim": lambda: open_devices(rig)}[request.param]()
+@pytest.fixture(params=["direct", "can", "serial", "previous_tick", "hardware"])
+def devices(request, start_simulator):
+    """Drive and sensor: simulated directly, through the wire in lock-step, or the real ones."""
+    if request.param == "hardware":
+        name = os.environ.get(HARDWARE)
+        if not name:
+            pytest.skip(f"HARDWARE NOT TESTED: {HARDWARE} names no profile of a rig that may move")
+        rig = load_profile(name).rig
+    elif request.param == "direct":
+        rig = load_profile("sim").rig
+    else:
+        name = "antenna_serial" if request.param == "serial" else "antenna_can"
+        rig = load_profile(name).rig
+        if request.param == "previous_tick":
+            rig = replace(rig, acquisition=replace(rig.acquisition, mode="previous_tick"))
+        start_simulator(name, "--lock-step")
+    opened = open_devices(rig)
+    yield opened
+    opened.drive.close()
+    opened.sensor.close()

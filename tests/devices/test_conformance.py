@@ -84,13 +84,3 @@ def test_disabling_and_closing_work_in_every_state(devices):
     devices.drive.close()
     devices.drive.close()
     devices.sensor.close()
-
-
-def test_a_missed_tick_passes_with_the_last_torque_held(devices):
-    connect(devices)
-    run(devices, 0, 2)
-    devices.drive.enable()
-    run(devices, 2, 5, torque_nm=0.2)
-    before = devices.drive.read_angle()
-    devices.drive.latch(56 * PERIOD_NS)
-    assert devices.drive.read_angle() > before + 1e-3

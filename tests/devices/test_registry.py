@@ -6,17 +6,12 @@ import sys
 import pytest
 
 from rigd.devices.parameters import Selection
-from rigd.devices.registry import UnknownDeviceError, check_selection, is_simulated
+from rigd.devices.registry import UnknownDeviceError, check_selection
 
 
 def test_unknown_drivers_are_refused_with_what_there_is():
     with pytest.raises(UnknownDeviceError, match=r'"steam".*choose drive = "sim"'):
         check_selection(Selection(drive="steam", sensor="sim"))
-
-
-def test_only_the_simulation_may_skip_real_time():
-    assert is_simulated(Selection(drive="sim", sensor="sim"))
-    assert not is_simulated(Selection(drive="cia402", sensor="ati_can"))
 
 
 def test_the_simulation_is_not_imported_unless_a_profile_names_it():

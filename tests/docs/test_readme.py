@@ -20,20 +20,23 @@ def blocks(language):
     return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 
 
-def test_every_how_to_runs_as_written(tmp_path):
+@pytest.mark.timeout(300)
+def test_every_how_to_runs_as_written(tmp_path, runtime_folder):
     shutil.copy(PROJECT / "hw_profiles" / "sim.toml", tmp_path / "my_rig.toml")
     shells, python = blocks("sh"), blocks("python")
     assert len(shells) >= 6
     assert len(python) == 1
-    script = "set -e\n" + "\n".join(shells)
+    # Job control, as on a terminal: the simulated rig of one how-to is ended by its job's number.
+    script = "set -em\n" + "\n".join(shells)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "XDG_RUNTIME_DIR": str(runtime_folder)}
     for command in (["bash", "-c", script], [sys.executable, "-c", python[0]]):
         done = subprocess.run(
             command,
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            env=os.environ | {"PATH": path},
+            env=environment,
             check=False,
         )
         assert done.returncode == 0, done.stdout + done.stderr

@@ -38,6 +38,10 @@ class WatchedDrive:
     def angle_stale(self):
         return self.stale_at is not None and self.reads >= self.stale_at
 
+    @property
+    def angle_time_ns(self):
+        return self.inner.angle_time_ns
+
     def connect(self):
         self.inner.connect()
 
@@ -62,7 +66,7 @@ class WatchedDrive:
         assert self.enabled
         self.torque_nm = torque_nm
         self.torques.append(torque_nm)
-        self.inner.command(torque_nm)
+        return self.inner.command(torque_nm)
 
     def disable(self):
         self.inner.disable()
@@ -109,7 +113,7 @@ class Session:
             stop_hz=5.0,
         )
         self.channels = create_channels(
-            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(4)]
+            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(5)]
         )
         self.board = self.channels.board
         self.parent = FakeParent()

@@ -56,7 +56,14 @@ def accepts(port: int) -> bool:
     return True
 
 
-def receive(rerun_program, publisher, path: Path, enough_bytes: int, eventually):
+def settled(path: Path) -> bool:
+    """Whether a file has stopped growing."""
+    size = path.stat().st_size
+    time.sleep(0.5)
+    return path.stat().st_size == size
+
+
+def receive(rerun_program, publisher, producer, path: Path, enough_bytes: int, eventually):
     """Have Rerun itself save what the server sends; return the saved columns by entity."""
     from rerun.chunk import RrdReader
 
@@ -68,6 +75,9 @@ def receive(rerun_program, publisher, path: Path, enough_bytes: int, eventually)
     )
     try:
         assert eventually(lambda: path.exists() and path.stat().st_size > enough_bytes)
+        # What is on its way when the server goes is lost: let everything arrive first.
+        producer.stop()
+        assert eventually(lambda: settled(path))
         # It completes the file when the server goes away.
         publisher.end()
         assert saver.wait(10.0) == 0
@@ -106,12 +116,13 @@ def test_every_sample_arrives_in_the_units_of_the_plots(
     publisher, producer, rerun_program, tmp_path, eventually
 ):
     recording, columns = receive(
-        rerun_program, publisher, tmp_path / "live.rrd", 300_000, eventually
+        rerun_program, publisher, producer, tmp_path / "live.rrd", 300_000, eventually
     )
     assert recording.application_id == "rigd"
     angle = columns["/angle_mrad"]
     time_s = angle[:, 0] * 1e-9
     assert len(angle) > 500
+    assert angle[-1, 0] == (producer.tick - 1) * 1_000_000  # up to the last that was made
     assert np.all(np.diff(angle[:, 0]) == 1_000_000)  # none missing, none twice
     reference_rad = 0.025 * np.sin(2.0 * np.pi * (0.5 * time_s + 0.1 * time_s**2))
     assert angle[:, 1] == pytest.approx(1e3 * reference_rad, abs=1e-9)
@@ -227,7 +238,9 @@ def test_a_killed_server_is_replaced_where_viewers_find_it(
     killed_ns = producer.tick * 1_000_000
     assert eventually(lambda: publisher.server_pid not in (0, first))
     assert eventually(lambda: all(accepts(port) for port in publisher.ports))
-    _, columns = receive(rerun_program, publisher, tmp_path / "live.rrd", 100_000, eventually)
+    _, columns = receive(
+        rerun_program, publisher, producer, tmp_path / "live.rrd", 100_000, eventually
+    )
     assert columns["/angle_mrad"][:, 0].max() > killed_ns
     assert producer.refused == 0
 

@@ -20,8 +20,10 @@ from rigd.session.format import (
     SAMPLE_DTYPE,
     SAMPLE_FIELDS,
     SAMPLE_SIZE,
+    TIMING_SIZE,
     pack_control_into,
     pack_sample_into,
+    pack_timing_into,
 )
 from rigd.session.schema import SAMPLE_SCHEMA, schema_data
 
@@ -58,6 +60,14 @@ def packed(samples):
     for i, sample in enumerate(samples.tolist()):
         pack_sample_into(block, i * SAMPLE_SIZE, *sample)
     return bytes(block)
+
+
+def packed_timings(ticks):
+    """Ages that tell the ticks apart."""
+    buffer = bytearray(TIMING_SIZE * len(ticks))
+    for i, tick in enumerate(ticks):
+        pack_timing_into(buffer, i * TIMING_SIZE, tick * 1_000_000, tick, 1e-6 * tick, -2e-6 * tick)
+    return bytes(buffer)
 
 
 def packed_controls(ticks, seed=0):

@@ -16,20 +16,31 @@ from rigd.session.format import (
     SAMPLE_SIZE,
     SAMPLE_TYPES,
     SAMPLE_WIRE_DTYPE,
+    TIMING_FIELDS,
+    TIMING_SIZE,
     Status,
     decode_controls,
     decode_samples,
+    decode_timings,
     is_fixed_layout,
     pack_control_into,
     pack_sample_into,
+    pack_timing_into,
 )
-from rigd.session.schema import CONTROL_SCHEMA, SAMPLE_SCHEMA, message_class, schema_data
+from rigd.session.schema import (
+    CONTROL_SCHEMA,
+    SAMPLE_SCHEMA,
+    TIMING_SCHEMA,
+    message_class,
+    schema_data,
+)
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 UINT32 = st.integers(0, 2**32 - 1)
 DOUBLE = st.floats()
 SAMPLES = st.tuples(INT64, UINT32, *[DOUBLE] * 10, UINT32, UINT32, UINT32)
 CONTROLS = st.tuples(INT64, UINT32, *[DOUBLE] * 6)
+TIMINGS = st.tuples(INT64, UINT32, DOUBLE, DOUBLE)
 
 
 def same(left, right):
@@ -48,7 +59,7 @@ def pack(pack_into, size, values):
 
 
 def test_sizes_and_fields_of_the_format():
-    assert (SAMPLE_SIZE, CONTROL_SIZE) == (119, 68)
+    assert (SAMPLE_SIZE, CONTROL_SIZE, TIMING_SIZE) == (119, 68, 32)
     assert SAMPLE_FIELDS == (
         "t_ns", "tick", "angle_reference_rad", "angle_rad", "torque_command_nm",
         "coupling_torque_nm", "fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm", "status",
@@ -70,6 +81,13 @@ def test_a_packed_control_message_is_decoded_by_protobuf_and_by_numpy(values):
     data = pack(pack_control_into, CONTROL_SIZE, values)
     assert all(map(same, protobuf_fields(CONTROL_SCHEMA, data, CONTROL_FIELDS), values))
     assert all(map(same, decode_controls(data)[0].item(), values))
+
+
+@given(TIMINGS)
+def test_a_packed_timing_message_is_decoded_by_protobuf_and_by_numpy(values):
+    data = pack(pack_timing_into, TIMING_SIZE, values)
+    assert all(map(same, protobuf_fields(TIMING_SCHEMA, data, TIMING_FIELDS), values))
+    assert all(map(same, decode_timings(data)[0].item(), values))
 
 
 @given(st.lists(SAMPLES, max_size=5), st.integers(0, 7))

@@ -14,8 +14,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from rigd.session import SessionError, SessionExistsError, SessionWriter, read_session
-from rigd.session.format import SAMPLE_FIELDS, decode_controls, decode_samples
+from rigd.session import SessionError, SessionExistsError, SessionWriter, read_session, read_timings
+from rigd.session.format import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
 from rigd.session.schema import message_class
 
 
@@ -44,7 +44,7 @@ def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
     assert event.timestamp.ToNanoseconds() == record.log_time == kit.START_UTC_NS - 5_000_000
     counts = {summary.channels[i].topic: n for i, n in
               summary.statistics.channel_message_counts.items()}  # fmt: skip
-    assert counts == {"/rig/sample": 1111, "/rig/control": 112, "/rig/event": 2}
+    assert counts == {"/rig/sample": 1111, "/rig/control": 112, "/rig/timing": 0, "/rig/event": 2}
     assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
     assert summary.statistics.message_start_time == kit.START_UTC_NS - 5_000_000
     assert summary.statistics.message_end_time == kit.START_UTC_NS + 1_110_000_000
@@ -89,6 +89,19 @@ def test_a_chunk_has_250_samples_and_the_controls_of_their_time(kit, tmp_path):
     ]  # fmt: skip
     for i, (first, end) in enumerate(((0, 250), (250, 500), (500, 600))):
         assert ticks[i] == {1: list(range(first, end)), 2: list(range(first, end, 10))}
+
+
+def test_ages_are_in_the_chunk_of_their_samples_and_read_back(kit, tmp_path):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_timings(kit.packed_timings(range(300)))
+    writer.write_samples(kit.packed(kit.make_samples(250)))
+    (chunk,) = kit.chunks_of(writer.part)
+    assert sum(len(message.data) == TIMING_SIZE for message in chunk) == 250
+    writer.close(kit.OUTCOME)
+    timings = read_timings(tmp_path / "a.mcap")
+    assert timings["tick"].tolist() == list(range(300))
+    assert timings["angle_age_s"].tolist() == [1e-6 * tick for tick in range(300)]
+    assert timings["wrench_age_s"].tolist() == [-2e-6 * tick for tick in range(300)]
 
 
 def test_an_error_is_in_the_file_at_once(kit, tmp_path):

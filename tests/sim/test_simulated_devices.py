@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import Selection
 from rigd.devices.registry import open_devices
 from rigd.profile import load_profile
 
@@ -91,3 +92,61 @@ def test_a_declared_delay_is_the_age_of_the_reading(rig):
 def test_a_profile_without_a_simulation_section_is_refused(rig):
     with pytest.raises(DeviceError, match=r"\[simulation\]"):
         open_devices(replace(rig, simulation=None))
+
+
+@pytest.fixture
+def streaming():
+    """A rig whose sensor streams seven records a tick, simulated directly and without noise."""
+    rig = load_profile("antenna_serial").rig
+    quiet = replace(rig.simulation, torque_noise_nm=0.0, force_noise_n=0.0, offset=(0.0,) * 6)
+    sensor = replace(rig.sensor, resolution=(0.0,) * 6)
+    return replace(
+        rig, devices=Selection(drive="sim", sensor="sim"), simulation=quiet, sensor=sensor
+    )
+
+
+def test_a_streaming_sensor_averages_its_records_and_is_as_old_as_the_profile_says(streaming):
+    # At low frequency a mean over a tick differs from a delay by (ωT)²/24 only.
+    point = replace(streaming, ati_serial=None)
+    _, averaged, _ = watch(streaming, 800, wiggle)
+    _, delayed, _ = watch(point, 800, wiggle)
+    torque, expected = averaged[100:, 5], delayed[100:, 5]
+    assert np.abs(torque - expected).max() < 2e-3 * np.abs(expected).max()
+    # The same without the filter's delay is visibly wrong: the agreement above says something.
+    early = replace(point, sensor=replace(point.sensor, delay_s=0.0))
+    _, undelayed, _ = watch(early, 800, wiggle)
+    assert np.abs(torque - undelayed[100:, 5]).max() > 5e-3 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("shape", "gain"), [("mean", 1 / 7), ("triangle", 231 / 2401)])
+def test_a_decimating_filter_takes_noise_away(streaming, shape, gain):
+    # Sum of the squared weights: 7/49, and (2(1² + … + 6²) + 7²)/49² = 231/2401.
+    noisy = replace(
+        streaming,
+        simulation=replace(streaming.simulation, torque_noise_nm=5e-3),
+        ati_serial=replace(streaming.ati_serial, filter=shape),
+    )
+    _, wrenches, _ = watch(noisy, 4000, lambda tick: 0.0)
+    assert wrenches[20:, 5].std() == pytest.approx(5e-3 * np.sqrt(gain), rel=0.06)
+
+
+def test_one_saturated_record_makes_the_wrench_of_its_tick_saturated(streaming):
+    narrow = replace(
+        streaming, sensor=replace(streaming.sensor, range=(20.0, 20.0, 60.0, 1.0, 1.0, 0.03))
+    )
+    _, wrenches, saturated = watch(narrow, 800, wiggle)
+    assert saturated.any()
+    # The mean of a tick lies inside the range where only a part of its records is at the end.
+    assert (np.abs(wrenches[saturated, 5]) < 0.03 - 1e-9).any()
+    assert not saturated[np.abs(wrenches[:, 5]) < 0.02].any()
+
+
+def test_a_missed_tick_passes_with_the_last_torque_held(rig):
+    drive = open_devices(rig).drive
+    drive.enable()
+    for tick in range(5):
+        drive.latch(tick * PERIOD_NS)
+        drive.command(0.2)
+    before = drive.read_angle()
+    drive.latch(55 * PERIOD_NS)
+    assert drive.read_angle() > before + 1e-3

@@ -1,38 +1,25 @@
-"""The command line of the rig: ``rigd``."""
+"""``rigd run``: sessions in the foreground, one command an excitation."""
 
 import inspect
-import io
 import json
-import os
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
+from rigd.cli.start import start_crew
 
 if TYPE_CHECKING:
     from rigd.daemon import SessionResult
     from rigd.excitation import Excitation
 
-app = typer.Typer(
-    help="Run the rig: excite the antenna, record every sample, watch it live.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    add_completion=False,
-)
 run_app = typer.Typer(
     help="Run one or more sessions in the foreground; Ctrl-C stops safely.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-app.add_typer(run_app, name="run")
-
-EXIT_FAILED = 1
-EXIT_WRONG_USE = 2
-EXIT_INTERRUPTED = 130
 
 Amplitude = Annotated[float, typer.Option("--amplitude", help="Amplitude, rad.")]
 StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the band starts, Hz.")]
@@ -41,24 +28,6 @@ Duration = Annotated[float, typer.Option("--duration", help="Duration of the exc
 Rest = Annotated[float, typer.Option("--rest", help="Rest before it, s.")]
 RingDown = Annotated[float, typer.Option("--ring-down", help="Holding after it, s.")]
 Taper = Annotated[float, typer.Option("--taper", help="Fade in and out over this time, s.")]
-
-
-def main() -> None:
-    """Entry point of ``rigd``."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal that does not know "·" or "²" gets a "?" instead of an error.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-    try:
-        app()
-    except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    typer.echo(f"Error: {message}", err=True)
-    raise typer.Exit(code)
 
 
 Build = Callable[..., "Excitation"]
@@ -113,23 +82,9 @@ def run_sessions(
     notes = {"operator": operator, "specimen": specimen, "note": note}
     for option, text in notes.items():
         if not text.isprintable():
-            _fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
-    from rigd.crew import Crew
-    from rigd.engine.process import SINGLE_THREADED
-    from rigd.engine.signals import StopRequest, ignore
-
-    stop = StopRequest()
-    stop.catch()
-    os.environ.update(SINGLE_THREADED)
-    # Before anything else: its processes import while this one does, and while it plans.
-    try:
-        crew = Crew(live=live)
-    except OSError as error:
-        _fail(
-            f"The processes of a session cannot be started ({error.strerror}); look at the limits "
-            "of open files and of shared memory (/dev/shm).",
-            EXIT_FAILED,
-        )
+            fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
+    stop, crew = start_crew(live=live)
+    from rigd.engine.signals import ignore
     from rigd.foreground import ForegroundError, run_in_foreground
 
     try:
@@ -150,7 +105,7 @@ def run_sessions(
     except ForegroundError as error:
         if as_json and error.results:
             _write_json(error.results)
-        _fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+        fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
     finally:
         ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
     if as_json:
@@ -282,31 +237,11 @@ def file(
     return excitation.from_csv(path, rate_hz=rate_hz, rest_s=rest, ring_down_s=ring_down)
 
 
-@app.command()
-def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", readable=False, help="A session file.")],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Write one JSON document to standard output.")
-    ] = False,
-) -> None:
-    """Say what is in a session file.
-
-    Example: rigd info sessions/20261120-101500-chirp.mcap
-    """
-    from rigd.session import SessionError, describe
-
-    try:
-        found = describe(path)
-    except SessionError as error:
-        _fail(str(error), EXIT_FAILED)
-    typer.echo(json.dumps(found.as_dict()) if as_json else "\n".join(found.lines()))
-
-
 def _write_json(results: "list[SessionResult]") -> None:
     try:
         typer.echo(json.dumps({"sessions": [_as_json(result) for result in results]}))
     except OSError as error:
-        _fail(f"The JSON document cannot be written ({error.strerror}).", EXIT_FAILED)
+        fail(f"The JSON document cannot be written ({error.strerror}).", EXIT_FAILED)
 
 
 def _as_json(result: "SessionResult") -> dict[str, object]:

@@ -1,0 +1,39 @@
+"""``rigd reset``: the operator's reset of a fault, the only one there is."""
+
+from typing import Protocol, runtime_checkable
+
+from rigd.devices.parameters import RigParameters
+from rigd.devices.registry import open_devices
+
+
+@runtime_checkable
+class ResettableDrive(Protocol):
+    """A drive that can be in fault; simulated ones in this process cannot."""
+
+    def reset_fault(self) -> str | None:
+        """Reset a fault without enabling the drive; return what it was, or None."""
+
+
+def reset_drive(rig: RigParameters) -> str:
+    """Reset the drive of a rig, and let go of it.
+
+    Returns
+    -------
+    str
+        What was found and how the drive stands now, for the operator.
+
+    Raises
+    ------
+    DeviceError
+        If the drive does not answer, or the fault stands.
+    """
+    drive = open_devices(rig).drive
+    if not isinstance(drive, ResettableDrive):
+        return "The drive is simulated in each session anew: there is no fault to reset."
+    try:
+        fault = drive.reset_fault()
+    finally:
+        drive.close()
+    if fault is None:
+        return "The drive is not in fault; nothing was reset. It is disabled."
+    return f"The drive was in fault: {fault}. The fault is reset; the drive is disabled."

@@ -1,0 +1,22 @@
+"""The whole check, in the order in which one thing rules out the next."""
+
+from rigd.checks.devices import inspect_devices
+from rigd.checks.loop import loop_rows
+from rigd.checks.on_paper import profile_rows, wiring_rows
+from rigd.checks.rights import rights_rows
+from rigd.checks.rows import Row, Verdict
+from rigd.profile import Profile
+
+
+def check_rig(profile: Profile) -> list[Row]:
+    """Check the rig of a profile without a torque: on paper, this computer, then the devices.
+
+    Where the identifiers meet or the bus cannot carry the frames, nothing is connected: devices
+    might obey what is not meant for them.
+    """
+    wiring = list(wiring_rows(profile.rig))
+    rows = [*profile_rows(profile), *wiring, *loop_rows(profile), *rights_rows(profile.realtime)]
+    if any(row.verdict is Verdict.FAIL for row in wiring):
+        why = "not connected: first the bus has to be right"
+        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
+    return rows + inspect_devices(profile)

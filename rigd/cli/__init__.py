@@ -1,0 +1,1 @@
+"""The command line of the rig: one module a command, light until a command runs."""

@@ -1,0 +1,43 @@
+"""The command line of the rig, put together: ``rigd``."""
+
+import io
+import signal
+import sys
+
+import typer
+
+from rigd.cli.check import check, reset
+from rigd.cli.exits import EXIT_INTERRUPTED
+from rigd.cli.identify import identify_app
+from rigd.cli.info import info
+from rigd.cli.run import run_app
+from rigd.cli.simulate import inject, simulate
+
+app = typer.Typer(
+    help="Run the rig: excite the antenna, record every sample, watch it live.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    add_completion=False,
+)
+# In the order in which an operator meets them.
+app.command()(check)
+app.add_typer(run_app, name="run")
+app.command()(info)
+app.add_typer(identify_app, name="identify")
+app.command()(reset)
+app.command()(simulate)
+app.command()(inject)
+
+
+def main() -> None:
+    """Entry point of ``rigd``."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that does not know "·" or "²" gets a "?" instead of an error.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)

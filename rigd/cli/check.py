@@ -1,0 +1,84 @@
+"""``rigd check`` and ``rigd reset``: the state of the rig, and the operator's fault reset."""
+
+import json
+import os
+import signal
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
+
+if TYPE_CHECKING:
+    from rigd.profile import Profile
+
+ProfileName = Annotated[
+    str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
+]
+
+
+def check(
+    profile: ProfileName = "sim",
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Write one JSON document to standard output.")
+    ] = False,
+) -> None:
+    """Check everything that can be checked without a torque: profile, buses, devices, loop.
+
+    Ends with 0 if a session can be run (warnings allowed), and with 1 if not.
+
+    Example: rigd check --profile antenna_can
+    """
+    _end_as_by_ctrl_c()
+    rig_profile = _load(profile)
+    from rigd.checks import overall
+    from rigd.checks.rig import check_rig
+
+    rows = check_rig(rig_profile)
+    verdict = overall(rows)
+    if as_json:
+        document = {"verdict": verdict, "rows": [row.as_dict() for row in rows]}
+        typer.echo(json.dumps(document, ensure_ascii=False))
+    else:
+        from rigd.checks.table import print_table
+
+        print_table(rows)
+    if verdict == "failed":
+        raise typer.Exit(EXIT_FAILED)
+
+
+def reset(profile: ProfileName = "sim") -> None:
+    """Reset a fault of the drive, after its cause is removed. No torque; the drive stays off.
+
+    Example: rigd reset --profile antenna_can
+    """
+    _end_as_by_ctrl_c()
+    rig_profile = _load(profile)
+    from rigd.checks.reset import reset_drive
+    from rigd.devices.contracts import DeviceError
+
+    try:
+        typer.echo(reset_drive(rig_profile.rig))
+    except (DeviceError, OSError) as error:
+        fail(str(error), EXIT_FAILED)
+
+
+def _load(name: str) -> "Profile":
+    from rigd.engine.process import SINGLE_THREADED
+
+    os.environ.update(SINGLE_THREADED)
+    from rigd.devices.registry import UnknownDeviceError, check_selection
+    from rigd.profile import ProfileError, load_profile
+
+    try:
+        profile = load_profile(name)
+        check_selection(profile.rig.devices)
+    except (ProfileError, UnknownDeviceError) as error:
+        fail(str(error), EXIT_WRONG_USE)
+    return profile
+
+
+def _end_as_by_ctrl_c() -> None:
+    """Let go of the devices when asked to end by whatever means."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)

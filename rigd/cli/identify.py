@@ -1,0 +1,187 @@
+"""``rigd identify``: data of the rig from sessions made for it."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
+from rigd.cli.start import start_crew
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rigd.excitation import Excitation
+    from rigd.identification.motor_estimate import MotorEstimate
+    from rigd.identification.proposal import Proposal
+    from rigd.profile import Profile
+
+    Session = Callable[..., Excitation]
+    Prepare = Callable[[Profile], Profile]
+
+identify_app = typer.Typer(
+    help="Measure data of the rig that its profile has to state.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@identify_app.callback()
+def identify() -> None:
+    """Measure data of the rig that its profile has to state."""
+
+
+@identify_app.command()
+def motor(
+    profile: Annotated[
+        str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
+    ] = "sim",
+    output: Annotated[Path, typer.Option("--output", help="Folder for the session files.")] = Path(
+        "sessions"
+    ),
+    torque_percent: Annotated[
+        float,
+        typer.Option("--torque-percent", help="Largest predicted torque, % of the rated torque."),
+    ] = 40.0,
+    stroke_rad: Annotated[
+        float,
+        typer.Option("--stroke-rad", help="Largest angle to either side of the start, rad."),
+    ] = 0.8,
+    from_files: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            readable=False,
+            help="Estimate from a file recorded before, and move nothing; once for each file.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="Of a simulated rig's noise (default: the profile's)."),
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Do not wait for real time (simulated rigs only).")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Write one JSON document to standard output.")
+    ] = False,
+) -> None:
+    """Measure inertia, friction, torque constant and delay of the motor, with deviations.
+
+    Three sessions of 25, 60 and 75 s: the shaft goes to and fro at constant speed, with a small
+    multisine on it, with a larger one, then at four speeds. The first only serves to design the
+    controller of the others. Proposes lines for the profile and changes nothing itself. The torque
+    constant shows only with the antenna mounted.
+
+    Example: rigd identify motor --profile sim --fast
+    """
+    if from_files:
+        files = from_files
+    else:
+        files = _run_sessions(
+            profile, output, torque_percent, stroke_rad, seed, fast=fast, quiet_stdout=as_json
+        )
+    _, found = _estimate(files, profile)
+    if as_json:
+        document = {"files": [str(path) for path in files], **found.as_dict()}
+        typer.echo(json.dumps(document))
+        return
+    typer.echo("\n".join(["", *found.table(), ""]))
+    for note in found.notes:
+        typer.echo(f"Note: {note}")
+    typer.echo("\n".join(["", "For the profile:", "", *found.toml()]))
+
+
+def _run_sessions(
+    profile_name: str,
+    folder: Path,
+    torque_percent: float,
+    stroke_rad: float,
+    seed: int | None,
+    *,
+    fast: bool,
+    quiet_stdout: bool,
+) -> list[Path]:
+    """Run the trial and both sessions; ends the command if one does not go well.
+
+    Returns the files of the two: the trial's controller is too slow for its passes to count.
+    """
+    stop, crew = start_crew(live=False)
+    from rigd.crew import Crew
+    from rigd.engine.signals import ignore
+    from rigd.foreground import ForegroundError, run_in_foreground
+    from rigd.identification import experiments, tuning
+
+    def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
+        prepared: list[Profile] = []
+
+        def note_and_prepare(profile: "Profile") -> "Profile":
+            prepared.append(prepare(profile))
+            return prepared[0]
+
+        def build(_: float) -> "Excitation":
+            return session(prepared[0], torque_percent=torque_percent, stroke_rad=stroke_rad)
+
+        results = run_in_foreground(
+            build,
+            crew,
+            stop,
+            profile_name=profile_name,
+            folder=folder,
+            repeat=1,
+            seed=None if seed is None else seed + number,
+            notes={},
+            fast=fast,
+            live=False,
+            force=False,
+            quiet_stdout=quiet_stdout,
+            prepare=note_and_prepare,
+        )
+        if stop.requested:
+            raise typer.Exit(EXIT_INTERRUPTED)
+        path = results[0].path if results else None
+        if path is None or not results[0].went_well:
+            raise typer.Exit(EXIT_FAILED)
+        return path
+
+    try:
+        trial = run(experiments.trial_session, tuning.cautious, 0, crew)
+        estimate = _estimate([trial], profile_name)[0]
+
+        def tune(profile: "Profile") -> "Profile":
+            return tuning.tuned(profile, estimate)
+
+        return [
+            run(session, tune, number, Crew(live=False))
+            for number, session in enumerate(
+                (experiments.multisine_session, experiments.speeds_session), start=1
+            )
+        ]
+    except ForegroundError as error:
+        fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+    finally:
+        ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
+
+
+def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
+    from rigd.identification.motor_estimate import EstimateError, estimate_motor
+    from rigd.identification.proposal import propose
+    from rigd.identification.records import read_recording
+    from rigd.profile import ProfileError, load_profile
+    from rigd.session import SessionError
+
+    try:
+        profile = load_profile(profile_name)
+        recording = read_recording(files, profile.rig.actuation.delay_s)
+        estimate = estimate_motor(
+            recording.windows,
+            recording.timing,
+            tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
+        )
+    except ProfileError as error:
+        fail(str(error), EXIT_WRONG_USE)
+    except (SessionError, EstimateError) as error:
+        fail(str(error), EXIT_FAILED)
+    return estimate, propose(estimate, profile, unusable=recording.unusable)

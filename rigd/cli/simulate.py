@@ -1,0 +1,100 @@
+"""``rigd simulate`` and ``rigd inject``: the simulated rig on the wire, and its faults."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
+
+ProfileName = Annotated[
+    str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
+]
+
+
+def simulate(
+    profile: ProfileName,
+    lock_step: Annotated[
+        bool,
+        typer.Option(
+            "--lock-step", help="Move on by one period a SYNC, as fast as they come (run --fast)."
+        ),
+    ] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="FILE", help="Write every event as a line of JSON."),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="SPEC", help="Inject a fault; see rigd inject --help."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing on the terminal.")] = False,
+) -> None:
+    """Put a simulated rig on the wire in place of a profile's devices; Ctrl-C ends it.
+
+    Sessions of the same profile find it by themselves. Its drive and its sensor speak the protocols
+    of the real ones, on a socket or a virtual CAN bus and on a pseudo-terminal.
+
+    Example: rigd simulate --profile antenna_can --fault drop,from=drive,frames=3@10
+    """
+    from rigd.devices import registry
+
+    simulator = registry.simulator()
+    try:
+        options = simulator.SimulatorOptions(
+            lock_step=lock_step,
+            log=log,
+            faults=tuple(simulator.parse_fault(spec) for spec in fault or ()),
+            quiet=quiet,
+        )
+        code = simulator.run_simulator(_load(profile).rig, options)
+    except simulator.FaultError as error:
+        fail(str(error), EXIT_WRONG_USE)
+    except simulator.DeviceError as error:
+        fail(str(error), EXIT_FAILED)
+    raise typer.Exit(code)
+
+
+def inject(
+    profile: ProfileName,
+    fault: Annotated[
+        list[str] | None, typer.Argument(metavar="[SPEC]...", help="Faults, as above.")
+    ] = None,
+) -> None:
+    """Inject faults into a running simulated rig; without any, say how it stands.
+
+    A fault happens at once, or with @SECONDS so long after the drive was first enabled. Times are
+    of the simulated rig.
+
+    \b
+    drop,from=drive|sensor|host[,id=0x181][,frames=3]  the next frames are lost
+    drop,from=sensor,bytes=5                  so many bytes on a sensor's serial line
+    delay,from=...,ms=2[,id=...][,frames=3]   they come later
+    corrupt,from=...[,byte=0][,id=...][,frames=3]  one byte of each is inverted
+    reorder,from=...[,id=...][,frames=3]      each comes after the next one
+    freeze,device=drive|sensor[,for=0.5]      it neither hears nor says anything
+    emcy,code=0x8130[,register=1]             the drive reports an emergency
+    saturate,gauge=0..5[,for=0.5]             a strain gauge is at the end of its range
+    status,bits=0x0080[,for=0.5]              the sensor reports errors
+    jump,counts=-500                          the encoder slips
+    cut[,device=bus|sensor]                   the bus, or a sensor's serial line, is cut
+
+    Example: rigd inject --profile antenna_can freeze,device=drive,for=0.5
+    """  # noqa: D301 - the mark that keeps lines apart is no raw text
+    from rigd.devices import registry
+
+    simulator = registry.simulator()
+    try:
+        lines = simulator.inject(_load(profile).rig.name, fault or [])
+    except simulator.DeviceError as error:
+        fail(str(error), EXIT_FAILED)
+    typer.echo("\n".join(lines))
+
+
+def _load(profile: str) -> Any:  # noqa: ANN401 - a Profile, imported late
+    from rigd.profile import ProfileError, load_profile
+
+    try:
+        return load_profile(profile)
+    except ProfileError as error:
+        fail(str(error), EXIT_WRONG_USE)

@@ -1,0 +1,439 @@
+"""A Digital F/T sensor on a serial line, streaming: set up over Modbus, then read record by record.
+
+The sensor streams several records for each tick of the loop. The profile's decimating filter and
+the calibration are one matrix, applied to the newest records in one product.
+"""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import chain
+from struct import Struct
+
+import numpy as np
+
+from rigd.devices.ati import modbus
+from rigd.devices.ati.calibration import same_serial_number
+from rigd.devices.ati.calibration_block import (
+    BLOCK_REGISTERS,
+    CalibrationBlock,
+    first_register,
+    parse_block,
+)
+from rigd.devices.ati.serial_line import SerialLine
+from rigd.devices.ati.status import SERIAL_CRITICAL, serial_status
+from rigd.devices.ati.stream import ERROR_BIT, RECORD_SIZE, RecordStream
+from rigd.devices.contracts import DeviceError, Wrench
+from rigd.devices.parameters import RigParameters
+from rigd.devices.simulator import SimulatorAddress
+
+BITS_PER_BYTE = 11
+"""On the line: start, eight, parity, stop."""
+
+# Anything sent while the sensor streams stops it; other drivers send 14 bytes.
+_JAM = bytes(range(1, 15))
+_JAM_TRIES = 3
+_QUIET_S = 0.05
+_DRAIN_LIMIT_S = 0.5
+_REPLY_TIMEOUT_S = 0.3
+_TRIES = 3
+# Modbus: a frame is over when the line has been silent for this long.
+_SILENCE_S = 0.002
+_FIRST_RECORDS_TIMEOUT_S = 0.5
+# The error bit is not covered by the checksum; one flipped bit must not end a session.
+_ERRORS_IN_A_ROW = 7
+# Unread for longer than this, the kernel's 4 kB may overflow at 91 kB/s and what is left is old.
+_IDLE_NS = 20_000_000
+
+_RECORD = np.dtype([("gauges", ">i2", 6), ("check", "u1")])
+
+
+class AtiSerialSensor:
+    """The sensor of a profile with a section ``ati_serial``.
+
+    Parameters
+    ----------
+    rig
+        With sections ``ati_serial`` and ``acquisition``.
+    simulator
+        Of the simulated rig that stands in for it, or None.
+
+    Attributes
+    ----------
+    wrench_stale, wrench_saturated, wrench_time_ns
+        Of the last reading; the time (``time.monotonic_ns``) is when its newest record was read.
+    stream : RecordStream
+        With the counts of records and checksum errors.
+    status : list of str
+        What the sensor's status word said last, in words; it can only be asked while the sensor
+        does not stream, that is in `connect` and `close`.
+
+    Raises
+    ------
+    DeviceError
+        If the profile lacks a section.
+    """
+
+    def __init__(self, rig: RigParameters, simulator: SimulatorAddress | None) -> None:
+        settings, acquisition = rig.ati_serial, rig.acquisition
+        if settings is None or acquisition is None:
+            missing = "ati_serial" if settings is None else "acquisition"
+            raise DeviceError(
+                f"The profile has no section [{missing}], which a sensor on a serial line needs."
+            )
+        self._settings = settings
+        self._port = settings.port
+        self._lock_step = False
+        if simulator is not None and simulator.serial_port:
+            self._port, self._lock_step = simulator.serial_port, simulator.lock_step
+        self._name = f"Sensor ATI Digital F/T on {self._port}"
+        self._rate_hz = rig.rate_hz
+        self._bytes_per_tick = settings.records_per_tick(rig.rate_hz) * RECORD_SIZE
+        self._weights = settings.weights(rig.rate_hz)
+        self._limit = settings.saturation_counts
+        self._deadline_ns = int(acquisition.deadline_us * 1e3)
+        # Waiting longer for the one record that lacks would let a sensor whose clock is slow drag
+        # every tick's sampling instant along, up to the deadline. In lock-step there is no clock.
+        self._patience_ns = self._deadline_ns
+        if not self._lock_step:
+            self._patience_ns = min(self._deadline_ns, int(1e9 / settings.stream_hz))
+        self._waits = acquisition.mode == "same_tick"
+        self._line: SerialLine | None = None
+        self._block: CalibrationBlock | None = None
+        self._operator = np.zeros((6, 6 * len(self._weights)))
+        self._history = b""
+        self._history_size = len(self._weights) * RECORD_SIZE
+        self._unpackers: dict[int, Callable[[bytes], tuple[int, ...]]] = {}
+        self.stream = RecordStream()
+        self.status: list[str] = []
+        self._errors_in_a_row = 0
+        self._arrived = 0
+        self._arrived_ns = 0
+        self._due = 0
+        self._asked_ns = 0
+        self._looked_ns = 0
+        self._wait_now = False
+        self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.wrench_stale = True
+        self.wrench_saturated = False
+        self.wrench_time_ns = 0
+
+    def connect(self) -> None:
+        """Open the port, load the calibration and start the stream.
+
+        Raises
+        ------
+        DeviceError
+            If the sensor is absent, not the profile's, not sound, or does not stream.
+        """
+        self.close()
+        self._check_line_rate()
+        self._line = SerialLine(self._port, self._settings.baud, self._name)
+        try:
+            self._stop_streaming()
+            self._check_status()
+            self._block = self._read_block()
+            self._load_amplifiers(self._block)
+            self._check_status()
+            rows = self._block.calibration.wrench_per_wire_count()
+            self._operator = np.kron(np.array(self._weights), np.array(rows))
+            self._start_streaming()
+        except BaseException:
+            self._release()
+            raise
+
+    def calibration(self) -> dict[str, object]:
+        """Return identity, calibration and line as found, for the session file.
+
+        Raises
+        ------
+        DeviceError
+            If the sensor is not connected.
+        """
+        if self._block is None or self._line is None:
+            raise DeviceError(f"{self._name}: it is not connected.")
+        return {
+            "sensor": "ATI Digital F/T",
+            **self._block.calibration.as_dict(),
+            "calibration": self._settings.calibration,
+            "gains": list(self._block.gains),
+            "offsets": list(self._block.offsets),
+            "status": self.status,
+            "port": self._port,
+            "baud": self._settings.baud,
+            "low_latency": self._line.low_latency,
+            "stream_hz": self._settings.stream_hz,
+            "filter": self._settings.filter,
+            "filter_weights": list(self._weights),
+        }
+
+    def request(self, due_ns: int) -> None:  # noqa: ARG002
+        """Begin the tick; the sensor streams, so nothing is sent."""
+        now_ns = self._asked_ns = time.monotonic_ns()
+        self._wait_now = self._waits
+        if now_ns - self._looked_ns > _IDLE_NS and not self._lock_step:
+            # What has piled up is old, and perhaps full of holes: only what comes now counts.
+            self._take(self._open_line().read())
+            self._history = b""
+            self._due = self._arrived - self.stream.pending + RECORD_SIZE
+            self._wait_now = True
+
+    def read_wrench(self) -> Wrench:
+        """Return the wrench in N and N·m: the filter over the newest records.
+
+        Raises
+        ------
+        DeviceError
+            If the line is gone or the sensor reports an error.
+        """
+        line, wait = self._open_line(), self._wait_now
+        new = self._take(line.read())
+        while wait and self._arrived < self._due:
+            lacks_one = self._due - self._arrived <= RECORD_SIZE
+            patience_ns = self._patience_ns if lacks_one else self._deadline_ns
+            left_ns = self._asked_ns + patience_ns - time.monotonic_ns()
+            if left_ns <= 0:
+                break
+            line.wait(left_ns * 1e-9)
+            new += self._take(line.read())
+        self._looked_ns = time.monotonic_ns()
+        self._due = self._arrived - self.stream.pending + self._bytes_per_tick
+        if not new:
+            self.wrench_stale = True
+            return self._wrench
+        self.wrench_stale = False
+        gauges = self._unpack(new)
+        self.wrench_saturated = max(gauges) >= self._limit or min(gauges) <= -self._limit
+        return self._filter()
+
+    def measure(self, duration_s: float) -> dict[str, float]:
+        """Watch the stream for a while, between `connect` and the first tick.
+
+        Returns
+        -------
+        dict
+            ``records_hz`` (records a second), ``checksum_errors`` and ``dropped_bytes`` (counted
+            meanwhile), ``longest_gap_s`` (between arrivals: what the adapter holds back).
+            A simulated rig in lock-step streams nothing meanwhile.
+
+        Raises
+        ------
+        DeviceError
+            If the line is gone or the sensor reports an error.
+        """
+        line, stream = self._open_line(), self.stream
+        self._take(line.read())
+        records, errors, dropped = stream.records, stream.checksum_errors, stream.dropped_bytes
+        begin_ns = heard_ns = now_ns = time.monotonic_ns()
+        end_ns = begin_ns + int(duration_s * 1e9)
+        longest_ns = 0
+        while now_ns < end_ns:
+            line.wait((end_ns - now_ns) * 1e-9)
+            data = line.read()
+            now_ns = time.monotonic_ns()
+            if data or now_ns >= end_ns:
+                longest_ns = max(longest_ns, now_ns - heard_ns)
+                heard_ns = now_ns
+                self._take(data)
+        self._looked_ns = now_ns
+        return {
+            "records_hz": (stream.records - records) / ((now_ns - begin_ns) * 1e-9),
+            "checksum_errors": float(stream.checksum_errors - errors),
+            "dropped_bytes": float(stream.dropped_bytes - dropped),
+            "longest_gap_s": longest_ns * 1e-9,
+        }
+
+    def close(self) -> None:
+        """Stop the stream, ask the status word once more, and release the port. Never raises."""
+        if self._line is not None:
+            with suppress(DeviceError):
+                self._stop_streaming()
+                self.status = serial_status(self._read_status())
+        self._release()
+
+    def _release(self) -> None:
+        if self._line is not None:
+            self._line.close()
+        self._line = None
+
+    def _open_line(self) -> SerialLine:
+        if self._line is None:
+            raise DeviceError(f"{self._name}: it is not connected.")
+        return self._line
+
+    def _take(self, data: bytes) -> bytes:
+        """Sort what has arrived into records; return the new ones."""
+        if not data:
+            return data
+        self._arrived += len(data)
+        self._arrived_ns = time.monotonic_ns()
+        new = self.stream.feed(data)
+        if new:
+            if max(new[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:
+                self._count_errors(new)
+            else:
+                self._errors_in_a_row = 0
+            # Before the first tick's worth the oldest record stands for those before it.
+            history = self._history or new[:RECORD_SIZE] * len(self._weights)
+            self._history = (history + new)[-self._history_size :]
+        return new
+
+    def _filter(self) -> Wrench:
+        """Compute the wrench from the newest records."""
+        newest = np.frombuffer(self._history, _RECORD)["gauges"].astype(float)
+        fx, fy, fz, tx, ty, tz = (self._operator @ newest.ravel()).tolist()
+        self._wrench = wrench = (fx, fy, fz, tx, ty, tz)
+        self.wrench_time_ns = self._arrived_ns
+        return wrench
+
+    def _count_errors(self, records: bytes) -> None:
+        for check in records[RECORD_SIZE - 1 :: RECORD_SIZE]:
+            self._errors_in_a_row = self._errors_in_a_row + 1 if check & ERROR_BIT else 0
+            if self._errors_in_a_row >= _ERRORS_IN_A_ROW:
+                raise DeviceError(
+                    f"{self._name}: its records say that it has an error. Its status word says "
+                    "which: run rigd check."
+                )
+
+    def _unpack(self, records: bytes) -> tuple[int, ...]:
+        """Return the gauges of some records, without the checksums."""
+        n = len(records) // RECORD_SIZE
+        unpack = self._unpackers.get(n)
+        if unpack is None:
+            unpack = self._unpackers[n] = Struct(">" + "6hx" * n).unpack
+        return unpack(records)
+
+    def _check_line_rate(self) -> None:
+        settings = self._settings
+        needed = settings.stream_hz * RECORD_SIZE * BITS_PER_BYTE
+        if needed > settings.baud:
+            raise DeviceError(
+                f"{self._name}: {settings.stream_hz:g} records a second need {needed:.0f} bit/s "
+                f"on the line, more than {settings.baud} baud; change ati_serial.stream_hz or "
+                "ati_serial.baud."
+            )
+        if settings.stream_hz < self._rate_hz:
+            raise DeviceError(
+                f"{self._name}: {settings.stream_hz:g} records a second are fewer than the "
+                f"loop's {self._rate_hz:g} ticks; change ati_serial.stream_hz or rate_hz."
+            )
+
+    def _stop_streaming(self) -> None:
+        line = self._open_line()
+        for _ in range(_JAM_TRIES):
+            line.write(_JAM)
+            if line.drain(_QUIET_S, _DRAIN_LIMIT_S):
+                return
+        raise DeviceError(
+            f"{self._name}: it goes on sending although it was told to stop; switch it off and on, "
+            "and check that no other device is on this line."
+        )
+
+    def _ask(self, request: bytes, what: str) -> bytes:
+        """Return what the reply to a request holds; disturbed ones are asked for again."""
+        line, problem = self._open_line(), ""
+        for _ in range(_TRIES):
+            time.sleep(_SILENCE_S)
+            length = modbus.reply_length(request)
+            try:
+                return modbus.content_of(request, line.transact(request, length, _REPLY_TIMEOUT_S))
+            except modbus.Refused as error:
+                raise DeviceError(
+                    f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
+                    "Digital F/T sensor, and ati_serial.calibration."
+                ) from None
+            except modbus.BadReply as error:
+                problem = str(error)
+        raise DeviceError(
+            f"{self._name}: asked to {what}, it gave no usable reply in {_TRIES} tries: {problem}. "
+            "Check power, cable (A and B swapped?), ati_serial.port and ati_serial.baud."
+        )
+
+    def _read(self, first: int, count: int, what: str) -> tuple[int, ...]:
+        registers: tuple[int, ...] = ()
+        while len(registers) < count:
+            piece = min(modbus.MAX_REGISTERS, count - len(registers))
+            request = modbus.read_registers(first + len(registers), piece)
+            registers += modbus.registers_of(self._ask(request, what))
+        return registers
+
+    def _read_status(self) -> int:
+        return self._read(modbus.STATUS_WORD, 1, "tell its status")[0]
+
+    def _check_status(self) -> None:
+        word = self._read_status()
+        self.status = serial_status(word)
+        if word & SERIAL_CRITICAL:
+            raise DeviceError(
+                f"{self._name}: its status word {word:#06x} says that "
+                f"{'; '.join(serial_status(word & SERIAL_CRITICAL))}. It does not measure "
+                "properly: look at sensor, cable and supply."
+            )
+
+    def _read_block(self) -> CalibrationBlock:
+        number, wanted = self._settings.calibration, self._settings.serial_number
+        what = f"read out calibration {number}"
+        registers = self._read(first_register(number), BLOCK_REGISTERS, what)
+        try:
+            block = parse_block(registers)
+        except ValueError as error:
+            raise DeviceError(f"{self._name}, ati_serial.calibration {number}: {error}") from None
+        found = block.calibration.serial_number
+        if not same_serial_number(wanted, found):
+            raise DeviceError(
+                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
+                f"for {wanted} (ati_serial.serial_number). Check which sensor is on the rig."
+            )
+        return block
+
+    def _load_amplifiers(self, block: CalibrationBlock) -> None:
+        """Make the amplifiers' settings those that the calibration was done with."""
+        self._ask(modbus.UNLOCK, "unlock its memory")
+        try:
+            for first, values in (
+                (modbus.ACTIVE_GAINS, block.gains),
+                (modbus.ACTIVE_OFFSETS, block.offsets),
+            ):
+                self._ask(modbus.write_registers(first, values), "load gains and offsets")
+        finally:
+            self._ask(modbus.LOCK, "lock its memory")
+        written = tuple(chain(block.gains, block.offsets))
+        active = self._read(modbus.ACTIVE_GAINS, len(written), "tell its gains and offsets")
+        if active != written:
+            raise DeviceError(
+                f"{self._name}: gains and offsets read back as {active}, where {written} were "
+                "written. Switch it off and on; without them its calibration does not hold."
+            )
+
+    def _start_streaming(self) -> None:
+        line, request = self._open_line(), modbus.START_STREAMING
+        time.sleep(_SILENCE_S)
+        length = modbus.reply_length(request)
+        reply = line.transact(request, length, _REPLY_TIMEOUT_S)
+        try:
+            # The first records may be behind the reply already.
+            modbus.content_of(request, reply[:length])
+        except ValueError as error:
+            raise DeviceError(f"{self._name}: it does not start streaming: {error}.") from None
+        self._history = b""
+        self._errors_in_a_row = 0
+        self.stream.start(aligned=True)
+        before, first = self._arrived, self.stream.records
+        self._take(reply[length:])
+        end_ns = time.monotonic_ns() + int(_FIRST_RECORDS_TIMEOUT_S * 1e9)
+        # A simulated rig in lock-step sends the first records with the first tick.
+        while not self._lock_step and self.stream.records - first < len(self._weights):
+            if time.monotonic_ns() > end_ns:
+                raise DeviceError(
+                    f"{self._name}: it was told to stream, but of the "
+                    f"{self._arrived - before} bytes that came in {_FIRST_RECORDS_TIMEOUT_S} s "
+                    f"only {self.stream.records - first} were sound records. Check cable, "
+                    "ati_serial.baud and ati_serial.stream_hz."
+                )
+            line.wait(_SILENCE_S)
+            self._take(line.read())
+        if self._history:
+            # What stands where the first tick finds no new records.
+            self._filter()
+        self._looked_ns = time.monotonic_ns()
+        self._due = self._arrived - self.stream.pending + self._bytes_per_tick

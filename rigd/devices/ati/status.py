@@ -1,0 +1,70 @@
+"""The status words of both sensors in words, and which of their bits forbid measuring.
+
+Sources: devices.md 1.1 for NETCANOEM and 2.1 for Digital F/T. They differ in bits 9, 10 and 13.
+"""
+
+CAN_BAD_CALIBRATION = 0x0040
+CAN_BUS_ERROR = 0x4000
+
+_WATCHDOG = "its watchdog has reset the board"
+_EXCITATION_HIGH = "the gauges' excitation is too high"
+_EXCITATION_LOW = "the gauges' excitation is too low"
+_GROUND = "its artificial analogue ground is out of range"
+_SUPPLY_HIGH = "its supply voltage is too high"
+_SUPPLY_LOW = "its supply voltage is too low"
+_MEMORY = "its memory (EEPROM) has failed"
+_CONFIGURATION = "its configuration is invalid"
+
+_CAN_WORDS = {
+    0: _WATCHDOG,
+    1: _EXCITATION_HIGH,
+    2: _EXCITATION_LOW,
+    3: _GROUND,
+    4: _SUPPLY_HIGH,
+    5: _SUPPLY_LOW,
+    6: "the active calibration is bad",
+    7: _MEMORY,
+    8: _CONFIGURATION,
+    11: "the sensor is too hot",
+    12: "the sensor is too cold",
+    14: "it has seen errors on the CAN bus",
+}
+CAN_CRITICAL = 0x18FE
+"""Bits 1 to 7, 11 and 12."""
+
+_SERIAL_WORDS = {
+    0: _WATCHDOG,
+    1: _EXCITATION_HIGH,
+    2: _EXCITATION_LOW,
+    3: _GROUND,
+    4: _SUPPLY_HIGH,
+    5: _SUPPLY_LOW,
+    7: _MEMORY,
+    8: _CONFIGURATION,
+    9: "the bridges take too much current (broken gauge or cable)",
+    10: "the bridges take too little current (broken gauge or cable)",
+    11: "the reading of its thermistor is too high",
+    12: "the reading of its thermistor is too low",
+    13: "the reading of its analogue output is out of range",
+}
+SERIAL_CRITICAL = 0x3EBE
+"""Bits 1 to 5, 7 and 9 to 13: what is critical on NETCANOEM, and the bits only this one has."""
+
+
+def can_status(word: int) -> list[str]:
+    """Return what the status word of a NETCANOEM box says, one clause a bit."""
+    # Bit 15 only sums up the others.
+    return _words(word & 0x7FFF, _CAN_WORDS)
+
+
+def serial_status(word: int) -> list[str]:
+    """Return what the status word of a Digital F/T sensor says, one clause a bit."""
+    return _words(word, _SERIAL_WORDS)
+
+
+def _words(word: int, table: dict[int, str]) -> list[str]:
+    return [
+        table.get(bit, f"status bit {bit}, which has no known meaning, is set")
+        for bit in range(16)
+        if word >> bit & 1
+    ]

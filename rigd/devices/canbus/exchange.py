@@ -1,0 +1,117 @@
+"""The cyclic exchange on one port: who gets which frame, and waiting for replies."""
+
+import time
+from collections.abc import Callable
+
+from rigd.devices.canbus.frame import ERROR_FLAG, ERROR_MASK, read_head
+from rigd.devices.canbus.port import CanPort
+from rigd.devices.contracts import DeviceError
+
+Handler = Callable[[bytes], None]
+
+# linux/can/error.h: class in the identifier, state of the controller in data[1].
+_BUS_OFF = 0x40
+_CONTROLLER = 0x04
+_CONTROLLER_STATE = 1
+_PASSIVE = 0x30
+_NO_ACKNOWLEDGE = 0x20
+
+
+class CanExchange:
+    """Routes the frames of a port to the drivers that share it.
+
+    Parameters
+    ----------
+    port
+        Open.
+
+    Attributes
+    ----------
+    error_frames : int
+        How often the controller reported a disturbance.
+    send
+        The port's, unchanged.
+    """
+
+    def __init__(self, port: CanPort) -> None:
+        self.port = port
+        self.send = port.send
+        self._receive = port.receive
+        self._handlers: dict[int, Handler] = {}
+        self.error_frames = 0
+        self._bus_off = ""
+
+    def subscribe(self, can_id: int, handler: Handler) -> None:
+        """Have a handler called with the data of each frame of this identifier.
+
+        Raises
+        ------
+        DeviceError
+            If another driver takes these frames already.
+        """
+        if can_id in self._handlers:
+            raise DeviceError(
+                f"CAN bus {self.port.name}: two devices use the identifier {can_id:#x}; give one "
+                "of them another base or node id in the profile."
+            )
+        self._handlers[can_id] = handler
+
+    def start(self) -> None:
+        """Drop what is queued, and have the port let in only what somebody subscribed to."""
+        self.port.accept(self._handlers)
+        while self._receive() is not None:
+            pass
+
+    def drain(self) -> None:
+        """Deliver everything that has arrived.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is gone, or its controller has switched itself off.
+        """
+        receive, handlers = self._receive, self._handlers
+        while (raw := receive()) is not None:
+            can_id, length = read_head(raw)
+            handler = handlers.get(can_id)
+            if handler is not None:
+                handler(raw[8 : 8 + length])
+            elif can_id & ERROR_FLAG:
+                self._note_error(can_id & ERROR_MASK, raw[8:16])
+        if self._bus_off:
+            raise DeviceError(self._bus_off)
+
+    def wait_until(self, ready: Callable[[], bool], deadline_ns: int) -> bool:
+        """Deliver frames until `ready` says yes, or until a time of ``time.monotonic_ns``.
+
+        Returns
+        -------
+        bool
+            Whether it is ready.
+        """
+        self.drain()
+        while not ready():
+            left_ns = deadline_ns - time.monotonic_ns()
+            if left_ns <= 0:
+                return False
+            self.port.wait(left_ns * 1e-9)
+            self.drain()
+        return True
+
+    def _note_error(self, kind: int, data: bytes) -> None:
+        self.error_frames += 1
+        if kind & _BUS_OFF:
+            self._bus_off = (
+                f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
+                "many errors; look at cable, termination and bit rate, then bring it up again."
+            )
+        elif kind & _NO_ACKNOWLEDGE:
+            self._bus_off = (
+                f"CAN bus {self.port.name}: nobody acknowledges our frames; look at cable, "
+                "termination, power and bit rate."
+            )
+        elif kind & _CONTROLLER and data[_CONTROLLER_STATE] & _PASSIVE:
+            self._bus_off = (
+                f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
+                "disturbed; look at cable and termination."
+            )

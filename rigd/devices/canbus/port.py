@@ -1,0 +1,245 @@
+"""Ports: where frames go out and come in, without blocking."""
+
+import errno
+import select
+import socket
+import struct
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Protocol
+
+from rigd.devices.canbus.frame import ERROR_MASK, FRAME_SIZE, SFF_MASK
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import CanBus
+from rigd.devices.simulator import SimulatorAddress
+
+if TYPE_CHECKING:
+    import can
+
+# What the kernel keeps for a reader that is late: some 200 ms of a full bus.
+_RECEIVE_BUFFER = 212_992
+_CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
+
+
+class CanPort(Protocol):
+    """One connection to a bus. Nothing here blocks, but for `wait`."""
+
+    name: str
+    """Of the bus, for messages."""
+
+    def send(self, frame: bytes) -> None:
+        """Send 16 bytes made by :func:`rigd.devices.canbus.pack_frame`.
+
+        Raises
+        ------
+        DeviceError
+            If the bus does not take it.
+        """
+
+    def receive(self) -> bytes | None:
+        """Return the next frame that has arrived, of 16 bytes, or None.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is gone.
+        """
+
+    def wait(self, timeout_s: float) -> None:
+        """Return as soon as a frame may have arrived, or after the timeout."""
+
+    def accept(self, can_ids: Iterable[int]) -> None:
+        """Let in only these identifiers from now on, and what the controller says of itself."""
+
+    def open_bus(self) -> "can.BusABC":
+        """Return a python-can bus on this port, for set-up; closing it leaves the port open."""
+
+    def close(self) -> None:
+        """Release the port; harmless when repeated."""
+
+
+class SocketPort:
+    """A socket that carries ``struct can_frame``: the kernel's CAN, or the simulated bus.
+
+    Parameters
+    ----------
+    link
+        Connected; made non-blocking.
+    name
+        Of the bus, for messages.
+    """
+
+    def __init__(self, link: socket.socket, name: str) -> None:
+        link.setblocking(False)
+        self._link = link
+        self._send = link.send
+        self._recv = link.recv
+        self._fd = [link.fileno()]
+        self.name = name
+
+    def send(self, frame: bytes) -> None:
+        """Send one frame of 16 bytes."""
+        try:
+            self._send(frame)
+        except OSError as error:
+            raise DeviceError(self._why("takes no more frames", error)) from None
+
+    def receive(self) -> bytes | None:
+        """Return the next frame, or None."""
+        try:
+            raw = self._recv(FRAME_SIZE)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise DeviceError(self._why("cannot be read", error)) from None
+        if len(raw) != FRAME_SIZE:
+            raise DeviceError(f"CAN bus {self.name}: it was cut off; look at cable and adapter.")
+        return raw
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for a frame."""
+        select.select(self._fd, (), (), timeout_s)
+
+    def accept(self, can_ids: Iterable[int]) -> None:
+        """Have the kernel drop all other identifiers; a simulated bus brings them all."""
+        if self._link.family == getattr(socket, "AF_CAN", None):
+            filters = b"".join(
+                struct.pack("=II", can_id, SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG)
+                for can_id in sorted(set(can_ids))
+            )
+            self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+
+    def open_bus(self) -> "can.BusABC":
+        """Return a python-can bus that sends and receives through this port."""
+        from rigd.devices.canbus.setup_bus import SetupBus
+
+        return SetupBus(self)
+
+    def close(self) -> None:
+        """Close the socket."""
+        with suppress(OSError):
+            self._link.close()
+
+    def _why(self, what: str, error: OSError) -> str:
+        remedy = (
+            "no other device acknowledges: look at cable, termination, power and bit rate"
+            if error.errno in (errno.ENOBUFS, errno.EAGAIN)
+            else "look at cable and adapter"
+        )
+        return f"CAN bus {self.name}: it {what} ({error.strerror}); {remedy}."
+
+
+class PythonCanPort:
+    """Any adapter that python-can knows. It costs about three times what a socket costs."""
+
+    def __init__(self, bus: "can.BusABC", name: str) -> None:
+        import can
+
+        from rigd.devices.canbus.setup_bus import from_message, to_message
+
+        self._bus = bus
+        self._to_message, self._from_message = to_message, from_message
+        self._error = can.CanError
+        self._next: bytes | None = None
+        self.name = name
+
+    def send(self, frame: bytes) -> None:
+        """Send one frame of 16 bytes."""
+        try:
+            self._bus.send(self._to_message(frame), timeout=0.0)
+        except (self._error, OSError) as error:
+            raise DeviceError(f"CAN bus {self.name}: it takes no more frames ({error}).") from None
+
+    def receive(self) -> bytes | None:
+        """Return the next frame, or None."""
+        if self._next is not None:
+            raw, self._next = self._next, None
+            return raw
+        return self._receive(0.0)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for a frame."""
+        if self._next is None:
+            self._next = self._receive(timeout_s)
+
+    def accept(self, can_ids: Iterable[int]) -> None:
+        """Nothing: filters of python-can end a poll at each frame they drop, and drop reports."""
+
+    def open_bus(self) -> "can.BusABC":
+        """Return a python-can bus that sends and receives through this port."""
+        from rigd.devices.canbus.setup_bus import SetupBus
+
+        return SetupBus(self)
+
+    def close(self) -> None:
+        """Shut the adapter down."""
+        with suppress(self._error, OSError):
+            self._bus.shutdown()
+
+    def _receive(self, timeout_s: float) -> bytes | None:
+        try:
+            message = self._bus.recv(timeout_s)
+        except (self._error, OSError) as error:
+            raise DeviceError(f"CAN bus {self.name}: it cannot be read ({error}).") from None
+        return None if message is None else self._from_message(message)
+
+
+def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
+    """Open the bus that a profile names, or the one of the simulated rig that stands in for it.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such bus here; the message says how to get one.
+    """
+    name = f"{settings.channel} ({settings.interface})"
+    if simulator is not None and simulator.can_socket:
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            link.connect(simulator.can_socket)
+        except OSError as error:
+            link.close()
+            raise DeviceError(
+                f"CAN bus {name}: the simulated rig does not answer ({error.strerror}); start "
+                "rigd simulate again."
+            ) from None
+        return SocketPort(link, f"{name}, simulated")
+    if settings.interface == "socketcan":
+        return SocketPort(_open_socketcan(settings), name)
+    import can
+
+    try:
+        bus = can.Bus(
+            interface=settings.interface, channel=settings.channel, bitrate=settings.bitrate_bit_s
+        )
+    except (can.CanError, OSError, ValueError, ImportError) as error:
+        raise DeviceError(
+            f"CAN bus {name}: it cannot be opened ({error}); check can.interface and can.channel."
+        ) from None
+    return PythonCanPort(bus, name)
+
+
+def _open_socketcan(settings: CanBus) -> socket.socket:
+    channel = settings.channel
+    remedy = (
+        f"bring it up with: ip link set {channel} up type can bitrate {settings.bitrate_bit_s}; "
+        "or start the simulated rig: rigd simulate --profile PROFILE"
+    )
+    if not hasattr(socket, "AF_CAN"):
+        raise DeviceError(f"CAN bus {channel}: this system has no CAN sockets; {remedy}.")
+    try:
+        link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    except OSError as error:
+        raise DeviceError(
+            f"CAN bus {channel}: this kernel has no CAN sockets ({error.strerror}); {remedy}."
+        ) from None
+    try:
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        link.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", ERROR_MASK))
+        link.bind((channel,))
+    except OSError as error:
+        link.close()
+        raise DeviceError(
+            f"CAN bus {channel}: it cannot be opened ({error.strerror}); {remedy}."
+        ) from None
+    return link

@@ -1,0 +1,366 @@
+"""The drive on its bus: set-up, the exchange of every tick, its guards, enabling and disabling.
+
+What a tick cannot know: a TPDO does not say which SYNC it answers. Replies are counted. Where one
+did not come in time, the next tick wants two, and takes a single one for late; if no second comes
+before the SYNC after it, the missing one counts as lost. A reply that is late by more than a whole
+period every time would therefore be paired with the SYNC after its own; that is why
+:meth:`Cia402Drive.connect` measures the delay of a reply to the first SYNC, which is alone.
+"""
+
+from math import isnan
+
+from rigd.devices.canbus import CanExchange, CanLink
+from rigd.devices.cia402.frames import NodeFrames
+from rigd.devices.cia402.inbox import Inbox
+from rigd.devices.cia402.node import Node
+from rigd.devices.cia402.objects import HEARTBEAT_CONSUMER
+from rigd.devices.cia402.setup import reset_fault, set_up, torque_limit_per_mille
+from rigd.devices.cia402.states import (
+    DISABLE_VOLTAGE,
+    ENABLE_OPERATION,
+    ENABLED,
+    FAULT_BIT,
+    FOLLOWS_TARGET,
+    STATE_BITS,
+    DriveState,
+    state_of,
+)
+from rigd.devices.cia402.switching import step_up, switch_off
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
+
+_HALF_TURN = 1 << 31
+_ALL_COUNTS = (1 << 32) - 1
+
+
+class Cia402Drive:
+    """A CiA 402 servo drive in cyclic synchronous torque mode.
+
+    Where ``acquisition.deadline_us`` is longer than a period, the drive is a simulated one in
+    lock-step, whose time passes with the SYNCs: then every reply is waited for, a SYNC counts as
+    one period, and nothing depends on how fast this computer is.
+
+    Parameters
+    ----------
+    rig
+        With the sections ``cia402`` and ``acquisition``.
+    link
+        The bus, which may be shared.
+
+    Attributes
+    ----------
+    angle_stale : bool
+        The last angle read is not the one of the SYNC it belongs to.
+    angle_time_ns : int
+        ``time.monotonic_ns`` when the SYNC of the last angle was sent.
+    angle_rad : float
+        The last angle, from the position at :meth:`connect`.
+    """
+
+    def __init__(self, rig: RigParameters, link: CanLink) -> None:
+        assert rig.cia402 is not None
+        assert rig.acquisition is not None
+        settings = rig.cia402
+        self._rig = rig
+        self._link = link
+        self._name = f"Drive (CANopen node {settings.node_id})"
+        self._frames = NodeFrames(settings.node_id, settings.host_node_id)
+        self._idle = self._frames.rpdo(DISABLE_VOLTAGE, 0)
+        self._inbox = Inbox(self._name)
+        self._same_tick = rig.acquisition.mode == "same_tick"
+        self._silence_ns = round(settings.drive_heartbeat_timeout_s * 1e9)
+        self._rad_per_count = rig.encoder.resolution_rad * settings.direction
+        self._per_mille_per_nm = 1000 * settings.direction / rig.motor.rated_torque_nm
+        self._limit = torque_limit_per_mille(rig)
+        self._open = False
+        self._subscribed: CanExchange | None = None
+        self._node: Node | None = None
+        self._identity: dict[str, object] = {}
+        self._enabled = False
+        self._may_be_on = False
+        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        self._awaiting = False
+        # The SYNC before the last was not answered in time; its reply may still come.
+        self._overdue = False
+        self._heard_ns = 0
+        self._position = 0
+        self._counts = 0
+        self.angle_rad = 0.0
+        self.angle_stale = False
+        self.angle_time_ns = 0
+
+    def connect(self) -> None:
+        """Open the bus, verify and configure the drive, start it, and take its angle as zero.
+
+        Between this and the first tick no SYNC is sent, and no heartbeat.
+
+        Raises
+        ------
+        DeviceError
+            If the drive is absent, in fault, not what the profile says, or does not take the
+            configuration.
+        """
+        if self._rig.encoder.resolution_rad == 0:
+            raise DeviceError(
+                f"{self._name}: encoder.resolution_rad = 0 rad, but a drive counts encoder steps; "
+                "give the angle of one count at the output shaft."
+            )
+        exchange = self._open_link()
+        self._node = None
+        self._enabled = self._may_be_on = False
+        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        self._inbox.clear()
+        self._identity = set_up(exchange.port, self._rig, self._name)
+        self._subscribe(exchange)
+        exchange.start()
+        node = self._node = Node(self._rig, exchange, self._frames, self._inbox)
+        node.go_operational()
+        node.await_first_reply()
+        self._position, self._counts = self._inbox.position, 0
+        self.angle_rad = 0.0
+        self.angle_stale = False
+        self.angle_time_ns = node.sync_ns
+        # That reply is of no tick.
+        self._awaiting = self._overdue = False
+        node.resume()
+
+    def identity(self) -> dict[str, object]:
+        """Return what the drive said of itself at :meth:`connect`, for reports.
+
+        Returns
+        -------
+        dict
+            ``vendor_id``, ``product_code``, ``revision``, ``serial_number`` (None where it has
+            none), ``device_name``, ``supported_modes`` (object 6502), ``rated_torque_counts``
+            (6076) and, where the profile gives its unit, ``rated_torque_nm`` at the output shaft.
+        """
+        return dict(self._identity)
+
+    def enable(self) -> None:
+        """Bring the drive to operation enabled, at zero torque.
+
+        Sends SYNC, RPDO and heartbeat itself, once a period; meant to be called between two ticks.
+
+        Raises
+        ------
+        DeviceError
+            If the drive does not get there; it is then disabled again.
+        """
+        node = self._connected()
+        if self._enabled:
+            return
+        node.refuse_alarm()
+        self._may_be_on = True
+        try:
+            step_up(node)
+        except DeviceError:
+            self.disable()
+            raise
+        self._enabled = True
+        self._guard_mask = STATE_BITS | FOLLOWS_TARGET
+        self._guard_value = ENABLED | FOLLOWS_TARGET
+        self._resume(node)
+
+    def latch(self, due_ns: int) -> None:
+        """Send SYNC, on which the drive latches its angle, and the heartbeat when it is due.
+
+        Parameters
+        ----------
+        due_ns
+            When the tick was due; heartbeats of both sides are timed by it.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is gone.
+        """
+        node = self._connected()
+        if not self._same_tick:
+            if self._awaiting:
+                self._settle_previous(node)
+            else:
+                self.angle_stale = True
+        elif self._awaiting or self.angle_stale:
+            # A reply that comes before the next SYNC is sent is late, and nothing else.
+            node.exchange.drain()
+            self._overdue = not self._inbox.replies and (self._overdue or self._awaiting)
+        node.send_sync()
+        self._awaiting = True
+        node.now_ns = node.now_ns + node.period_ns if node.lock_step else due_ns
+        node.send_heartbeat()
+
+    def read_angle(self) -> float:
+        """Return the angle in rad at the output shaft, from the position at :meth:`connect`.
+
+        Raises
+        ------
+        DeviceError
+            If the drive has reported a fault, has left the state it should be in, or is silent.
+        """
+        node = self._connected()
+        if self._same_tick and self._awaiting:
+            self._awaiting = False
+            node.exchange.wait_until(self._answered, node.sync_ns + node.deadline_ns)
+            self._settle(node)
+        inbox = self._inbox
+        if inbox.heard:
+            inbox.heard = False
+            self._heard_ns = node.now_ns
+        if (
+            inbox.alarm
+            or inbox.statusword & self._guard_mask != self._guard_value
+            or node.now_ns - self._heard_ns > self._silence_ns
+        ):
+            self._complain(node)
+        return self.angle_rad
+
+    def command(self, torque_nm: float) -> float:
+        """Set the torque in N·m at the output shaft; clipped to the motor's peak torque.
+
+        A drive that is not enabled gets zero torque and the command to stay so.
+
+        Returns
+        -------
+        float
+            The torque as sent, a whole number of thousandths of the rated torque.
+
+        Raises
+        ------
+        DeviceError
+            If the torque is not a number, or the bus is gone.
+        """
+        send = self._connected().exchange.send
+        if not self._enabled:
+            send(self._idle)
+            return 0.0
+        per_mille = torque_nm * self._per_mille_per_nm
+        limit = self._limit
+        if not -limit <= per_mille <= limit:
+            if isnan(per_mille):
+                raise DeviceError(f"{self._name}: the torque command is not a number.")
+            per_mille = limit if per_mille > 0 else -limit
+        sent = round(per_mille)
+        send(self._frames.rpdo(ENABLE_OPERATION, sent))
+        return sent / self._per_mille_per_nm
+
+    def disable(self) -> None:
+        """Zero the torque and disable the drive. Works in every state and never raises.
+
+        If the statusword does not show it off within some 50 ms, the command goes by SDO as well,
+        and last the node is stopped.
+        """
+        self._enabled = False
+        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        node = self._node
+        if node is None:
+            return
+        if not self._may_be_on:
+            node.send_if_possible(self._idle)
+            return
+        if switch_off(node):
+            self._may_be_on = False
+        self._resume(node)
+
+    def reset_fault(self) -> str | None:
+        """Reset a fault, for the operator; the drive stays disabled and has to be connected anew.
+
+        Returns
+        -------
+        str or None
+            What the fault was, in words; None if there was none.
+
+        Raises
+        ------
+        DeviceError
+            If the drive does not answer, or the fault stands.
+        """
+        self.disable()
+        exchange = self._open_link()
+        self._node = None
+        return reset_fault(exchange.port, self._rig, self._name)
+
+    def close(self) -> None:
+        """Disable, have the drive leave operational and expect no more heartbeats; release."""
+        self.disable()
+        self._inbox.watching = False
+        node, self._node = self._node, None
+        if node is not None:
+            node.send_if_possible(self._frames.pre_operational)
+            node.write(self._frames.forget_heartbeat, HEARTBEAT_CONSUMER, 1)
+        if self._open:
+            self._open = False
+            self._link.close()
+
+    def _connected(self) -> Node:
+        if self._node is None:
+            raise DeviceError(f"{self._name}: it is not connected.")
+        return self._node
+
+    def _open_link(self) -> CanExchange:
+        if not self._open:
+            self._link.open()
+            self._open = True
+        return self._link.exchange
+
+    def _subscribe(self, exchange: CanExchange) -> None:
+        if self._subscribed is exchange:
+            return
+        self._subscribed = exchange
+        exchange.subscribe(self._frames.tpdo_id, self._inbox.take_tpdo)
+        exchange.subscribe(self._frames.emergency_id, self._inbox.take_emergency)
+        exchange.subscribe(self._frames.heartbeat_id, self._inbox.take_heartbeat)
+        exchange.subscribe(self._frames.reply_id, self._inbox.take_reply)
+
+    def _resume(self, node: Node) -> None:
+        """Go on with the ticks after switching; the reply to its last SYNC has come, or is lost."""
+        node.resume()
+        self._awaiting = True
+        self._overdue = False
+
+    def _answered(self) -> bool:
+        return self._inbox.replies > self._overdue
+
+    def _settle_previous(self, node: Node) -> None:
+        """Take the reply to the SYNC of the tick before, which should have come by now."""
+        if node.lock_step:
+            node.exchange.wait_until(self._answered, node.sync_ns + node.deadline_ns)
+        else:
+            node.exchange.drain()
+        self._settle(node)
+
+    def _settle(self, node: Node) -> None:
+        """Take the position if it is the reply to the last SYNC."""
+        inbox = self._inbox
+        fresh = inbox.replies > self._overdue
+        self._overdue = not inbox.replies
+        inbox.replies = 0
+        self.angle_stale = not fresh
+        if fresh:
+            position = inbox.position
+            # The counter of 32 bits wraps around.
+            self._counts += (position - self._position + _HALF_TURN & _ALL_COUNTS) - _HALF_TURN
+            self._position = position
+            self.angle_rad = self._counts * self._rad_per_count
+            self.angle_time_ns = node.sync_ns
+
+    def _complain(self, node: Node) -> None:
+        """Say what is wrong with the drive."""
+        node.refuse_alarm()
+        statusword = self._inbox.statusword
+        if statusword & self._guard_mask & STATE_BITS != self._guard_value & STATE_BITS:
+            raise DeviceError(
+                f'{self._name}: it has left "{DriveState.OPERATION_ENABLED.value}" for '
+                f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}) by itself; look '
+                "at STO, supply and its own diagnosis."
+            )
+        if statusword & self._guard_mask != self._guard_value:
+            raise DeviceError(
+                f"{self._name}: it ignores the target torque: bit 12 of its statusword "
+                f"0x{statusword:04X} is not set; look at its own diagnosis."
+            )
+        silence_s = (node.now_ns - self._heard_ns) * 1e-9
+        raise DeviceError(
+            f"{self._name}: no heartbeat for {silence_s:.3g} s, more than "
+            f"cia402.drive_heartbeat_timeout_s = {node.settings.drive_heartbeat_timeout_s:g} s; "
+            "look at its supply and at the cable."
+        )

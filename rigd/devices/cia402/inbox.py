@@ -1,0 +1,120 @@
+"""What has come from the drive: handlers of its frames, which take any content and never raise."""
+
+from struct import error as LengthError  # noqa: N812
+
+from rigd.devices.cia402.faults import describe_error
+from rigd.devices.cia402.frames import (
+    BOOT_UP,
+    NMT_STATES,
+    OPERATIONAL,
+    read_emergency,
+    unpack_tpdo,
+)
+
+_TOGGLE_BIT = 0x80
+
+
+class Inbox:
+    """The drive's last words. A frame of the wrong length counts as one that has not come.
+
+    Parameters
+    ----------
+    name
+        Of the drive, for messages.
+
+    Attributes
+    ----------
+    statusword, position
+        Of the last TPDO; position in counts.
+    replies : int
+        TPDOs since somebody set this to zero.
+    nmt_state : int or None
+        Of the last heartbeat.
+    heard : bool
+        A heartbeat has come since somebody set this to False.
+    watching : bool
+        The drive is meant to stay operational.
+    alarm : str
+        Why a session has to end, as a sentence for the operator: an emergency message, a restart,
+        a drive that has left operational. The first reason stays; empty: none.
+    emergency : bool
+        An emergency message has come.
+    reply : bytes
+        The last SDO reply.
+    malformed : int
+        Frames of the wrong length.
+    """
+
+    __slots__ = (
+        "alarm",
+        "emergency",
+        "heard",
+        "malformed",
+        "name",
+        "nmt_state",
+        "position",
+        "replies",
+        "reply",
+        "statusword",
+        "watching",
+    )
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.malformed = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything but the number of malformed frames."""
+        self.statusword = 0
+        self.position = 0
+        self.replies = 0
+        self.nmt_state: int | None = None
+        self.heard = False
+        self.watching = False
+        self.alarm = ""
+        self.emergency = False
+        self.reply = b""
+
+    def take_tpdo(self, data: bytes) -> None:
+        """Take statusword and position."""
+        try:
+            self.statusword, self.position, _ = unpack_tpdo(data)
+        except LengthError:
+            self.malformed += 1
+            return
+        self.replies += 1
+
+    def take_emergency(self, data: bytes) -> None:
+        """Take an emergency message; a code of zero only ends one."""
+        message = read_emergency(data)
+        if message is None:
+            self.malformed += 1
+            return
+        code, _, vendor = message
+        if code >> 8 == 0:
+            return
+        self.emergency = True
+        if not self.alarm:
+            own = f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else ""
+            self.alarm = f"{self.name}: emergency message: {describe_error(code)}{own}."
+
+    def take_heartbeat(self, data: bytes) -> None:
+        """Take a heartbeat, or the message that the drive has started."""
+        if not data:
+            self.malformed += 1
+            return
+        state = data[0] & ~_TOGGLE_BIT
+        self.nmt_state = state
+        self.heard = True
+        if self.watching and state != OPERATIONAL and not self.alarm:
+            if state == BOOT_UP:
+                what = "it has restarted by itself; look at its supply"
+            else:
+                words = NMT_STATES.get(state, f"state {state}")
+                what = f"it has left operational for {words}, as it does when it misses heartbeats"
+            self.alarm = f"{self.name}: {what}."
+
+    def take_reply(self, data: bytes) -> None:
+        """Take an SDO reply."""
+        self.reply = data

@@ -1,0 +1,205 @@
+"""The drive as a partner on the bus: start, SYNC, heartbeat, replies and requests."""
+
+import time
+from contextlib import suppress
+from math import ceil
+
+from rigd.devices.canbus import CanExchange
+from rigd.devices.cia402.frames import OPERATIONAL, NodeFrames, is_written
+from rigd.devices.cia402.inbox import Inbox
+from rigd.devices.cia402.states import FAULT_BIT, state_of
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
+
+_LONG_AGO_NS = -(1 << 62)
+_START_PATIENCE_NS = 1_000_000_000
+"""For going operational, beside three periods of the drive's heartbeat."""
+_FIRST_REPLY_NS = 100_000_000
+_FIRST_REPLIES = 20
+"""SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""
+_WRITTEN_NS = 50_000_000
+_REASON_NS = 5_000_000
+"""How long a drive in fault has to say why."""
+
+
+class Node:
+    """One connection to a drive that has been set up.
+
+    Parameters
+    ----------
+    rig
+        With the sections ``cia402`` and ``acquisition``.
+    exchange
+        Started; delivers the drive's frames to the inbox.
+    frames, inbox
+        Of the drive.
+
+    Attributes
+    ----------
+    lock_step : bool
+        The drive is a simulated one whose time passes with the SYNCs: replies are waited for, and
+        nothing is paced.
+    sync_ns : int
+        ``time.monotonic_ns`` of the last SYNC.
+    now_ns : int
+        Time by which heartbeats go: that of the ticks, or in lock-step the drive's.
+    """
+
+    def __init__(
+        self, rig: RigParameters, exchange: CanExchange, frames: NodeFrames, inbox: Inbox
+    ) -> None:
+        assert rig.cia402 is not None
+        assert rig.acquisition is not None
+        self.name = inbox.name
+        self.exchange = exchange
+        self.frames = frames
+        self.inbox = inbox
+        self.settings = rig.cia402
+        self.rate_hz = rig.rate_hz
+        self.period_ns = round(1e9 / rig.rate_hz)
+        self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
+        self.lock_step = self.deadline_ns > self.period_ns
+        self.sync_ns = 0
+        self.now_ns = 0
+        self._reset_command = f"rigd reset --profile {rig.name}"
+        self._heartbeat_ns = round(self.settings.heartbeat_period_s * 1e9)
+        self._next_heartbeat_ns = _LONG_AGO_NS
+
+    def go_operational(self) -> None:
+        """Start the node and wait for the heartbeat that says so.
+
+        Raises
+        ------
+        DeviceError
+            If none comes.
+        """
+        inbox = self.inbox
+        inbox.nmt_state = None
+        self.exchange.send(self.frames.start)
+        period_s = self.settings.drive_heartbeat_period_s
+        if self.lock_step:
+            # Its time does not pass without SYNC, not even up to its next heartbeat.
+            turns = ceil(3 * period_s * self.rate_hz)
+            while not self._is_operational() and turns > 0 and self.sync():
+                turns -= 1
+        else:
+            patience_ns = _START_PATIENCE_NS + round(3e9 * period_s)
+            self.exchange.wait_until(self._is_operational, time.monotonic_ns() + patience_ns)
+        if not self._is_operational():
+            told = (
+                "no heartbeat came"
+                if inbox.nmt_state is None
+                else f"its heartbeat says {inbox.nmt_state}"
+            )
+            raise DeviceError(
+                f"{self.name}: it does not become operational ({told}, {OPERATIONAL} was "
+                "expected); look at its own diagnosis."
+            )
+        inbox.watching = True
+
+    def await_first_reply(self) -> None:
+        """Have SYNC answered, within a period.
+
+        Raises
+        ------
+        DeviceError
+            If that does not succeed, or the drive is in fault.
+        """
+        best_ns = None
+        for _ in range(_FIRST_REPLIES):
+            if not self.sync(_FIRST_REPLY_NS):
+                break
+            delay_ns = time.monotonic_ns() - self.sync_ns
+            best_ns = delay_ns if best_ns is None else min(best_ns, delay_ns)
+            if delay_ns <= self.period_ns or self.lock_step:
+                self.refuse_alarm()
+                return
+        if best_ns is None:
+            raise DeviceError(
+                f"{self.name}: it does not answer SYNC with its TPDO, although it is operational; "
+                "look at its own diagnosis."
+            )
+        raise DeviceError(
+            f"{self.name}: it answers SYNC only after {best_ns * 1e-6:.2g} ms, more than the "
+            f"period of {self.period_ns * 1e-6:g} ms; look at bit rate and adapter, or choose a "
+            "lower rig.rate_hz."
+        )
+
+    def send_sync(self) -> None:
+        """Send SYNC; replies are counted anew."""
+        self.inbox.replies = 0
+        self.sync_ns = time.monotonic_ns()
+        self.exchange.send(self.frames.sync)
+
+    def send_heartbeat(self) -> None:
+        """Send this computer's heartbeat if it is due."""
+        if self.now_ns >= self._next_heartbeat_ns:
+            self.exchange.send(self.frames.heartbeat)
+            self._next_heartbeat_ns = self.now_ns + self._heartbeat_ns
+
+    def resume(self) -> None:
+        """Go on with the ticks after a time that they have not seen: both heartbeats start anew."""
+        self._next_heartbeat_ns = _LONG_AGO_NS
+        self.inbox.heard = True
+
+    def await_reply(self, patience_ns: int = 0) -> bool:
+        """Wait for a TPDO: one period or as given, in lock-step for as long as it takes."""
+        patience_ns = self.deadline_ns if self.lock_step else patience_ns or self.period_ns
+        return self.exchange.wait_until(self._is_answered, self.sync_ns + patience_ns)
+
+    def sync(self, patience_ns: int = 0) -> bool:
+        """Send SYNC and return whether it was answered."""
+        self.send_sync()
+        return self.await_reply(patience_ns)
+
+    def await_grid(self, grid_ns: int) -> None:
+        """Wait for the next SYNC as the ticks will go on: whole periods after `grid_ns`."""
+        if self.lock_step:
+            return
+        wait_ns = self.period_ns - (time.monotonic_ns() - grid_ns) % self.period_ns
+        time.sleep(wait_ns * 1e-9)
+
+    def write(self, request: bytes, index: int, sub: int) -> bool:
+        """Send an SDO request to write, and return whether it was confirmed in time."""
+        inbox = self.inbox
+        inbox.reply = b""
+        try:
+            self.exchange.send(request)
+            return self.exchange.wait_until(
+                lambda: is_written(inbox.reply, index, sub), time.monotonic_ns() + _WRITTEN_NS
+            )
+        except (DeviceError, OSError):
+            return False
+
+    def send_if_possible(self, frame: bytes) -> None:
+        """Send a frame, or not."""
+        with suppress(DeviceError, OSError):
+            self.exchange.send(frame)
+
+    def refuse_alarm(self) -> None:
+        """Refuse to go on with a drive that has reported something, or is in fault.
+
+        Raises
+        ------
+        DeviceError
+            With the reason.
+        """
+        inbox = self.inbox
+        in_fault = bool(inbox.statusword & FAULT_BIT)
+        if in_fault and not inbox.alarm:
+            self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)
+        if not (in_fault or inbox.alarm):
+            return
+        reason = inbox.alarm or (
+            f'{self.name}: it is in the state "{state_of(inbox.statusword).value}" (statusword '
+            f"0x{inbox.statusword:04X}) and names no cause."
+        )
+        if in_fault or inbox.emergency:
+            reason += f" Remove the cause, then: {self._reset_command}"
+        raise DeviceError(reason)
+
+    def _is_operational(self) -> bool:
+        return self.inbox.nmt_state == OPERATIONAL
+
+    def _is_answered(self) -> bool:
+        return self.inbox.replies > 0

@@ -1,0 +1,66 @@
+"""Where a running ``rigd simulate`` is found: one small file for each simulated rig.
+
+The simulated rig stands in for the hardware of one profile. Whoever opens that profile's devices
+looks here first, so that a motor never moves where a simulation was meant.
+"""
+
+import json
+import os
+import socket
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorAddress:
+    """How to reach a simulated rig."""
+
+    pid: int
+    control_socket: str
+    """Unix socket that takes faults to inject; as long as it answers, the simulator runs."""
+    can_socket: str = ""
+    """Unix socket that carries CAN frames; empty where it sits on a real (virtual) CAN bus."""
+    serial_port: str = ""
+    """Pseudo-terminal of the serial sensor; empty where it has none."""
+    lock_step: bool = False
+    """It moves on by one period a SYNC instead of by the clock."""
+
+
+def runtime_folder() -> Path:
+    """Return the folder for sockets and addresses: of this user, gone after a restart."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    if base and Path(base).is_dir():
+        return Path(base) / "rigd"
+    return Path(tempfile.gettempdir()) / f"rigd-{os.getuid()}"
+
+
+def announce(rig_name: str, address: SimulatorAddress) -> Path:
+    """Write down where the simulator of a rig is; the file goes when it ends."""
+    path = _address_file(rig_name)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    fresh = path.with_suffix(f".{os.getpid()}")
+    fresh.write_text(json.dumps(asdict(address)), encoding="utf-8")
+    fresh.replace(path)
+    return path
+
+
+def find_simulator(rig_name: str) -> SimulatorAddress | None:
+    """Return the running simulator of a rig, or None; what a dead one left is not one."""
+    try:
+        address = SimulatorAddress(**json.loads(_address_file(rig_name).read_text("utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(address.control_socket)
+        except (BlockingIOError, TimeoutError):
+            pass  # it listens, only its queue is full: alive
+        except (OSError, TypeError, ValueError):
+            return None
+    return address
+
+
+def _address_file(rig_name: str) -> Path:
+    return runtime_folder() / f"{rig_name}.json"

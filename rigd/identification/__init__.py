@@ -1,0 +1,1 @@
+"""Identification of the motor from recorded sessions: experiments, estimate, proposal."""

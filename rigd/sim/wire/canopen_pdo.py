@@ -1,0 +1,266 @@
+"""PDOs of a simulated CANopen node, mapped as its dictionary says.
+
+A mapping is turned into one :class:`struct.Struct` and a list of readers whenever it changes, so
+that a PDO costs a few microseconds when it comes or goes.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from struct import Struct
+
+from rigd.sim.wire.canopen_objects import Abort, AbortCode, Entry, ObjectDictionary
+
+DISABLED = 0x8000_0000
+_MAX_ENTRIES = 8
+_MAX_BITS = 64
+_LAST_SYNC_TYPE = 240
+_EVENT_TYPES = (254, 255)
+
+
+def is_free_id(can_id: int) -> bool:
+    """Whether an identifier of 11 bits may be given to a PDO, to SYNC or to EMCY (CiA 301)."""
+    return not (
+        can_id <= 0x07F
+        or can_id > 0x6FF
+        or 0x101 <= can_id <= 0x180
+        or 0x581 <= can_id <= 0x5FF
+        or 0x601 <= can_id <= 0x67F
+        or 0x6E0 <= can_id <= 0x6FF
+    )
+
+
+class Pdo:
+    """Communication and mapping parameters of one PDO.
+
+    Parameters
+    ----------
+    objects
+        The dictionary that gets the parameters, and that holds what is mapped.
+    communication, mapping
+        Indices of the parameters, such as 1400 and 1600.
+    direction
+        "r" or "t": what entries must allow in `Entry.mapping`.
+    cob_id
+        At power-on, with `DISABLED` or not.
+    mapped
+        At power-on: index << 16 | sub-index << 8 | bits.
+    changed
+        Called after identifier, type or mapping have changed.
+
+    Attributes
+    ----------
+    can_id : int
+        As it is used; -1 while the PDO is off or empty.
+    size : int
+        Bytes of the PDO.
+    entries : list of Entry
+        What it carries.
+    """
+
+    direction = ""
+
+    def __init__(
+        self,
+        objects: ObjectDictionary,
+        communication: int,
+        mapping: int,
+        cob_id: int,
+        mapped: tuple[int, ...],
+        changed: Callable[[], None],
+    ) -> None:
+        self._objects = objects
+        self._changed = changed
+        self._cob_id = Entry("I", cob_id, check=self._check_cob_id, wrote=self._rebuild)
+        self._type = Entry("B", 255, check=_check_type, wrote=self._rebuild)
+        self._inhibit = Entry("H", check=self._check_inhibit)
+        self._timer = Entry("H")
+        objects.add_record(
+            communication, {1: self._cob_id, 2: self._type, 3: self._inhibit, 5: self._timer}
+        )
+        self._count = Entry("B", len(mapped), check=self._check_count, wrote=self._rebuild)
+        objects.add(mapping, self._count)
+        self._slots = [
+            objects.add(mapping, Entry("I", value, check=self._check_slot), sub)
+            for sub, value in enumerate(mapped + (0,) * (_MAX_ENTRIES - len(mapped)), 1)
+        ]
+        self.can_id = -1
+        self.size = 0
+        self.entries: list[Entry] = []
+        self._struct = Struct("<")
+
+    def compile(self) -> None:
+        """Get ready to carry what the dictionary says now."""
+        slots = self._slots[: self._count.value]
+        self.entries = [self._mapped(slot.value) for slot in slots]
+        self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
+        self.size = self._struct.size
+        on = self.entries and not self._cob_id.value & DISABLED
+        self.can_id = self._cob_id.value & 0x7FF if on else -1
+        self.forget()
+
+    def forget(self) -> None:
+        """Start afresh: nothing has come or gone yet."""
+        raise NotImplementedError
+
+    @property
+    def is_synchronous(self) -> bool:
+        """Whether it belongs to the SYNC."""
+        return self._type.value <= _LAST_SYNC_TYPE
+
+    def _rebuild(self) -> None:
+        self.compile()
+        self._changed()
+
+    def _mapped(self, value: int) -> Entry:
+        """Return the entry a mapping names.
+
+        Raises
+        ------
+        Abort
+            If it does not exist, does not go into this PDO, or has another length.
+        """
+        entry = self._objects.find(value >> 16, value >> 8 & 0xFF)
+        if self.direction not in entry.mapping or entry.bits != value & 0xFF:
+            raise Abort(AbortCode.NOT_MAPPABLE)
+        return entry
+
+    def _check_cob_id(self, value: int) -> None:
+        was_on = not self._cob_id.value & DISABLED
+        if value & 0x3FFF_F800 or not is_free_id(value & 0x7FF):
+            raise Abort(AbortCode.VALUE)
+        if was_on and not value & DISABLED and (value ^ self._cob_id.value) & 0x7FF:
+            raise Abort(AbortCode.STATE)
+
+    def _check_inhibit(self, value: int) -> None:  # noqa: ARG002
+        if not self._cob_id.value & DISABLED:
+            raise Abort(AbortCode.STATE)
+
+    def _check_slot(self, value: int) -> None:
+        if not self._cob_id.value & DISABLED or self._count.value:
+            raise Abort(AbortCode.STATE)
+        if value:
+            self._mapped(value)
+
+    def _check_count(self, value: int) -> None:
+        if not self._cob_id.value & DISABLED:
+            raise Abort(AbortCode.STATE)
+        if value > _MAX_ENTRIES:
+            raise Abort(AbortCode.PDO_LENGTH)
+        if sum(self._mapped(slot.value).bits for slot in self._slots[:value]) > _MAX_BITS:
+            raise Abort(AbortCode.PDO_LENGTH)
+
+
+class ReceivePdo(Pdo):
+    """A PDO that the node receives.
+
+    Attributes
+    ----------
+    pending : bytes or None
+        Received, and waiting for the next SYNC.
+    received_s : float or None
+        When the last one came; None before the first.
+    applied : bool
+        Whether one has taken effect.
+    """
+
+    direction = "r"
+
+    def __init__(
+        self,
+        objects: ObjectDictionary,
+        communication: int,
+        mapping: int,
+        cob_id: int,
+        mapped: tuple[int, ...],
+        changed: Callable[[], None],
+    ) -> None:
+        super().__init__(objects, communication, mapping, cob_id, mapped, changed)
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop what has been received."""
+        self.pending: bytes | None = None
+        self.received_s: float | None = None
+        self.applied = False
+
+    @property
+    def deadline_s(self) -> float:
+        """How long the next one may take, from sub-index 5; 0 for any time."""
+        return 1e-3 * self._timer.value
+
+    def apply(self, data: bytes) -> None:
+        """Store the values, all of them before any takes effect; what is out of range is left."""
+        for entry, value in zip(self.entries, self._struct.unpack(data), strict=True):
+            with suppress(Abort):
+                entry.put(value)
+        self.applied = True
+        for entry in self.entries:
+            if entry.wrote is not None:
+                entry.wrote()
+
+
+class TransmitPdo(Pdo):
+    """A PDO that the node sends."""
+
+    direction = "t"
+
+    def __init__(
+        self,
+        objects: ObjectDictionary,
+        communication: int,
+        mapping: int,
+        cob_id: int,
+        mapped: tuple[int, ...],
+        changed: Callable[[], None],
+    ) -> None:
+        super().__init__(objects, communication, mapping, cob_id, mapped, changed)
+        self._readers: list[Callable[[], int]] = []
+        self.forget()
+
+    def compile(self) -> None:
+        """Get ready to carry what the dictionary says now."""
+        super().compile()
+        self._readers = [entry.live or entry.get for entry in self.entries]
+
+    def forget(self) -> None:
+        """Start as on entering operational: every event is news."""
+        self._syncs = 0
+        self._last: bytes | None = None
+        self._sent_s = 0.0
+
+    def build(self) -> bytes:
+        """Return the values as they are now."""
+        return self._struct.pack(*[read() for read in self._readers])
+
+    def at_sync(self) -> bytes | None:
+        """Return what is to be sent at this SYNC, or None."""
+        every = self._type.value
+        if every == 1:
+            return self.build()
+        if every == 0:
+            data = self.build()
+            changed, self._last = data != self._last, data
+            return data if changed else None
+        self._syncs += 1
+        if self._syncs < every:
+            return None
+        self._syncs = 0
+        return self.build()
+
+    def at_event(self, now_s: float) -> bytes | None:
+        """Return what is to be sent by now as values have changed or the timer ran out, or None."""
+        data = self.build()
+        age_s = now_s - self._sent_s
+        timer_s = 1e-3 * self._timer.value
+        is_due = timer_s > 0 and age_s >= timer_s - 1e-9
+        is_inhibited = age_s < 1e-4 * self._inhibit.value - 1e-9
+        if self._last is not None and not is_due and (data == self._last or is_inhibited):
+            return None
+        self._last = data
+        self._sent_s = now_s
+        return data
+
+
+def _check_type(value: int) -> None:
+    if value > _LAST_SYNC_TYPE and value not in _EVENT_TYPES:
+        raise Abort(AbortCode.VALUE)

@@ -1,0 +1,248 @@
+"""Faults to inject: how they are written, and what they do to what is sent.
+
+``KIND[,key=value…][@SECONDS]``: with ``@`` so long after the drive was first enabled, without at
+once. Times are of the simulated world. A frame meets at most one fault, the oldest that it fits.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+Value = int | float | str
+Deliver = Callable[[int, bytes, object], None]
+"""Takes identifier, data and origin of what gets through."""
+
+SERIAL = -1
+"""Stands for the identifier of what a serial line carries."""
+
+
+class FaultError(ValueError):
+    """A fault is not written as it should be, or this rig cannot have it; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Key:
+    """What may stand behind a key, and what counts where the key is left out."""
+
+    read: Callable[[str], Value]
+    says: str
+    default: Value | None = None
+    needed: bool = False
+
+
+def _whole(low: int, high: int, **how: Any) -> _Key:  # noqa: ANN401 - passed on
+    def read(text: str) -> int:
+        number = int(text, 0)
+        if not low <= number <= high:
+            raise ValueError(text)
+        return number
+
+    return _Key(read, f"a whole number from {low} to {high}", **how)
+
+
+def _positive(**how: Any) -> _Key:  # noqa: ANN401 - passed on
+    def read(text: str) -> float:
+        number = float(text)
+        if not 0 < number <= _LONGEST_S:
+            raise ValueError(text)
+        return number
+
+    return _Key(read, f"a number above 0, up to {_LONGEST_S:g}", **how)
+
+
+def _one_of(*choices: str, **how: Any) -> _Key:  # noqa: ANN401 - passed on
+    def read(text: str) -> str:
+        if text not in choices:
+            raise ValueError(text)
+        return text
+
+    return _Key(read, " or ".join(choices), **how)
+
+
+_LONGEST_S = 1e6
+_MOST = 1_000_000_000
+_SENDER = {
+    "from": _one_of("drive", "sensor", "host", needed=True),
+    "id": _whole(0, 0x7FF),
+    "frames": _whole(1, _MOST, default=1),
+}
+_DEVICE = _one_of("drive", "sensor", needed=True)
+_FOR = _positive()
+
+LINE_KINDS = ("drop", "delay", "corrupt", "reorder")
+KINDS: dict[str, dict[str, _Key]] = {
+    "drop": _SENDER | {"bytes": _whole(1, _MOST)},
+    "delay": _SENDER | {"ms": _positive(needed=True)},
+    "corrupt": _SENDER | {"byte": _whole(0, 255, default=0)},
+    "reorder": _SENDER,
+    "freeze": {"device": _DEVICE, "for": _FOR},
+    "emcy": {"code": _whole(0, 0xFFFF, needed=True), "register": _whole(0, 0xFF, default=1)},
+    "saturate": {"gauge": _whole(0, 5, needed=True), "for": _FOR},
+    "status": {"bits": _whole(0, 0xFFFF, needed=True), "for": _FOR},
+    "jump": {"counts": _whole(-(2**31), 2**31 - 1, needed=True)},
+    "cut": {"device": _one_of("bus", "sensor", default="bus")},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault, as an operator asks for it."""
+
+    kind: str
+    values: Mapping[str, Value]
+    """By key; a key that was left out and has no default is missing."""
+    after_s: float | None = None
+    """Time after the drive was first enabled; None: at once."""
+
+    def __str__(self) -> str:
+        """Return the fault as it is written; `parse_fault` reads it back."""
+        words = [self.kind]
+        words += [f"{key}={_text(key, value)}" for key, value in self.values.items()]
+        return ",".join(words) + ("" if self.after_s is None else f"@{self.after_s!r}")
+
+
+def parse_fault(spec: str) -> Fault:
+    """Read a fault.
+
+    Raises
+    ------
+    FaultError
+        Naming the word that is wrong and what may stand in its place.
+    """
+    body, at, time = spec.partition("@")
+    kind, *words = (word.strip() for word in body.split(","))
+    if kind not in KINDS:
+        raise FaultError(_complaint(spec, f"'{kind}' is no fault; choose {', '.join(KINDS)}"))
+    keys = KINDS[kind]
+    values: dict[str, Value] = {}
+    for word in words:
+        key, _, text = word.partition("=")
+        if key not in keys:
+            raise FaultError(_complaint(spec, f"{kind} has no '{key}'; choose {', '.join(keys)}"))
+        if key in values:
+            raise FaultError(_complaint(spec, f"'{key}' stands twice"))
+        try:
+            values[key] = keys[key].read(text)
+        except ValueError:
+            raise FaultError(_complaint(spec, f"{key}={text}: give {keys[key].says}")) from None
+    if "bytes" in values and "frames" in values:
+        raise FaultError(_complaint(spec, "give frames or bytes, not both"))
+    for name, key_of in keys.items():
+        if key_of.needed and name not in values:
+            raise FaultError(_complaint(spec, f"{kind} needs {name}: {key_of.says}"))
+        if key_of.default is not None and not (name == "frames" and "bytes" in values):
+            values.setdefault(name, key_of.default)
+    return Fault(kind, values, _time(spec, time) if at else None)
+
+
+def _time(spec: str, text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds <= _LONGEST_S:
+        raise FaultError(
+            _complaint(spec, f"'@{text}': give the seconds after enabling, 0 to {_LONGEST_S:g}")
+        )
+    return seconds
+
+
+def _text(key: str, value: Value) -> str:
+    return f"{value:#x}" if key in ("id", "code", "bits") else f"{value}"
+
+
+def _complaint(spec: str, what: str) -> str:
+    return f"Fault '{spec}': {what}."
+
+
+class _Active:
+    """A fault of a line, and how much of it is still to come."""
+
+    def __init__(self, fault: Fault) -> None:
+        values = fault.values
+        self.kind = fault.kind
+        self.can_id = values.get("id")
+        self.in_bytes = "bytes" in values
+        self.left = int(values["bytes"] if self.in_bytes else values["frames"])
+        self.delay_s = float(values.get("ms", 0)) * 1e-3
+        self.byte = int(values.get("byte", 0))
+
+    def fits(self, can_id: int, data: bytes) -> bool:
+        """Whether it acts on this."""
+        if self.can_id is not None and self.can_id != can_id:
+            return False
+        return self.kind != "corrupt" or self.byte < len(data)
+
+
+class Line:
+    """The way of one sender's frames to everybody else, with the faults on it.
+
+    Parameters
+    ----------
+    sender
+        Whose, for the log.
+    deliver
+        Takes what gets through.
+    postpone
+        Calls something after so many seconds.
+    log
+        Told of each frame that a fault hits.
+    """
+
+    def __init__(
+        self,
+        sender: str,
+        deliver: Deliver,
+        postpone: Callable[[float, Callable[[], None]], None],
+        log: Callable[..., None],
+    ) -> None:
+        self._sender = sender
+        self._deliver = deliver
+        self._postpone = postpone
+        self._log = log
+        self._active: list[_Active] = []
+        self._held: list[tuple[int, bytes, object]] = []
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether a fault may act on what comes next."""
+        return bool(self._active or self._held)
+
+    def add(self, fault: Fault) -> None:
+        """Let a fault act from now on."""
+        self._active.append(_Active(fault))
+
+    def send(self, can_id: int, data: bytes, origin: object = None) -> None:
+        """Let a frame, or a record of a serial line, go the way of this line."""
+        if not self._active and not self._held:
+            self._deliver(can_id, data, origin)
+            return
+        waiting, self._held = self._held, []
+        fault = next((fault for fault in self._active if fault.fits(can_id, data)), None)
+        if waiting and fault is not None and fault.kind == "reorder":
+            fault = None  # this is the frame that the held one waits for
+        if fault is None:
+            self._deliver(can_id, data, origin)
+        else:
+            self._disturb(fault, can_id, data, origin)
+        # A held frame goes after the next one, whatever becomes of that.
+        for held in waiting:
+            self._deliver(*held)
+
+    def _disturb(self, fault: _Active, can_id: int, data: bytes, origin: object) -> None:
+        hit = min(fault.left, len(data)) if fault.in_bytes else 1
+        fault.left -= hit
+        if fault.left == 0:
+            self._active.remove(fault)
+        where = {} if can_id == SERIAL else {"can_id": can_id}
+        self._log("simulator", fault.kind, sender=self._sender, data=data.hex(), **where)
+        if fault.kind == "delay":
+            self._postpone(fault.delay_s, lambda: self._deliver(can_id, data, origin))
+        elif fault.kind == "corrupt":
+            wrong = data[fault.byte] ^ 0xFF
+            data = data[: fault.byte] + bytes([wrong]) + data[fault.byte + 1 :]
+            self._deliver(can_id, data, origin)
+        elif fault.kind == "reorder":
+            self._held.append((can_id, data, origin))
+        elif fault.in_bytes and hit < len(data):
+            self._deliver(can_id, data[hit:], origin)

@@ -1,0 +1,366 @@
+"""``rigd simulate``: a simulated rig as a process of its own, on the wire.
+
+One thread, one loop: it waits for frames, for bytes of the serial line, and for the time to pass.
+The operator's commands come over the control socket.
+"""
+
+import fcntl
+import gc
+import os
+import select
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
+from rigd.devices.simulator import SimulatorAddress, announce, find_simulator, runtime_folder
+from rigd.sim.devices import SimulatedRig
+from rigd.sim.wire.control import ControlSocket, ask
+from rigd.sim.wire.faults import Fault, FaultError, parse_fault
+from rigd.sim.wire.hub import Handlers, Hub, VirtualCan, is_virtual
+from rigd.sim.wire.log import EventLog
+from rigd.sim.wire.pty_line import PtyLine
+from rigd.sim.wire.world import World
+
+__all__ = [
+    "DeviceError",
+    "FaultError",
+    "SimulatorOptions",
+    "inject",
+    "parse_fault",
+    "run_simulator",
+]
+
+_LONGEST_SOCKET_NAME = 107
+_IDLE_S = 0.01
+"""How often the loop looks up while nothing hurries."""
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorOptions:
+    """How a simulated rig is run."""
+
+    lock_step: bool = False
+    """Move on by one period a SYNC instead of by wall time."""
+    log: Path | None = None
+    """File of JSON lines, one an event."""
+    faults: tuple[Fault, ...] = ()
+    quiet: bool = False
+    """Tell nothing on the terminal."""
+
+
+def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
+    """Run the simulated rig that stands in for a profile's, until a signal ends it.
+
+    Returns
+    -------
+    int
+        Exit code.
+
+    Raises
+    ------
+    DeviceError
+        If the profile cannot be simulated on the wire, if its simulated rig runs already, or if
+        sockets or files cannot be made.
+    FaultError
+        If a fault is none that this rig can have.
+    """
+    if rig.cia402 is None or rig.can is None:
+        raise DeviceError(
+            f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): there is "
+            "nothing to put on the wire. Its devices are simulated within a session already."
+        )
+    if rig.devices.sensor != "ati_serial":
+        rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
+    with ExitStack() as stack:
+        stack.enter_context(_only_one(rig.name))
+        log = EventLog(options.log, quiet=options.quiet)
+        stack.callback(log.close)
+        process = _Process(rig, options, log, stack)
+        stop = stack.enter_context(_stop_requested())
+        process.start()
+        process.serve(stop)
+    return 0
+
+
+def inject(rig_name: str, specs: list[str]) -> list[str]:
+    """Inject faults into the running simulated rig of a profile.
+
+    Returns
+    -------
+    list of str
+        The faults as it understood them; without any, lines on how it stands.
+
+    Raises
+    ------
+    DeviceError
+        If no simulated rig of that name runs, or it refuses.
+    """
+    address = find_simulator(rig_name)
+    if address is None:
+        raise DeviceError(
+            f"No simulated rig of the profile {rig_name} runs; start it with: rigd simulate "
+            f"--profile {rig_name}"
+        )
+    if not specs:
+        return [f"{name}: {value}" for name, value in ask(address, {"status": True}).items()]
+    return [str(ask(address, {"inject": spec})["injected"]) for spec in specs]
+
+
+def without_transport(rig: RigParameters) -> RigParameters:
+    """Return the rig with the delays that are left to simulate behind the wire.
+
+    With replies taken a tick later the exchange itself brings one period of what the profile
+    states; the decimating filter's delay is seen to by :class:`rigd.sim.devices.SimulatedRig`.
+
+    Raises
+    ------
+    DeviceError
+        If the profile states less than the exchange takes.
+    """
+    if rig.acquisition is None or rig.acquisition.mode == "same_tick":
+        return rig
+    period_s = 1 / rig.rate_hz
+    for name, delay_s in (("encoder", rig.encoder.delay_s), ("sensor", rig.sensor.delay_s)):
+        if delay_s < period_s * (1 - 1e-9):
+            raise DeviceError(
+                f"The profile {rig.name} has {name}.delay_s = {delay_s:g} s, but with "
+                f"acquisition.mode previous_tick values are at least one period old "
+                f"({period_s:g} s); correct one of the two."
+            )
+    return replace(
+        rig,
+        encoder=replace(rig.encoder, delay_s=max(0.0, rig.encoder.delay_s - period_s)),
+        sensor=replace(rig.sensor, delay_s=max(0.0, rig.sensor.delay_s - period_s)),
+    )
+
+
+class _Process:
+    """The lines to the outside, and the loop that serves them."""
+
+    def __init__(
+        self, rig: RigParameters, options: SimulatorOptions, log: EventLog, stack: ExitStack
+    ) -> None:
+        assert rig.can is not None
+        self._rig = rig
+        self._options = options
+        self._log = log
+        self._stack = stack
+        self._handlers: Handlers = {}
+        folder = stack.enter_context(_socket_folder(rig.name))
+        self._bus: Hub | VirtualCan
+        can_socket = ""
+        if rig.can.interface == "socketcan" and is_virtual(rig.can.channel):
+            self._bus = VirtualCan(rig.can.channel, self._handlers, self._on_frames)
+        else:
+            can_socket = str(folder / f"{rig.name}.can")
+            self._bus = Hub(Path(can_socket), self._handlers, self._on_frames, self._on_clients)
+        stack.callback(self._bus.close)
+        self._line: PtyLine | None = None
+        if rig.ati_serial is not None:
+            self._line = PtyLine(self._handlers, self._on_bytes, self._on_port)
+            stack.callback(self._line.close)
+        self._world = self._make_world()
+        control = ControlSocket(folder / f"{rig.name}.control", self._handlers, self._answer)
+        stack.callback(control.close)
+        self._address = SimulatorAddress(
+            pid=os.getpid(),
+            control_socket=str(folder / f"{rig.name}.control"),
+            can_socket=can_socket,
+            serial_port="" if self._line is None else self._line.port,
+            lock_step=options.lock_step,
+        )
+
+    def start(self) -> None:
+        """Let the faults in that are there from the start, and say where the rig is."""
+        for fault in self._options.faults:
+            self._world.inject(fault)
+        started = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
+        self._log(
+            "simulator",
+            "started",
+            rig=self._rig.name,
+            lock_step=self._options.lock_step,
+            **started,
+        )
+        for line in self._invitation():
+            self._log.tell(line)
+        path = announce(self._rig.name, self._address)
+        self._stack.callback(path.unlink, missing_ok=True)
+        # Set-up leaves objects that never go: no need to look through them again and again.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self._stack.callback(gc.enable)
+        if not self._options.lock_step:
+            # Replies in time while other processes work too; below every real-time loop. Of 2500
+            # replies on two busy cores 7 were late with it and 95 without.
+            with suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+
+    def serve(self, stop: Callable[[], bool]) -> None:
+        """Serve until a stop is asked for."""
+        handlers, world, line, log = self._handlers, self._world, self._line, self._log
+        now_ns = time.monotonic_ns
+        look_ns = 0
+        while not stop():
+            ready, _, _ = select.select(handlers, (), (), world.wait_s(now_ns(), _IDLE_S))
+            for descriptor in ready:
+                handler = handlers.get(descriptor)
+                if handler is not None:  # not closed by one of the others
+                    handler()
+            now = now_ns()
+            world.elapse(now)
+            if now > look_ns:
+                look_ns = now + round(_IDLE_S * 1e9)
+                log.flush()
+                if line is not None:
+                    line.look()
+        self._log("simulator", "ended")
+
+    def _make_world(self) -> World:
+        # Late: a process that only injects a fault needs none of it.
+        from rigd.sim.wire.drive_node import DriveNode
+
+        rig = self._rig
+        simulated = SimulatedRig(without_transport(rig))
+        line = self._line
+        world = World(
+            rig,
+            simulated,
+            lock_step=self._options.lock_step,
+            now_ns=time.monotonic_ns(),
+            send=self._bus.send,
+            write=_nowhere if line is None else line.write,
+            cut=self._cut,
+            log=self._log,
+        )
+        drive = DriveNode(rig, simulated, world.step, world.can_port("drive"), self._log)
+        world.join("drive", drive)
+        if rig.ati_serial is not None:
+            from rigd.sim.wire.ati_serial_device import AtiSerialDevice
+
+            world.join_serial(AtiSerialDevice(rig, simulated, world.serial_port(), self._log))
+        elif rig.ati_can is not None:
+            from rigd.sim.wire.ati_can_node import AtiCanNode
+
+            world.join("sensor", AtiCanNode(rig, simulated, world.can_port("sensor"), self._log))
+        return world
+
+    def _invitation(self) -> Iterator[str]:
+        address, rig = self._address, self._rig
+        assert rig.can is not None
+        mode = "one period a SYNC (lock-step)" if address.lock_step else "by wall time"
+        yield f"Simulated rig {rig.name}, {rig.rate_hz:g} Hz, {mode}; Ctrl-C ends it."
+        yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
+        if address.serial_port:
+            yield f"  serial   {address.serial_port}"
+        fast = " --fast" if address.lock_step else ""
+        yield f"  session  rigd run chirp --profile {rig.name}{fast}"
+        yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
+
+    def _on_frames(self, frames: list[bytes], origin: object) -> None:
+        self._world.hear(frames, origin, time.monotonic_ns())
+
+    def _on_bytes(self, data: bytes) -> None:
+        self._world.hear_serial(data)
+
+    def _on_clients(self, what: str, count: int) -> None:
+        self._log("bus", what, clients=count)
+        if count == 0:
+            self._world.left_alone(time.monotonic_ns())
+
+    def _on_port(self, is_open: bool) -> None:
+        self._log("line", "port opened" if is_open else "port closed")
+
+    def _cut(self, device: str) -> None:
+        if device == "bus":
+            self._bus.close()
+        elif self._line is not None:
+            self._line.close()
+
+    def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        if "inject" in request:
+            try:
+                fault = parse_fault(str(request["inject"]))
+                self._world.inject(fault)
+            except FaultError as error:
+                return {"error": str(error)}
+            return {"injected": str(fault)}
+        if "status" in request:
+            return {
+                "rig": self._rig.name,
+                "time_s": round(self._world.now_s, 6),
+                "lock_step": self._options.lock_step,
+                "moved_periods": self._world.moved,
+                "syncs": self._world.syncs,
+                "clients": self._bus.clients,
+                "lost_frames": self._bus.lost,
+                "lost_bytes": 0 if self._line is None else self._line.lost,
+                "disturbed": self._world.disturbed,
+            }
+        return {"error": "A request has to be 'inject' or 'status'."}
+
+
+def _nowhere(data: bytes) -> None:
+    """Take what a rig without a serial line never writes."""
+
+
+@contextmanager
+def _only_one(rig_name: str) -> Iterator[None]:
+    """Refuse to start beside another simulated rig of the same name."""
+    folder = runtime_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock = (folder / f"{rig_name}.lock").open("w")
+    except OSError as error:
+        raise DeviceError(
+            f"The simulated rig cannot use the folder {folder} ({error.strerror}); set "
+            "XDG_RUNTIME_DIR to one that is yours."
+        ) from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            running = find_simulator(rig_name)
+            who = "" if running is None else f" (process {running.pid})"
+            raise DeviceError(
+                f"A simulated rig of the profile {rig_name} runs already{who}; end it first, or "
+                "use that one."
+            ) from None
+        # What a dead one left must go first: it names the sockets that are about to live again.
+        (folder / f"{rig_name}.json").unlink(missing_ok=True)
+        yield
+
+
+@contextmanager
+def _socket_folder(rig_name: str) -> Iterator[Path]:
+    """Make room for the sockets, whose names must be short."""
+    folder = runtime_folder()
+    if len(os.fsencode(folder / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short:
+        yield Path(short)
+
+
+@contextmanager
+def _stop_requested() -> Iterator[Callable[[], bool]]:
+    """Say whether one of the signals that end the process has come; one ignored before stays so."""
+    requested: list[int] = []
+    before = {number: signal.getsignal(number) for number in _STOPPING}
+    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    for number in caught:
+        signal.signal(number, lambda got, _: requested.append(got))
+    try:
+        yield lambda: bool(requested)
+    finally:
+        for number in caught:
+            signal.signal(number, before[number])

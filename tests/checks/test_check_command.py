@@ -1,0 +1,140 @@
+"""``rigd check`` and ``rigd reset`` as an operator sees them."""
+
+import json
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rigd.cli.check import check, reset
+from rigd.devices.contracts import DeviceError
+
+
+@pytest.fixture
+def rigd(monkeypatch):
+    """Run one of the two commands; returns exit code, standard output and standard error."""
+    monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)  # of the test runner
+    monkeypatch.setenv("COLUMNS", "80")
+    app = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+    app.command()(check)
+    app.command()(reset)
+
+    def run(*arguments):
+        done = CliRunner().invoke(app, arguments)
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return done.exit_code, done.stdout, done.stderr
+
+    return run
+
+
+def changed_profile(profile, tmp_path, old, new):
+    assert old in profile.text
+    path = tmp_path / "changed.toml"
+    path.write_text(profile.text.replace(old, new, 1), encoding="utf-8")
+    return str(path)
+
+
+def test_a_table_of_80_columns_and_a_verdict(rigd, stand_ins):
+    code, text, _ = rigd("check", "--profile", "antenna_can")
+    assert code == 0, text
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 80
+    for heading in ("profile", "CAN bus", "loop, torque command", "real time", "drive", "sensor"):
+        assert any(line.strip() == heading for line in lines), heading
+    assert "Verdict: warnings (failed: 0, warnings: 1" in " ".join(lines)
+    assert "Assumed: motor.inertia_kg_m2" in text
+
+
+def test_json_is_one_document(rigd, stand_ins):
+    code, text, _ = rigd("check", "--profile", "antenna_can", "--json")
+    assert code == 0
+    document = json.loads(text)
+    assert set(document) == {"verdict", "rows"}
+    assert document["verdict"] == "warnings"
+    assert all(
+        set(row) == {"group", "what", "found", "wanted", "verdict", "detail"}
+        for row in document["rows"]
+    )
+    assert {row["verdict"] for row in document["rows"]} <= {"ok", "warning", "FAIL", "skipped"}
+
+
+def test_a_dead_device_fails_with_its_message(rigd, stand_ins, silent):
+    stand_ins.drive.fails_at["connect"] = silent
+    code, text, _ = rigd("check", "--profile", "antenna_can", "--json")
+    assert code == 1
+    document = json.loads(text)
+    assert document["verdict"] == "failed"
+    assert str(silent) in [row["found"] for row in document["rows"]]
+    assert stand_ins.closed
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("base_id = { value = 0x68", "base_id = { value = 0x20", "RPDO1"),
+        ("value = 1_000_000, source", "value = 500_000, source", "% at worst"),
+    ],
+    ids=["identifiers", "load"],
+)
+def test_a_bus_that_cannot_be_right_is_left_alone(
+    rigd, stand_ins, can_profile, tmp_path, old, new, word
+):
+    path = changed_profile(can_profile, tmp_path, old, new)
+    code, text, _ = rigd("check", "--profile", path, "--json")
+    assert code == 1
+    rows = json.loads(text)["rows"]
+    assert any(row["verdict"] == "FAIL" and word in row["found"] for row in rows)
+    assert rows[-1]["verdict"] == "skipped"
+    assert stand_ins.calls == []
+
+
+@pytest.mark.parametrize("command", ["check", "reset"])
+def test_wrong_use(rigd, command):
+    code, text, errors = rigd(command, "--profile", "nowhere")
+    assert code == 2
+    assert text == ""
+    assert "There is no profile 'nowhere'" in errors
+
+
+def test_the_simulation_can_be_checked(rigd):
+    code, text, _ = rigd("check")
+    assert code == 0
+    assert "simulated in this" in text
+
+
+def test_hardware_that_is_not_there(rigd, can_profile, tmp_path):
+    """The real drivers, and a bus that nobody has: rows, no traceback."""
+    path = changed_profile(can_profile, tmp_path, 'channel = "can0"', 'channel = "nocan9"')
+    code, text, _ = rigd("check", "--profile", path, "--json")
+    assert code == 1
+    failed = [row for row in json.loads(text)["rows"] if row["verdict"] == "FAIL"]
+    assert [row["group"] for row in failed] == ["drive", "sensor"]
+    assert all("nocan9" in row["found"] for row in failed)
+
+
+def test_reset_says_what_the_fault_was(rigd, stand_ins):
+    stand_ins.drive.fault = "heartbeat of this computer lost (error code 0x8130)"
+    code, text, _ = rigd("reset", "--profile", "antenna_can")
+    assert code == 0
+    assert "was in fault: heartbeat of this computer lost" in text
+    assert stand_ins.calls == ["open", "drive.reset_fault", "drive.close"]
+
+
+def test_reset_without_a_fault(rigd, stand_ins):
+    code, text, _ = rigd("reset", "--profile", "antenna_can")
+    assert code == 0
+    assert "not in fault" in text
+
+
+def test_a_fault_that_stands(rigd, stand_ins):
+    stand_ins.drive.fails_at["reset_fault"] = DeviceError("Drive: the fault stands.")
+    code, _, errors = rigd("reset", "--profile", "antenna_can")
+    assert code == 1
+    assert errors == "Error: Drive: the fault stands.\n"
+    assert stand_ins.calls[-1] == "drive.close"
+
+
+def test_a_simulated_drive_has_no_fault(rigd):
+    code, text, _ = rigd("reset", "--profile", "sim")
+    assert code == 0
+    assert "no fault to reset" in text

@@ -1,0 +1,97 @@
+"""What a profile alone shows, before anything is connected."""
+
+from dataclasses import replace
+
+import pytest
+
+from rigd.checks.on_paper import profile_rows, wiring_rows
+from rigd.checks.rows import Row, Verdict, overall
+from rigd.devices.canbus.load import bus_load
+from rigd.profile import load_profile
+
+
+def by_name(rows):
+    return {row.what: row for row in rows}
+
+
+def row(verdict):
+    return Row("", "", "", "", verdict)
+
+
+def test_the_worst_row_is_the_verdict():
+    ok, skipped, warning, fail = map(
+        row, (Verdict.OK, Verdict.SKIPPED, Verdict.WARNING, Verdict.FAIL)
+    )
+    assert overall([]) == "ok"
+    assert overall([ok, skipped]) == "ok"
+    assert overall([ok, warning, skipped]) == "warnings"
+    assert overall([warning, fail, ok]) == "failed"
+
+
+def test_assumed_numbers_are_one_warning_that_names_them(can_profile):
+    found = by_name(profile_rows(can_profile))["numbers assumed"]
+    assert found.verdict is Verdict.WARNING
+    assumed = [key for key, source in can_profile.sources.items() if source == "assumed"]
+    assert found.found == f"{len(assumed)} of {len(can_profile.sources)}"
+    assert all(key in found.detail for key in assumed)
+    assert "beam.length_m" not in found.detail  # from the paper
+
+
+def test_a_profile_without_assumptions_has_no_warning(can_profile):
+    sources = dict.fromkeys(can_profile.sources, "measured")
+    assert overall(profile_rows(replace(can_profile, sources=sources))) == "ok"
+
+
+def test_the_shipped_wiring_is_fine(can_profile, serial_profile):
+    for profile in (can_profile, serial_profile):
+        rows = by_name(wiring_rows(profile.rig))
+        assert {row.verdict for row in rows.values()} == {Verdict.OK}
+    assert list(wiring_rows(load_profile("sim").rig)) == []
+
+
+def test_a_collision_fails(can_profile):
+    rig = replace(can_profile.rig, ati_can=replace(can_profile.rig.ati_can, base_id=0x20))
+    found = by_name(wiring_rows(rig))["identifiers"]
+    assert found.verdict is Verdict.FAIL
+    assert "0x201 (RPDO1)" in found.found
+
+
+@pytest.mark.parametrize(
+    ("worst", "verdict"),
+    [
+        (0.69, Verdict.OK),
+        (0.71, Verdict.WARNING),
+        (0.89, Verdict.WARNING),
+        (0.91, Verdict.FAIL),
+        (1.2, Verdict.FAIL),
+    ],
+)
+def test_bus_load_is_refused_above_90_percent(can_profile, worst, verdict):
+    rig = can_profile.rig
+    bitrate = round(bus_load(rig).worst / worst * rig.can.bitrate_bit_s)
+    found = by_name(wiring_rows(replace(rig, can=replace(rig.can, bitrate_bit_s=bitrate))))["load"]
+    assert found.verdict is verdict
+    assert f"{100 * worst:.1f} %" in found.found
+
+
+def test_every_frame_is_listed(can_profile):
+    detail = by_name(wiring_rows(can_profile.rig))["load"].detail
+    for frame in (
+        "SYNC (0x080",
+        "RPDO1 (0x201, 4",
+        "TPDO1 (0x181, 8",
+        "0x680",
+        "0x681, 6",
+        "0x77f",
+    ):
+        assert frame in detail
+
+
+def test_a_slow_serial_line_fails(serial_profile):
+    """7000 records of 143 bits are 1.001 Mbit/s."""
+    rig = serial_profile.rig
+    rows = [row for row in wiring_rows(rig) if row.group == "serial line"]
+    assert rows[0].found.startswith("80.1 %")
+    slow = replace(rig, ati_serial=replace(rig.ati_serial, baud=115_200))
+    (found,) = (row for row in wiring_rows(slow) if row.group == "serial line")
+    assert found.verdict is Verdict.FAIL

@@ -1,0 +1,47 @@
+"""Real-time rights are tried elsewhere: this process stays as it is."""
+
+import os
+from dataclasses import replace
+
+import pytest
+
+from rigd.checks.rights import rights_rows
+from rigd.checks.rows import Verdict
+from rigd.profile import load_profile
+
+
+@pytest.fixture
+def asked():
+    return load_profile("sim").realtime
+
+
+def state():
+    return os.sched_getaffinity(0), os.sched_getscheduler(0)
+
+
+def test_every_setting_has_a_row_and_none_sticks(asked):
+    before = state()
+    rows = {row.what: row for row in rights_rows(asked)}
+    assert set(rows) == {"memory", "timer slack", "garbage collector", "cpu", "scheduling"}
+    assert rows["timer slack"].verdict is Verdict.OK
+    assert state() == before
+
+
+def test_what_is_refused_is_a_warning_with_a_remedy(asked):
+    rows = {row.what: row for row in rights_rows(replace(asked, cpu=4000))}
+    assert rows["cpu"].verdict is Verdict.WARNING
+    assert rows["cpu"].found.startswith("refused")
+    assert "realtime.cpu" in rows["cpu"].wanted
+
+
+def test_an_ordinary_scheduler_may_be_wanted(asked):
+    rows = {row.what: row for row in rights_rows(replace(asked, priority=0))}
+    assert rows["scheduling"].found == "not asked for"
+    assert rows["scheduling"].verdict is Verdict.OK
+
+
+def test_a_trial_that_fails_is_told(asked, monkeypatch):
+    monkeypatch.setattr("rigd.checks.rights.sys.executable", "/no/such/python")
+    (row,) = rights_rows(asked)
+    assert row.verdict is Verdict.WARNING
+    assert "could not be tried" in row.found

@@ -1,0 +1,208 @@
+"""Calibrations, status words and registers, against numbers worked out by hand."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigd.devices.ati.calibration import (
+    WIRE_ORDER,
+    Calibration,
+    same_serial_number,
+    text_of,
+    wrench_function,
+)
+from rigd.devices.ati.calibration_block import first_register, parse_block
+from rigd.devices.ati.status import CAN_CRITICAL, SERIAL_CRITICAL, can_status, serial_status
+
+ONES = tuple(tuple(1.0 if axis == gauge else 0.0 for gauge in range(6)) for axis in range(6))
+
+
+def calibration(**changes):
+    fields = {
+        "serial_number": "FT1",
+        "force_unit": 2,
+        "torque_unit": 3,
+        "counts_per_force": 1,
+        "counts_per_torque": 1,
+        "matrix": ONES,
+    } | changes
+    return Calibration(**fields)
+
+
+@pytest.mark.parametrize(
+    ("code", "newton"),
+    [(1, 4.4482216), (2, 1.0), (3, 4448.2216), (4, 1000.0), (5, 9.80665), (6, 9.80665e-3)],
+)
+def test_force_units(code, newton):
+    rows = calibration(force_unit=code).wrench_per_count()
+    assert rows[2][2] == pytest.approx(newton, rel=1e-8)
+    assert rows[3][3] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("code", "newton_metre"),
+    [(1, 0.112984829), (2, 1.35581795), (3, 1.0), (4, 1e-3), (5, 0.0980665), (6, 1000.0)],
+)
+def test_torque_units(code, newton_metre):
+    rows = calibration(torque_unit=code).wrench_per_count()
+    assert rows[5][5] == pytest.approx(newton_metre, rel=1e-8)
+    assert rows[0][0] == 1.0
+
+
+def test_forces_and_torques_have_their_own_counts():
+    rows = calibration(counts_per_force=4, counts_per_torque=5).wrench_per_count()
+    assert rows[1][1] == 0.25
+    assert rows[4][4] == 0.2
+
+
+@pytest.mark.parametrize("code", [0, 7, 255])
+def test_unknown_units_are_refused(code):
+    with pytest.raises(ValueError, match="unit codes"):
+        calibration(force_unit=code)
+    with pytest.raises(ValueError, match="unit codes"):
+        calibration(torque_unit=code)
+
+
+@pytest.mark.parametrize("counts", [0, -1])
+def test_counts_that_are_not_positive_are_refused(counts):
+    with pytest.raises(ValueError, match="counts"):
+        calibration(counts_per_force=counts)
+    with pytest.raises(ValueError, match="counts"):
+        calibration(counts_per_torque=counts)
+
+
+@pytest.mark.parametrize("entry", [math.nan, math.inf, -math.inf])
+def test_a_matrix_with_entries_that_are_no_numbers_is_refused(entry):
+    rows = [list(row) for row in ONES]
+    rows[4][1] = entry
+    with pytest.raises(ValueError, match=r"row Ty .* no numbers"):
+        calibration(matrix=tuple(map(tuple, rows)))
+
+
+def test_a_matrix_with_an_empty_row_is_refused():
+    with pytest.raises(ValueError, match=r"row Fx .* zero"):
+        calibration(matrix=((0.0,) * 6,) * 6)
+    with pytest.raises(ValueError, match=r"row Tz .* zero"):
+        calibration(matrix=(*ONES[:5], (0.0,) * 6))
+
+
+def test_the_range_is_given_in_newtons():
+    found = calibration(force_unit=1, torque_unit=4, ratings=(5.0, 5.0, 15.0, 1e3, 1e3, 1e3))
+    said = found.as_dict()
+    assert said["range_n_nm"] == pytest.approx([22.2411, 22.2411, 66.7233, 1.0, 1.0, 1.0], rel=1e-5)
+    assert said["force_unit"] == "lbf"
+    assert json.loads(json.dumps(said, allow_nan=False)) == said
+
+
+def test_a_range_that_is_unknown_is_said_to_be():
+    assert calibration().as_dict()["range_n_nm"] == "not stated by the sensor"
+    unwritten = calibration(ratings=(math.nan,) * 6)
+    assert unwritten.as_dict()["range_n_nm"] == "not stated by the sensor"
+
+
+entries = st.floats(-1e4, 1e4, width=32)
+gauges = st.integers(-32768, 32767)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    matrix=st.lists(st.lists(entries, min_size=6, max_size=6), min_size=6, max_size=6),
+    counts=st.tuples(st.integers(1, 2**31 - 1), st.integers(1, 2**31 - 1)),
+    readings=st.lists(gauges, min_size=6, max_size=6),
+)
+def test_the_wrench_is_matrix_times_gauges_over_counts(matrix, counts, readings):
+    for axis, row in enumerate(matrix):
+        row[axis] = row[axis] or 1.0
+    found = calibration(
+        matrix=tuple(map(tuple, matrix)), counts_per_force=counts[0], counts_per_torque=counts[1]
+    )
+    expected = np.array(matrix) @ np.array(readings) / np.repeat(counts, 3)
+    scale = np.abs(matrix) @ np.abs(readings) / np.repeat(counts, 3) + 1e-300
+    natural = wrench_function(found.wrench_per_count())(*readings)
+    wired = wrench_function(found.wrench_per_wire_count())(*(readings[j] for j in WIRE_ORDER))
+    assert np.all(np.abs(np.array(natural) - expected) <= 1e-13 * scale)
+    assert np.all(np.abs(np.array(wired) - expected) <= 1e-13 * scale)
+
+
+def test_serial_numbers():
+    assert same_serial_number("", "FT12345")
+    assert same_serial_number("ft12345 ", "FT12345")
+    assert not same_serial_number("FT12345", "FT12346")
+    assert not same_serial_number("FT12345", "")
+
+
+def test_text():
+    assert text_of(b"SI-20-1\0\0\0") == "SI-20-1"
+    assert text_of(b"FT1\xff\xff") == "FT1"
+    assert text_of(b"\0" * 8) == ""
+    assert text_of(b"\x00\x07") == "00 07"
+    assert text_of(b"A\xb0B") == "41 b0 42"
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.binary(max_size=32))
+def test_text_is_always_printable(raw):
+    assert text_of(raw).isprintable()
+
+
+def test_where_calibration_blocks_are():
+    assert first_register(1) == 0x00E3
+    assert first_register(2) == 0x01A3
+    assert first_register(16) == 0x0C23
+
+
+def test_a_calibration_block(fakes):
+    block = parse_block(fakes.calibration_registers()[:133])
+    found = block.calibration
+    assert (found.serial_number, found.part_number) == ("FT12345", "SI-20-1")
+    assert (found.family, found.date) == ("DIG", "2021/03/04 12:00")
+    assert (found.force_unit, found.torque_unit) == (2, 3)
+    assert (found.counts_per_force, found.counts_per_torque) == (1_000_000, 2_000_000)
+    assert found.ratings == (20.0, 20.0, 60.0, 1.0, 1.0, 1.0)
+    assert found.matrix == fakes.MATRIX
+    assert block.gains == (541, 550, 560, 570, 575, 579)
+    assert block.offsets == (31842, 32000, 32768, 33000, 34000, 34927)
+
+
+@pytest.mark.parametrize("fill", [0x0000, 0xFFFF])
+def test_an_empty_calibration_block_is_refused(fill):
+    with pytest.raises(ValueError, match="Choose another calibration"):
+        parse_block([fill] * 133)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.integers(0, 0xFFFF), min_size=133, max_size=133), st.booleans())
+def test_any_calibration_block_is_read_or_refused_in_words(registers, sound_units):
+    if sound_units:
+        registers[104] = 0x0203
+    try:
+        block = parse_block(registers)
+    except ValueError as error:
+        assert str(error).endswith("calibration.")
+    else:
+        assert all(map(math.isfinite, sum(block.calibration.wrench_per_count(), ())))
+        json.dumps(replace(block.calibration).as_dict(), allow_nan=False)
+
+
+def test_status_words():
+    assert can_status(0) == serial_status(0) == []
+    assert can_status(0x8001) == ["its watchdog has reset the board"]
+    assert can_status(0x0040) == ["the active calibration is bad"]
+    assert serial_status(0x0040) == ["status bit 6, which has no known meaning, is set"]
+    assert can_status(0x0800) == ["the sensor is too hot"]
+    assert serial_status(0x0800) == ["the reading of its thermistor is too high"]
+    assert "too much current" in serial_status(0x0200)[0]
+    assert "no known meaning" in can_status(0x0200)[0]
+    assert len(can_status(0x7FFF)) == 15
+
+
+def test_critical_bits_are_those_of_the_table():
+    critical_on_can = {1, 2, 3, 4, 5, 6, 7, 11, 12}
+    critical_on_serial = {1, 2, 3, 4, 5, 7, 9, 10, 11, 12, 13}
+    assert sum(1 << bit for bit in critical_on_can) == CAN_CRITICAL
+    assert sum(1 << bit for bit in critical_on_serial) == SERIAL_CRITICAL

@@ -1,0 +1,527 @@
+"""The Digital F/T sensor, against one at a pseudo-terminal, by struct from devices.md 2.1."""
+
+import json
+import os
+import random
+import threading
+import time
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from rigd.devices.ati.serial_sensor import AtiSerialSensor
+from rigd.devices.contracts import DeviceError
+from rigd.devices.simulator import SimulatorAddress
+
+
+@pytest.fixture
+def open_sensor(serial_rig, digital_ft):
+    """Make sensors at the fake one, and close them."""
+    made = []
+
+    def make(*, lock_step=False, mode="same_tick", rate_hz=1000.0, deadline_us=1e6, **ati):
+        address = SimulatorAddress(0, "", serial_port=digital_ft.port, lock_step=lock_step)
+        rig = replace(
+            serial_rig,
+            rate_hz=rate_hz,
+            ati_serial=replace(serial_rig.ati_serial, **ati),
+            acquisition=replace(serial_rig.acquisition, mode=mode, deadline_us=deadline_us),
+        )
+        made.append(AtiSerialSensor(rig, address))
+        return made[-1]
+
+    yield make
+    for sensor in made:
+        sensor.close()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """No long waits for replies that never come."""
+    monkeypatch.setattr("rigd.devices.ati.serial_sensor._REPLY_TIMEOUT_S", 0.02)
+    monkeypatch.setattr("rigd.devices.ati.serial_sensor._FIRST_RECORDS_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("rigd.devices.ati.serial_sensor._DRAIN_LIMIT_S", 0.1)
+
+
+@pytest.fixture
+def unhurried(monkeypatch):
+    """However slowly a test runs, no tick comes after a pause that the driver distrusts."""
+    monkeypatch.setattr("rigd.devices.ati.serial_sensor._IDLE_NS", 10**12)
+
+
+def refusal(sensor):
+    with pytest.raises(DeviceError) as caught:
+        sensor.connect()
+    return str(caught.value)
+
+
+def tick(sensor):
+    sensor.request(0)
+    return sensor.read_wrench()
+
+
+def wrench_of(fakes, gauges):
+    raw = np.array(fakes.MATRIX) @ np.array(gauges, dtype=float)
+    return raw / np.repeat((1_000_000, 2_000_000), 3)
+
+
+def emitted(fakes, digital_ft, gauges):
+    digital_ft.emit(b"".join(map(fakes.record_of, gauges)))
+
+
+def test_connecting_loads_gains_and_offsets_between_unlock_and_lock(open_sensor, digital_ft):
+    open_sensor().connect()
+    log = digital_ft.log
+    assert "0a 03 00 1d 00 01 15 77" in log
+    assert "0a 03 00 e3 00 40 b4 b7" in log
+    unlock, lock = log.index("0a 6a aa ff 1d"), log.index("0a 6a 18 7f 68")
+    written = log[unlock + 1 : lock]
+    assert [entry[:20] for entry in written] == ["0a 10 00 00 00 06 0c", "0a 10 00 06 00 06 0c"]
+    assert log[-1] == "0a 46 55 a3 9d"
+    assert digital_ft.registers[:6] == [541, 550, 560, 570, 575, 579]
+    assert digital_ft.registers[6:12] == [31842, 32000, 32768, 33000, 34000, 34927]
+    assert not digital_ft.unlocked
+
+
+def test_a_stream_that_still_runs_is_stopped_first(open_sensor, digital_ft):
+    digital_ft.streaming = True
+    open_sensor().connect()
+    assert digital_ft.log[0] == "jam"
+
+
+def test_the_calibration_goes_into_the_file(open_sensor, digital_ft, fakes):
+    sensor = open_sensor()
+    sensor.connect()
+    said = sensor.calibration()
+    assert json.loads(json.dumps(said, allow_nan=False)) == said
+    assert (said["serial_number"], said["part_number"]) == ("FT12345", "SI-20-1")
+    assert (said["family"], said["calibration_date"]) == ("DIG", "2021/03/04 12:00")
+    assert said["matrix"] == [list(row) for row in fakes.MATRIX]
+    assert said["range_n_nm"] == [20.0, 20.0, 60.0, 1.0, 1.0, 1.0]
+    assert said["gains"] == [541, 550, 560, 570, 575, 579]
+    assert said["low_latency"] is False
+    assert (said["port"], said["baud"]) == (digital_ft.port, 1_250_000)
+    assert sum(said["filter_weights"]) == pytest.approx(1.0)
+
+
+def test_another_calibration_block_is_found(open_sensor, digital_ft, fakes):
+    digital_ft.set_block(3, fakes.calibration_registers(part=b"SI-40-2"))
+    sensor = open_sensor(calibration=3)
+    sensor.connect()
+    assert sensor.calibration()["part_number"] == "SI-40-2"
+
+
+def test_the_wrench_is_the_filter_over_the_newest_records(
+    open_sensor, digital_ft, fakes, unhurried, settled
+):
+    rng = random.Random(5)
+    for kind, weights in (
+        ("mean", [1 / 7] * 7),
+        ("triangle", [w / 49 for w in (1, 2, 3, 4, 5, 6, 7, 6, 5, 4, 3, 2, 1)]),
+    ):
+        sensor = open_sensor(filter=kind)
+        sensor.connect()
+        sent = [list(fakes.GAUGES)] * 20
+        tick_gauges = []
+        for _ in range(5):
+            new = [[rng.randint(-9000, 9000) for _ in range(6)] for _ in range(7)]
+            emitted(fakes, digital_ft, new)
+            sent += new
+            newest = np.array(sent[-len(weights) :], dtype=float)
+            tick_gauges.append(np.array(weights) @ newest)
+            if len(tick_gauges) == 1:
+                # The twenty records of the start are still there, too.
+                tick(sensor)
+                continue
+            wrench = tick(sensor)
+            assert wrench == pytest.approx(wrench_of(fakes, tick_gauges[-1]), rel=1e-9, abs=1e-12)
+            assert not sensor.wrench_stale
+        sensor.close()
+
+
+@pytest.fixture
+def settled(fakes, digital_ft):
+    """Let a connected sensor do a first tick, with records of the start."""
+
+    def settle(sensor):
+        emitted(fakes, digital_ft, [fakes.GAUGES] * 7)
+        tick(sensor)
+        return sensor
+
+    return settle
+
+
+def watch_waits(sensor, digital_ft, pieces):
+    """Have each wait of the driver bring one more piece; returns the timeouts it asked for."""
+    waits = []
+    original = sensor._line.wait
+
+    def wait(timeout_s):
+        waits.append(timeout_s)
+        if pieces:
+            digital_ft.emit(pieces.pop(0))
+        original(timeout_s)
+
+    sensor._line.wait = wait
+    return waits
+
+
+def test_in_lock_step_a_tick_waits_for_all_its_records(open_sensor, digital_ft, fakes, settled):
+    sensor = open_sensor(lock_step=True)
+    sensor.connect()
+    settled(sensor)
+    pieces = [fakes.record_of((k, 0, 0, 0, 0, 0)) for k in range(7)]
+    sensor.request(0)
+    waits = watch_waits(sensor, digital_ft, pieces)
+    wrench = sensor.read_wrench()
+    del sensor._line.wait
+    assert len(waits) == 7
+    assert pieces == []
+    assert wrench == pytest.approx(wrench_of(fakes, (3, 0, 0, 0, 0, 0)), abs=1e-15)
+    assert all(earlier > later > 0.5 for earlier, later in pairwise(waits))
+
+
+def test_for_a_last_record_a_tick_waits_no_longer_than_a_record_takes(
+    open_sensor, digital_ft, fakes, settled, unhurried
+):
+    """Else a sensor with a slow clock would drag every tick to its deadline."""
+    sensor = open_sensor(deadline_us=5e6)
+    sensor.connect()
+    settled(sensor)
+    six = b"".join(fakes.record_of((k, 0, 0, 0, 0, 0)) for k in range(6))
+    sensor.request(0)
+    waits = watch_waits(sensor, digital_ft, [six])
+    sensor.read_wrench()
+    del sensor._line.wait
+    assert not sensor.wrench_stale
+    assert waits[0] > 1.0
+    assert all(timeout_s <= 1 / 7000 for timeout_s in waits[1:])
+
+
+def test_a_tick_without_records_keeps_the_last_value_and_says_so(
+    open_sensor, digital_ft, fakes, unhurried, settled
+):
+    sensor = open_sensor(deadline_us=2000.0)
+    sensor.connect()
+    before = tick(settled(sensor))
+    time_ns = sensor.wrench_time_ns
+    assert tick(sensor) == before
+    assert sensor.wrench_stale
+    assert sensor.wrench_time_ns == time_ns
+    emitted(fakes, digital_ft, [(0, 0, 0, 0, 0, 9)] * 3)
+    tick(sensor)
+    assert not sensor.wrench_stale
+    assert sensor.wrench_time_ns > time_ns
+
+
+def test_the_start_of_the_stream_stands_until_the_first_tick(open_sensor, fakes):
+    sensor = open_sensor(mode="previous_tick")
+    sensor.connect()
+    assert tick(sensor) == pytest.approx(wrench_of(fakes, fakes.GAUGES), rel=1e-12)
+    assert sensor.wrench_stale
+
+
+def test_with_the_previous_tick_there_is_no_wait(
+    open_sensor, digital_ft, fakes, unhurried, settled
+):
+    sensor = open_sensor(mode="previous_tick")
+    sensor.connect()
+    settled(sensor)
+    sensor._line.wait = None
+    tick(sensor)
+    assert sensor.wrench_stale
+    emitted(fakes, digital_ft, [(7, 0, 0, 0, 0, 0)] * 7)
+    assert tick(sensor) == pytest.approx(wrench_of(fakes, (7, 0, 0, 0, 0, 0)), abs=1e-15)
+    assert not sensor.wrench_stale
+    del sensor._line.wait
+
+
+def test_after_a_pause_only_new_records_count(open_sensor, digital_ft, fakes, monkeypatch, settled):
+    monkeypatch.setattr("rigd.devices.ati.serial_sensor._IDLE_NS", 1_000_000)
+    sensor = open_sensor(mode="previous_tick")
+    sensor.connect()
+    settled(sensor)
+    emitted(fakes, digital_ft, [(1000, 0, 0, 0, 0, 0)] * 300)
+    time.sleep(0.005)
+    sensor.request(0)
+    emitted(fakes, digital_ft, [(5, 0, 0, 0, 0, 0)] * 2)
+    assert sensor.read_wrench() == pytest.approx(wrench_of(fakes, (5, 0, 0, 0, 0, 0)), abs=1e-15)
+    assert not sensor.wrench_stale
+
+
+def test_in_lock_step_the_first_records_come_with_the_first_tick(open_sensor, digital_ft, fakes):
+    digital_ft.first_records = []
+    sensor = open_sensor(lock_step=True, filter="triangle")
+    sensor.connect()
+    emitted(fakes, digital_ft, [(5, 1, 2, 3, 4, 6)] * 7)
+    time.sleep(0.03)
+    wrench = tick(sensor)
+    assert not sensor.wrench_stale
+    assert wrench == pytest.approx(wrench_of(fakes, (5, 1, 2, 3, 4, 6)), rel=1e-12)
+
+
+@pytest.mark.parametrize("gauge", range(6))
+def test_saturation_of_any_gauge_of_any_new_record(
+    open_sensor, digital_ft, fakes, gauge, unhurried, settled
+):
+    sensor = open_sensor(saturation_counts=32700)
+    sensor.connect()
+    settled(sensor)
+    for counts, saturated in ((32699, False), (-32700, True), (0, False), (32700, True)):
+        gauges = [[0] * 6 for _ in range(7)]
+        gauges[gauge][gauge] = counts
+        emitted(fakes, digital_ft, gauges)
+        tick(sensor)
+        assert sensor.wrench_saturated is saturated
+
+
+def test_a_sensor_that_reports_an_error_ends_the_session(
+    open_sensor, digital_ft, fakes, unhurried, settled
+):
+    sensor = open_sensor()
+    sensor.connect()
+    settled(sensor)
+    single = [fakes.record_of(fakes.GAUGES, error=i == 3) for i in range(7)]
+    digital_ft.emit(b"".join(single))
+    tick(sensor)
+    assert not sensor.wrench_stale, "one such bit may be a disturbed one"
+    digital_ft.emit(fakes.record_of(fakes.GAUGES, error=True) * 7)
+    with pytest.raises(DeviceError, match="has an error"):
+        tick(sensor)
+    digital_ft.status = 0x0204
+    sensor.close()
+    assert sensor.status == [
+        "the gauges' excitation is too low",
+        "the bridges take too much current (broken gauge or cable)",
+    ]
+
+
+def test_damage_is_counted_and_survived(open_sensor, digital_ft, fakes, fuzz, unhurried, settled):
+    sensor = open_sensor(deadline_us=20_000.0)
+    sensor.connect()
+    settled(sensor)
+    records = fuzz.noisy_records(random.Random(3), 70)
+    data = bytearray(b"".join(records))
+    data[13 * 30 + 2] ^= 1
+    del data[13 * 50 + 4]
+    stale = 0
+    for at in range(0, len(data), 91):
+        digital_ft.emit(bytes(data[at : at + 91]))
+        tick(sensor)
+        stale += sensor.wrench_stale
+    assert sensor.stream.checksum_errors == 2
+    assert sensor.stream.dropped_bytes == 13 + 12
+    assert sensor.stream.synchronised
+    assert stale <= 1
+
+
+def test_measuring(open_sensor, digital_ft, fakes):
+    sensor = open_sensor()
+    sensor.connect()
+    pieces = [fakes.record_of(fakes.GAUGES) * 7] * 10
+    watch_waits(sensor, digital_ft, pieces)
+    found = sensor.measure(0.05)
+    assert 0 < found["records_hz"] <= 70 / 0.05
+    assert found["checksum_errors"] == found["dropped_bytes"] == 0
+    assert found["longest_gap_s"] > 0
+    pieces[:] = [b"\x01" + fakes.record_of(fakes.GAUGES) * 10]
+    assert sensor.measure(0.02)["checksum_errors"] == 1
+
+
+def test_a_silent_sensor(open_sensor, digital_ft, quick):
+    digital_ft.silent = True
+    message = refusal(open_sensor())
+    assert "no usable reply in 3 tries: no reply came" in message
+    assert digital_ft.port in message
+    assert "ati_serial.baud" in message
+
+
+def test_a_disturbed_reply_is_asked_for_again(open_sensor, digital_ft, quick):
+    digital_ft.damage_next = 2
+    open_sensor().connect()
+    assert digital_ft.log.count("0a 03 00 1d 00 01 15 77") == 4
+
+
+def test_replies_that_stay_disturbed(open_sensor, digital_ft, quick):
+    digital_ft.damage_next = 9
+    assert "checksum of the reply is wrong" in refusal(open_sensor())
+
+
+def test_a_refused_request(open_sensor, digital_ft):
+    digital_ft.refuse = {0x03: 2}
+    assert "it refused: it has no such register" in refusal(open_sensor())
+
+
+def test_refused_writing_locks_again(open_sensor, digital_ft):
+    digital_ft.refuse = {0x10: 4}
+    assert "load gains and offsets" in refusal(open_sensor())
+    assert digital_ft.log[-1] == "0a 6a 18 7f 68"
+
+
+def test_gains_that_do_not_stay(open_sensor, digital_ft):
+    digital_ft.forgets_writes = True
+    assert "read back as (0, 0, 0, 0, 0, 0" in refusal(open_sensor())
+
+
+@pytest.mark.parametrize(
+    ("status", "words"), [(0x0002, "excitation is too high"), (0x1000, "thermistor is too low")]
+)
+def test_critical_status_at_the_start(open_sensor, digital_ft, status, words):
+    digital_ft.status = status
+    assert words in refusal(open_sensor())
+
+
+def test_critical_status_once_the_gains_are_loaded(open_sensor, digital_ft):
+    digital_ft.after_load = 0x2000
+    assert "analogue output is out of range" in refusal(open_sensor())
+
+
+def test_a_watchdog_reset_is_noted(open_sensor, digital_ft):
+    digital_ft.status = 1
+    sensor = open_sensor()
+    sensor.connect()
+    assert sensor.calibration()["status"] == ["its watchdog has reset the board"]
+
+
+def test_an_empty_calibration(open_sensor):
+    message = refusal(open_sensor(calibration=2))
+    assert "ati_serial.calibration 2" in message
+    assert "Choose another" in message
+
+
+def test_another_serial_number(open_sensor):
+    message = refusal(open_sensor(serial_number="FT99999"))
+    assert "FT12345" in message
+    assert "FT99999" in message
+
+
+def test_a_declined_start(open_sensor, digital_ft):
+    digital_ft.start_reply = 0
+    assert "does not start streaming: it declined with code 0" in refusal(open_sensor())
+
+
+@pytest.mark.parametrize("first", [[], [b"\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a\x0b\x0c\x00"]])
+def test_a_start_without_sound_records(open_sensor, digital_ft, quick, first):
+    digital_ft.first_records = first * 30
+    message = refusal(open_sensor())
+    assert f"of the {390 if first else 0} bytes" in message
+    assert "only 0 were sound records" in message
+
+
+def test_a_sensor_that_does_not_stop_streaming(open_sensor, digital_ft, quick, fakes):
+    digital_ft.streaming = digital_ft.deaf_to_jam = True
+    sensor = open_sensor()
+    noise = fakes.record_of(fakes.GAUGES)
+    stop = threading.Event()
+
+    def babble():
+        while not stop.wait(0.01):
+            os.write(digital_ft.master, noise)
+
+    babbler = threading.Thread(target=babble)
+    babbler.start()
+    try:
+        assert "goes on sending" in refusal(sensor)
+    finally:
+        stop.set()
+        babbler.join()
+    digital_ft.deaf_to_jam = False
+
+
+def test_a_line_too_slow_for_the_stream(open_sensor):
+    message = refusal(open_sensor(baud=115_200))
+    assert "7000 records a second need 1001000 bit/s" in message
+
+
+def test_a_stream_slower_than_the_loop(open_sensor):
+    assert "fewer than the loop's 1000 ticks" in refusal(open_sensor(stream_hz=500.0))
+
+
+def test_a_port_that_does_not_exist(serial_rig):
+    port = "/dev/ttyNowhere7"
+    sensor = AtiSerialSensor(
+        replace(serial_rig, ati_serial=replace(serial_rig.ati_serial, port=port)), None
+    )
+    message = refusal(sensor)
+    assert f"{port} cannot be opened at 1250000 baud (No such file or directory)" in message
+    assert "rigd simulate --profile" in message
+    sensor.close()
+
+
+def test_a_file_that_is_no_port(serial_rig, tmp_path):
+    port = tmp_path / "port"
+    port.touch()
+    settings = replace(serial_rig.ati_serial, port=str(port))
+    assert "cannot be opened" in refusal(
+        AtiSerialSensor(replace(serial_rig, ati_serial=settings), None)
+    )
+
+
+def test_a_port_that_another_program_has(open_sensor):
+    open_sensor().connect()
+    assert "another program has it open" in refusal(open_sensor())
+
+
+def test_an_unplugged_adapter_in_the_cycle(open_sensor, digital_ft):
+    sensor = open_sensor()
+    sensor.connect()
+    digital_ft.hang_up()
+    with pytest.raises(DeviceError, match="has failed"):
+        for _ in range(3):
+            tick(sensor)
+    begin = time.monotonic()
+    sensor.close()
+    sensor.close()
+    assert time.monotonic() - begin < 1.0
+
+
+def test_an_adapter_unplugged_while_waiting(open_sensor, digital_ft, unhurried, settled):
+    sensor = open_sensor()
+    sensor.connect()
+    settled(sensor)
+    sensor.request(0)
+    original = sensor._line.wait
+
+    def wait(timeout_s):
+        digital_ft.hang_up()
+        original(timeout_s)
+
+    sensor._line.wait = wait
+    with pytest.raises(DeviceError, match="look at adapter and cable"):
+        sensor.read_wrench()
+
+
+def test_closing_stops_the_stream_and_frees_the_port(open_sensor, digital_ft):
+    sensor = open_sensor()
+    sensor.connect()
+    sensor.close()
+    assert not digital_ft.streaming
+    assert digital_ft.log[-2:] == ["jam", "0a 03 00 1d 00 01 15 77"]
+    sensor.connect()
+    assert tick(sensor)
+
+
+def test_unconnected_sensors_say_so(open_sensor):
+    sensor = open_sensor()
+    for use in (lambda: tick(sensor), sensor.calibration, lambda: sensor.measure(0.01)):
+        with pytest.raises(DeviceError, match="not connected"):
+            use()
+    sensor.close()
+
+
+@pytest.mark.parametrize("section", ["ati_serial", "acquisition"])
+def test_a_profile_without_the_section(serial_rig, section):
+    with pytest.raises(DeviceError, match=section):
+        AtiSerialSensor(replace(serial_rig, **{section: None}), None)
+
+
+def test_no_descriptor_is_left_open(open_sensor, digital_ft):
+    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    sensor = open_sensor()
+    sensor.connect()
+    sensor.close()
+    digital_ft.status = 2
+    refusal(sensor)
+    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208

@@ -1,0 +1,145 @@
+"""The exchange: who gets which frame, waiting for replies, and what the controller reports."""
+
+import threading
+import time
+
+import pytest
+
+from rigd.devices.canbus import CanExchange, pack_frame
+from rigd.devices.contracts import DeviceError
+
+ERROR = 0x2000_0000
+
+
+@pytest.fixture
+def exchange(ends):
+    return CanExchange(ends[0])
+
+
+def test_each_frame_goes_to_whom_subscribed_to_it(ends, exchange):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, lambda data: got.append(("drive", data)))
+    exchange.subscribe(0x110, lambda data: got.append(("sensor", data)))
+    far.send(0x110, b"abc")
+    far.send(0x3FF, b"nobody's")
+    far.send(0x181, b"12345678")
+    far.send(0x110)
+    exchange.drain()
+    assert got == [("sensor", b"abc"), ("drive", b"12345678"), ("sensor", b"")]
+
+
+@pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000])
+def test_long_identifiers_and_requests_for_data_are_for_nobody(ends, exchange, flag):
+    _, far = ends
+    exchange.subscribe(0x181, lambda data: pytest.fail("not ours"))
+    far.send(0x181 | flag)
+    exchange.drain()
+
+
+def test_one_identifier_is_for_one_device(exchange):
+    exchange.subscribe(0x201, print)
+    with pytest.raises(DeviceError, match=r"two devices use the identifier 0x201.*profile"):
+        exchange.subscribe(0x201, repr)
+
+
+def test_starting_drops_what_is_queued_and_keeps_the_subscriptions(ends, exchange):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, got.append)
+    far.send(0x181, b"old")
+    exchange.start()
+    far.send(0x181, b"new")
+    exchange.drain()
+    assert got == [b"new"]
+
+
+def test_sending_is_the_port_s(ends, exchange):
+    _, far = ends
+    exchange.send(pack_frame(0x80, b"\x01"))
+    assert far.receive() == (0x80, b"\x01")
+
+
+def test_waiting_ends_as_soon_as_it_is_ready(ends, exchange):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, got.append)
+    later = threading.Timer(0.02, far.send, (0x181, b"x"))
+    later.start()
+    assert exchange.wait_until(lambda: bool(got), time.monotonic_ns() + 10_000_000_000)
+    later.join()
+    assert got == [b"x"]
+
+
+def test_waiting_goes_on_over_frames_that_do_not_help(ends, exchange):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, got.append)
+    for number in range(3):
+        far.send(0x181, bytes([number]))
+    assert exchange.wait_until(lambda: len(got) == 3, time.monotonic_ns() + 1_000_000_000)
+
+
+def test_waiting_ends_at_its_deadline(exchange):
+    before = time.monotonic_ns()
+    assert not exchange.wait_until(lambda: False, before + 5_000_000)
+    assert time.monotonic_ns() >= before + 5_000_000
+
+
+def test_a_deadline_that_has_passed_still_takes_what_has_arrived(ends, exchange):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, got.append)
+    far.send(0x181, b"x")
+    assert exchange.wait_until(lambda: bool(got), time.monotonic_ns() - 1)
+    assert not exchange.wait_until(lambda: False, time.monotonic_ns() - 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "says"),
+    [
+        (0x040, bytes(8), "bus-off"),
+        (0x020, bytes(8), "nobody acknowledges"),
+        (0x004, b"\0\x10" + bytes(6), "error-passive"),
+        (0x004, b"\0\x20" + bytes(6), "error-passive"),
+        (0x044, bytes(8), "bus-off"),
+    ],
+)
+def test_a_disturbed_bus_is_told_now_and_later(ends, exchange, kind, data, says):
+    _, far = ends
+    far.send(ERROR | kind, data)
+    for _ in range(2):
+        with pytest.raises(DeviceError, match=says):
+            exchange.drain()
+    assert exchange.error_frames == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"), [(0x004, b"\0\x0c" + bytes(6)), (0x008, bytes(8)), (0x100, bytes(8))]
+)
+def test_a_warning_of_the_controller_is_only_counted(ends, exchange, kind, data):
+    _, far = ends
+    for _ in range(3):
+        far.send(ERROR | kind, data)
+    exchange.drain()
+    assert exchange.error_frames == 3
+
+
+def test_frames_before_a_cut_are_delivered(ends, exchange):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, got.append)
+    far.send(0x181, b"x")
+    far.socket.close()
+    with pytest.raises(DeviceError, match="cut off"):
+        exchange.drain()
+    assert got == [b"x"]
+
+
+def test_waiting_notices_a_cut(ends, exchange):
+    _, far = ends
+    cut = threading.Timer(0.02, far.socket.close)
+    cut.start()
+    with pytest.raises(DeviceError, match="cut off"):
+        exchange.wait_until(lambda: False, time.monotonic_ns() + 10_000_000_000)
+    cut.join()

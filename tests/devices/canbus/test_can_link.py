@@ -1,0 +1,84 @@
+"""The bus that devices share: opened by the first, closed by the last."""
+
+import socket
+
+import pytest
+
+from rigd.devices.canbus import CanLink
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import CanBus
+from rigd.devices.simulator import SimulatorAddress
+
+SETTINGS = CanBus("socketcan", "rigd-none0", 1_000_000)
+
+
+@pytest.fixture
+def hub(runtime_folder):
+    path = runtime_folder / "can"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        listener.settimeout(2.0)
+        yield listener
+
+
+@pytest.fixture
+def link(hub):
+    link = CanLink(SETTINGS, SimulatorAddress(1, "", can_socket=hub.getsockname()))
+    yield link
+    link.close()
+    link.close()
+
+
+def is_connected(far):
+    far.settimeout(0.0)
+    try:
+        return far.recv(16) != b""
+    except BlockingIOError:
+        return True
+
+
+def test_two_users_share_one_bus_and_the_last_closes_it(hub, link):
+    exchange = link.open()
+    assert link.open() is exchange
+    assert link.exchange is exchange
+    far, _ = hub.accept()
+    hub.settimeout(0.0)
+    with pytest.raises(BlockingIOError):
+        hub.accept()
+    with far:
+        link.close()
+        assert link.exchange is exchange
+        assert is_connected(far)
+        link.close()
+        assert not is_connected(far)
+
+
+def test_a_bus_that_is_not_open_is_told(link):
+    with pytest.raises(DeviceError, match="not open"):
+        _ = link.exchange
+    link.open()
+    link.close()
+    with pytest.raises(DeviceError, match="not open"):
+        _ = link.exchange
+
+
+def test_closing_too_often_is_harmless_and_it_opens_again(hub, link):
+    link.close()
+    first = link.open()
+    link.close()
+    link.close()
+    assert link.open() is not first
+    link.close()
+    with pytest.raises(DeviceError):
+        _ = link.exchange
+
+
+def test_a_bus_that_does_not_open_counts_no_user():
+    link = CanLink(SETTINGS, None)
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="rigd-none0"):
+            link.open()
+    link.close()
+    with pytest.raises(DeviceError, match="not open"):
+        _ = link.exchange

@@ -1,0 +1,308 @@
+"""Ports: the socket that carries frames, and any adapter of python-can."""
+
+import errno
+import gc
+import socket
+import struct
+import time
+from dataclasses import replace
+
+import can
+import pytest
+
+from rigd.devices.canbus import open_port, pack_frame, unpack_frame
+from rigd.devices.canbus.exchange import CanExchange
+from rigd.devices.canbus.port import PythonCanPort, SocketPort
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import CanBus
+from rigd.devices.simulator import SimulatorAddress
+
+SETTINGS = CanBus("socketcan", "rigd-none0", 1_000_000)
+
+
+def test_frames_go_both_ways_in_order(ends):
+    port, far = ends
+    for number in range(20):
+        port.send(pack_frame(0x200 + number, bytes([number])))
+        far.send(0x180 + number, bytes([number, number]))
+    for number in range(20):
+        assert far.receive() == (0x200 + number, bytes([number]))
+        assert unpack_frame(port.receive()) == (0x180 + number, bytes([number, number]))
+    assert port.receive() is None
+
+
+def test_a_line_that_is_cut_off_is_told(ends):
+    port, far = ends
+    far.send(0x123)
+    far.socket.close()
+    assert unpack_frame(port.receive()) == (0x123, b"")
+    with pytest.raises(DeviceError, match=r"can0 \(test\): it was cut off"):
+        port.receive()
+    with pytest.raises(DeviceError, match=r"takes no more frames \(Broken pipe\)"):
+        port.send(pack_frame(0x80))
+
+
+def test_a_line_nobody_reads_is_told_and_does_not_block(ends):
+    port, _ = ends
+    frame = pack_frame(0x80)
+    with pytest.raises(DeviceError, match="no other device acknowledges"):
+        for _ in range(100_000):
+            port.send(frame)
+
+
+def test_a_full_line_carries_whole_frames_only(ends):
+    port, far = ends
+    sent = 0
+    with pytest.raises(DeviceError):
+        while True:
+            port.send(pack_frame(sent % 0x800, sent.to_bytes(8, "big")))
+            sent += 1
+    for number in range(sent):
+        assert far.receive() == (number % 0x800, number.to_bytes(8, "big"))
+    far.socket.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        far.socket.recv(1)
+
+
+def test_waiting_ends_with_a_frame(ends):
+    port, far = ends
+    far.send(0x123)
+    before = time.monotonic()
+    port.wait(30.0)
+    assert time.monotonic() - before < 10.0
+    assert port.receive() is not None
+    port.wait(0.001)
+    assert port.receive() is None
+
+
+def test_a_closed_port_is_told_and_may_be_closed_again(ends):
+    port, _ = ends
+    port.close()
+    port.close()
+    with pytest.raises(DeviceError):
+        port.send(pack_frame(0x80))
+    with pytest.raises(DeviceError):
+        port.receive()
+
+
+def test_the_simulated_bus_brings_everything(ends):
+    port, far = ends
+    port.accept([0x181])
+    far.send(0x182)
+    assert unpack_frame(port.receive()) == (0x182, b"")
+
+
+class RecordingLink:
+    """Of a kernel with CAN: takes the options, and every frame with an error of choice."""
+
+    family = getattr(socket, "AF_CAN", 29)
+
+    def __init__(self, error=None):
+        self.options = []
+        self.error = error
+
+    def setblocking(self, flag):
+        assert not flag
+
+    def fileno(self):
+        return 0
+
+    def setsockopt(self, *option):
+        self.options.append(option)
+
+    def send(self, frame):
+        raise OSError(self.error, "no buffer space available")
+
+    def recv(self, size):
+        raise OSError(self.error or errno.EAGAIN, "network is down")
+
+
+def test_the_kernel_is_told_which_frames_to_let_in():
+    link = RecordingLink()
+    SocketPort(link, "can0").accept({0x701: None, 0x181: None})
+    # Identifier and mask; neither long identifiers nor requests for data get through.
+    wanted = struct.pack("=4I", 0x181, 0xC000_07FF, 0x701, 0xC000_07FF)
+    assert link.options == [(101, 1, wanted)]  # SOL_CAN_RAW, CAN_RAW_FILTER
+
+
+def test_an_exchange_that_starts_lets_in_what_was_subscribed_to():
+    link = RecordingLink()
+    exchange = CanExchange(SocketPort(link, "can0"))
+    exchange.subscribe(0x181, print)
+    exchange.start()
+    exchange.subscribe(0x110, print)
+    exchange.start()
+    assert [len(filters) for _, _, filters in link.options] == [8, 16]
+
+
+def test_what_the_kernel_says_has_its_remedy():
+    full = SocketPort(RecordingLink(errno.ENOBUFS), "can0")
+    with pytest.raises(DeviceError, match="no other device acknowledges: look at cable"):
+        full.send(pack_frame(1))
+    down = SocketPort(RecordingLink(errno.ENETDOWN), "can0")
+    with pytest.raises(DeviceError, match=r"cannot be read \(network is down\)"):
+        down.receive()
+
+
+@pytest.fixture
+def kernel_bus():
+    """The kernel's own virtual bus, where it has one."""
+    try:
+        link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    except (AttributeError, OSError) as error:
+        pytest.skip(f"CAN SOCKETS NOT TESTED: this kernel has none ({error})")
+    with link:
+        try:
+            link.bind(("vcan0",))
+        except OSError as error:
+            pytest.skip(f"CAN SOCKETS NOT TESTED: there is no vcan0 ({error})")
+        yield link
+
+
+def test_on_the_kernel_s_bus_only_what_is_wanted_gets_in(kernel_bus):
+    port = open_port(replace(SETTINGS, channel="vcan0"), None)
+    port.accept([0x181])
+    try:
+        for can_id in (0x182, 0x181 | 0x8000_0000, 0x181 | 0x4000_0000, 0x181):
+            kernel_bus.send(struct.pack("=IB3x8s", can_id, 0, b""))
+        port.wait(1.0)
+        assert unpack_frame(port.receive()) == (0x181, b"")
+        assert port.receive() is None
+    finally:
+        port.close()
+
+
+def test_a_bus_that_is_not_there_is_told_with_its_remedy():
+    with pytest.raises(DeviceError) as refused:
+        open_port(SETTINGS, None)
+    assert "rigd-none0" in str(refused.value)
+    assert "ip link set rigd-none0 up type can bitrate 1000000" in str(refused.value)
+    assert "rigd simulate" in str(refused.value)
+
+
+@pytest.mark.parametrize("interface", ["no-such-adapter", "slcan"])
+def test_an_adapter_that_is_not_there_is_told(interface):
+    with pytest.raises(DeviceError, match=r"check can\.interface and can\.channel"):
+        open_port(CanBus(interface, "/dev/rigd-none", 1_000_000), None)
+    gc.collect()
+
+
+def test_the_simulated_bus_is_reached_by_its_socket(runtime_folder):
+    path = str(runtime_folder / "can")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(path)
+        listener.listen()
+        port = open_port(SETTINGS, SimulatorAddress(1, "", can_socket=path))
+        far, _ = listener.accept()
+        with far:
+            port.send(pack_frame(0x80))
+            assert far.recv(16) == pack_frame(0x80)
+            assert "simulated" in port.name
+            port.close()
+            assert far.recv(16) == b""
+
+
+def test_a_simulated_bus_that_is_gone_is_told(runtime_folder):
+    address = SimulatorAddress(1, "", can_socket=str(runtime_folder / "gone"))
+    with pytest.raises(DeviceError, match="start rigd simulate again"):
+        open_port(SETTINGS, address)
+
+
+def test_a_simulator_on_a_real_bus_leaves_the_profile_s(runtime_folder):
+    with pytest.raises(DeviceError, match="ip link set"):
+        open_port(SETTINGS, SimulatorAddress(1, "", can_socket=""))
+
+
+@pytest.fixture
+def adapter(request):
+    """A port on python-can's virtual bus, and a bus of python-can beside it."""
+    channel = request.node.name
+    port = open_port(CanBus("virtual", channel, 1_000_000), None)
+    with can.Bus(interface="virtual", channel=channel) as beside:
+        assert isinstance(port, PythonCanPort)
+        yield port, beside
+        port.close()
+
+
+def message(can_id, data=b"", **flags):
+    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False} | flags)
+
+
+def test_an_adapter_carries_frames_both_ways(adapter):
+    port, beside = adapter
+    port.send(pack_frame(0x201, b"\x0f\x00"))
+    heard = beside.recv(1.0)
+    assert (heard.arbitration_id, bytes(heard.data)) == (0x201, b"\x0f\x00")
+    assert not heard.is_extended_id
+    assert not heard.is_error_frame
+    beside.send(message(0x181, b"12345678"))
+    assert unpack_frame(port.receive()) == (0x181, b"12345678")
+    assert port.receive() is None
+
+
+def test_waiting_on_an_adapter_loses_nothing(adapter):
+    port, beside = adapter
+    for number in range(3):
+        beside.send(message(0x181, bytes([number])))
+    port.wait(1.0)
+    port.wait(1.0)
+    received = [unpack_frame(port.receive()) for _ in range(3)]
+    assert received == [(0x181, bytes([number])) for number in range(3)]
+    port.wait(0.001)
+    assert port.receive() is None
+
+
+def test_one_poll_of_an_adapter_gets_past_frames_of_others(adapter):
+    port, beside = adapter
+    got = []
+    exchange = CanExchange(port)
+    exchange.subscribe(0x181, got.append)
+    exchange.start()
+    for _ in range(5):
+        beside.send(message(0x3FF))
+    beside.send(message(0x181, b"x"))
+    exchange.drain()
+    assert got == [b"x"]
+
+
+def test_what_an_adapter_says_of_itself_gets_past_the_filters(adapter):
+    port, beside = adapter
+    exchange = CanExchange(port)
+    exchange.subscribe(0x181, print)
+    exchange.start()
+    beside.send(message(0x40, bytes(8), is_error_frame=True))
+    with pytest.raises(DeviceError, match="bus-off"):
+        exchange.drain()
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        message(0x181, b"x", is_extended_id=True),
+        message(0x1800_0181, b"x", is_extended_id=True),
+        message(0x181, is_remote_frame=True),
+    ],
+    ids=["long", "long, same end", "remote"],
+)
+def test_frames_of_another_kind_are_not_taken_for_ours(adapter, foreign):
+    port, beside = adapter
+    got = []
+    exchange = CanExchange(port)
+    exchange.subscribe(0x181, got.append)
+    beside.send(foreign)
+    exchange.drain()
+    assert got == []
+    exchange.start()
+    beside.send(foreign)
+    exchange.drain()
+    assert got == []
+
+
+def test_a_closed_adapter_is_told_and_may_be_closed_again(adapter):
+    port, _ = adapter
+    port.close()
+    port.close()
+    with pytest.raises(DeviceError):
+        port.send(pack_frame(0x80))
+    with pytest.raises(DeviceError):
+        port.receive()

@@ -1,0 +1,121 @@
+"""Set-up through canopen on our ports, and that the port stays as it was."""
+
+import socket
+import sys
+
+import can
+import canopen
+import pytest
+from canopen.objectdictionary import ODVariable, datatypes
+
+from rigd.devices.canbus import pack_frame, unpack_frame
+from rigd.devices.canbus.port import SocketPort
+from rigd.devices.canbus.setup_bus import from_message, to_message
+
+NODE = 5
+
+
+def dictionary():
+    objects = canopen.ObjectDictionary()
+    for index, name, kind in (
+        (0x2000, "number", datatypes.UNSIGNED32),
+        (0x2001, "text", datatypes.VISIBLE_STRING),
+    ):
+        variable = ODVariable(name, index)
+        variable.data_type = kind
+        variable.access_type = "rw"
+        objects.add_object(variable)
+    return objects
+
+
+@pytest.fixture
+def nodes():
+    """A node as its master sees it, and the node itself, on two ends of a line."""
+    networks = []
+    ports = [
+        SocketPort(link, f"end {number}")
+        for number, link in enumerate(socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM))
+    ]
+    for port in ports:
+        network = canopen.Network(port.open_bus())
+        network.NOTIFIER_CYCLE = 0.02
+        network.connect()
+        networks.append(network)
+    remote = canopen.RemoteNode(NODE, dictionary())
+    networks[0].add_node(remote)
+    local = canopen.LocalNode(NODE, dictionary())
+    networks[1].add_node(local)
+    yield remote, local, ports, networks
+    for network in networks:
+        network.disconnect()
+    for port in ports:
+        port.close()
+
+
+def test_objects_are_written_and_read(nodes):
+    remote, local, _, _ = nodes
+    remote.sdo["number"].raw = 0x1234_5678
+    assert local.sdo["number"].raw == 0x1234_5678
+    assert remote.sdo["number"].raw == 0x1234_5678
+    text = "longer than what fits into one frame, so that it goes in segments"
+    remote.sdo["text"].raw = text
+    assert remote.sdo["text"].raw == text
+
+
+def test_a_refusal_is_canopen_s(nodes):
+    remote, _, _, _ = nodes
+    with pytest.raises(canopen.SdoAbortedError, match="0x06020000"):
+        remote.sdo.upload(0x3000, 0)
+
+
+def test_after_set_up_the_port_is_still_open(nodes):
+    remote, _, ports, networks = nodes
+    remote.sdo["number"].raw = 1
+    for network in networks:
+        network.disconnect()
+    ports[0].send(pack_frame(0x80))
+    ports[1].wait(1.0)
+    assert unpack_frame(ports[1].receive()) == (0x80, b"")
+
+
+def test_receiving_waits_for_its_time_and_no_longer(ends):
+    port, far = ends
+    bus = port.open_bus()
+    assert bus.recv(0.0) is None
+    assert bus.recv(0.005) is None
+    far.send(0x705, b"\x05")
+    received = bus.recv(5.0)
+    assert (received.arbitration_id, bytes(received.data)) == (0x705, b"\x05")
+    bus.shutdown()
+
+
+@pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000])
+def test_frames_of_another_kind_are_not_taken_for_a_node_s(ends, flag):
+    port, far = ends
+    bus = port.open_bus()
+    far.send(flag | 0x585)
+    far.send(0x705)
+    assert bus.recv(1.0).arbitration_id == 0x705
+    assert bus.recv(0.0) is None
+    bus.shutdown()
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        can.Message(arbitration_id=0x123, is_extended_id=False, data=b"abc"),
+        can.Message(arbitration_id=0x1234_5678, is_extended_id=True, data=b"abc"),
+        can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True),
+        can.Message(arbitration_id=0x44, is_extended_id=False, is_error_frame=True, data=bytes(8)),
+    ],
+    ids=["data", "long", "remote", "error"],
+)
+def test_messages_of_python_can_come_back_as_they_were(message):
+    assert to_message(from_message(message)).equals(message, timestamp_delta=None)
+
+
+def test_the_flags_are_those_of_the_kernel():
+    remote = can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True)
+    assert int.from_bytes(from_message(remote)[:4], sys.byteorder) == 0x4000_0123
+    long = can.Message(arbitration_id=0x123, is_extended_id=True)
+    assert int.from_bytes(from_message(long)[:4], sys.byteorder) == 0x8000_0123

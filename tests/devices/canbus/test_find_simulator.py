@@ -1,0 +1,112 @@
+"""Where a running simulated rig is found, and that what a dead one left is not one."""
+
+import json
+import socket
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from rigd.devices.simulator import SimulatorAddress, announce, find_simulator
+from rigd.devices.simulator import runtime_folder as current_folder
+
+
+@pytest.fixture
+def alive(runtime_folder):
+    """The control socket of a simulator that runs."""
+    path = runtime_folder / "control"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        yield str(path)
+
+
+def test_what_was_announced_is_found(alive):
+    address = SimulatorAddress(4711, alive, "/run/can", "/dev/pts/7", lock_step=True)
+    path = announce("antenna", address)
+    assert find_simulator("antenna") == address
+    assert find_simulator("sim") is None
+    assert [entry.name for entry in path.parent.iterdir()] == ["antenna.json"]
+    assert path.parent.stat().st_mode & 0o077 == 0
+
+
+def test_announcing_again_replaces(alive):
+    announce("antenna", SimulatorAddress(1, alive))
+    announce("antenna", SimulatorAddress(2, alive))
+    assert find_simulator("antenna").pid == 2
+
+
+def test_a_rig_without_a_simulator_has_none(runtime_folder):
+    assert find_simulator("antenna") is None
+
+
+def test_what_a_dead_one_left_is_not_found(runtime_folder):
+    path = runtime_folder / "control"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen()
+    assert path.exists()
+    announce("antenna", SimulatorAddress(1, str(path)))
+    assert find_simulator("antenna") is None
+    path.unlink()
+    assert find_simulator("antenna") is None
+
+
+def test_one_that_is_too_busy_to_answer_runs_all_the_same(runtime_folder):
+    """Taken for a dead one, it would have the drivers turn to the hardware."""
+    path = str(runtime_folder / "control")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(path)
+        listener.listen(0)
+        announce("antenna", SimulatorAddress(1, path))
+        with ExitStack() as queued:
+            with pytest.raises(BlockingIOError):
+                while True:
+                    waiting = queued.enter_context(socket.socket(socket.AF_UNIX))
+                    waiting.setblocking(False)
+                    waiting.connect(path)
+            assert find_simulator("antenna") is not None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "7",
+        "null",
+        "{}",
+        '{"pid": 1}',
+        '{"pid": 1, "control_socket": "x", "unknown": 1}',
+        '{"pid": 1, "control_socket": 5}',
+        '{"pid": 1, "control_socket": null}',
+        '{"pid": 1, "control_socket": "a\\u0000b"}',
+        '{"pid": 1, "control_socket": "/' + 300 * "x" + '"}',
+        '{"pid": 1, "control_socket": ""}',
+    ],
+)
+def test_a_garbled_file_is_not_a_simulator(runtime_folder, text):
+    path = announce("antenna", SimulatorAddress(1, "x"))
+    path.write_text(text, encoding="utf-8")
+    assert find_simulator("antenna") is None
+
+
+def test_bytes_that_are_no_text_are_not_a_simulator(runtime_folder):
+    announce("antenna", SimulatorAddress(1, "x")).write_bytes(b"\xff\xfe\x00")
+    assert find_simulator("antenna") is None
+
+
+def test_other_settings_of_the_file_are_kept(alive):
+    path = announce("antenna", SimulatorAddress(1, alive, can_socket="c"))
+    assert json.loads(path.read_text("utf-8"))["can_socket"] == "c"
+
+
+def test_without_a_runtime_folder_it_is_this_user_s_own(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
+    assert current_folder().parent == Path(tempfile.gettempdir())
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert current_folder().parent == Path(tempfile.gettempdir())
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert current_folder() == tmp_path / "rigd"

@@ -1,0 +1,253 @@
+"""Golden bytes of every frame, written by hand from CiA 301 and 402, and tables in full."""
+
+import struct
+from collections import Counter
+from pathlib import Path
+
+import canopen
+import pytest
+from canopen.emcy import EmcyError
+from canopen.objectdictionary import datatypes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rigd.devices.cia402 as package
+from rigd.devices.canbus import unpack_frame
+from rigd.devices.cia402 import objects, states
+from rigd.devices.cia402.faults import describe_error
+from rigd.devices.cia402.frames import (
+    NodeFrames,
+    is_written,
+    read_emergency,
+    read_mode,
+    unpack_tpdo,
+)
+from rigd.devices.cia402.inbox import Inbox
+from rigd.devices.cia402.states import DriveState, state_of
+
+FRAMES = NodeFrames(5, 100)
+EDS = Path(package.__file__).with_name("drive.eds")
+
+
+@pytest.mark.parametrize(
+    ("frame", "can_id", "data"),
+    [
+        (FRAMES.sync, 0x080, ""),
+        (FRAMES.heartbeat, 0x764, "05"),
+        (FRAMES.start, 0x000, "01 05"),
+        (FRAMES.stop, 0x000, "02 05"),
+        (FRAMES.pre_operational, 0x000, "80 05"),
+        (FRAMES.disable_voltage, 0x605, "2B 40 60 00 00 00 00 00"),
+        (FRAMES.forget_heartbeat, 0x605, "23 16 10 01 00 00 00 00"),
+        (FRAMES.ask_mode, 0x605, "40 61 60 00 00 00 00 00"),
+        (FRAMES.rpdo(0x00, 0), 0x205, "00 00 00 00"),
+        (FRAMES.rpdo(0x06, 0), 0x205, "06 00 00 00"),
+        (FRAMES.rpdo(0x0F, 1000), 0x205, "0F 00 E8 03"),
+        (FRAMES.rpdo(0x0F, -1), 0x205, "0F 00 FF FF"),
+        (FRAMES.rpdo(0x0F, 32767), 0x205, "0F 00 FF 7F"),
+        (FRAMES.rpdo(0x80, -32768), 0x205, "80 00 00 80"),
+    ],
+)
+def test_frames_sent(frame, can_id, data):
+    assert len(frame) == 16
+    assert unpack_frame(frame) == (can_id, bytes.fromhex(data))
+
+
+def test_identifiers_of_the_drives_frames():
+    last = NodeFrames(127, 1)
+    assert (last.tpdo_id, last.emergency_id, last.heartbeat_id, last.reply_id, last.rpdo_id) == (
+        0x1FF, 0x0FF, 0x77F, 0x5FF, 0x27F,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        ("37 12 00 00 00 00 00 00", (0x1237, 0, 0)),
+        ("50 02 01 00 00 00 F4 01", (0x0250, 1, 500)),
+        ("37 12 FF FF FF FF 0C FE", (0x1237, -1, -500)),
+        ("18 02 00 00 00 80 00 80", (0x0218, -(2**31), -32768)),
+        ("27 00 FF FF FF 7F FF 7F", (0x0027, 2**31 - 1, 32767)),
+    ],
+)
+def test_tpdo(data, told):
+    assert unpack_tpdo(bytes.fromhex(data)) == told
+
+
+@settings(deadline=None)
+@given(
+    word=st.integers(0, 0xFFFF),
+    position=st.integers(-(2**31), 2**31 - 1),
+    torque=st.integers(-(2**15), 2**15 - 1),
+)
+def test_tpdo_and_rpdo_round_trip(word, position, torque):
+    def little(value, size):
+        return (value % 256**size).to_bytes(size, "little")
+
+    assert unpack_tpdo(little(word, 2) + little(position, 4) + little(torque, 2)) == (
+        word,
+        position,
+        torque,
+    )
+    assert unpack_frame(FRAMES.rpdo(word, torque)) == (0x205, little(word, 2) + little(torque, 2))
+
+
+def test_emergency():
+    assert read_emergency(bytes.fromhex("11 86 20 02 00 00 00 00")) == (
+        0x8611,
+        0x20,
+        bytes.fromhex("02 00 00 00 00"),
+    )
+    assert read_emergency(bytes.fromhex("30 81 11")) == (0x8130, 0x11, b"")
+    assert read_emergency(b"\x30\x81") is None
+
+
+@pytest.mark.parametrize(
+    ("data", "mode"),
+    [
+        ("4F 61 60 00 0A 00 00 00", 10),
+        ("4F 61 60 00 FF 00 00 00", -1),
+        ("43 61 60 00 0A 00 00 00", 10),
+        ("42 61 60 00 0A 00 00 00", 10),
+        ("4F 60 60 00 0A 00 00 00", None),
+        ("4F 61 60 01 0A 00 00 00", None),
+        ("80 61 60 00 00 00 02 06", None),
+        ("60 61 60 00 00 00 00 00", None),
+        ("4F 61 60 00 0A 00 00", None),
+        ("", None),
+    ],
+)
+def test_reply_to_the_question_for_the_mode(data, mode):
+    assert read_mode(bytes.fromhex(data)) == mode
+
+
+def test_confirmation_of_a_write():
+    assert is_written(bytes.fromhex("60 40 60 00 00 00 00 00"), 0x6040, 0)
+    assert is_written(bytes.fromhex("60 16 10 01 00 00 00 00"), 0x1016, 1)
+    assert not is_written(bytes.fromhex("80 40 60 00 22 00 00 08"), 0x6040, 0)
+    assert not is_written(bytes.fromhex("60 40 60 00"), 0x6040, 0)
+    assert not is_written(bytes.fromhex("60 41 60 00 00 00 00 00"), 0x6040, 0)
+
+
+def test_the_state_of_every_statusword():
+    """CiA 402: bits 0 to 3 and 6, with bit 5 where the state tells a quick stop from the rest."""
+    words = {
+        0b000_0000: DriveState.NOT_READY,
+        0b100_0000: DriveState.SWITCH_ON_DISABLED,
+        0b000_1111: DriveState.FAULT_REACTION,
+        0b000_1000: DriveState.FAULT,
+    }
+    with_bit_5 = {
+        0b010_0001: DriveState.READY,
+        0b010_0011: DriveState.SWITCHED_ON,
+        0b010_0111: DriveState.OPERATION_ENABLED,
+        0b000_0111: DriveState.QUICK_STOP,
+    }
+    seen = Counter()
+    for word in range(0x10000):
+        expected = words.get(word & 0b100_1111, with_bit_5.get(word & 0b110_1111))
+        state = state_of(word)
+        assert state is (expected or DriveState.UNKNOWN), f"{word:#06x}"
+        seen[state] += 1
+    assert set(seen) == set(DriveState)
+
+
+def test_no_two_states_share_a_statusword():
+    for word in range(0x80):
+        assert sum(word & mask == value for mask, value, _ in states._TABLE) <= 1
+
+
+def test_every_error_code_has_words_of_its_class():
+    """Canopen's own table of CiA 301's classes is the witness."""
+    ours = {
+        "Error Reset / No Error": "no error",
+        "Generic Error": "generic",
+        "Current": "current",
+        "Voltage": "voltage",
+        "Temperature": ("temperature", "hot"),
+        "Device Hardware": "hardware",
+        "Device Software": ("software", "parameters"),
+        "Additional Modules": "module",
+        "External Error": "external",
+        "Additional Functions": "additional function",
+        "Device Specific": "see its manual",
+    }
+    for code in range(0x10000):
+        theirs = EmcyError(code, 0, b"", 0).get_desc()
+        words = describe_error(code)
+        assert f"0x{code:04X}" in words
+        if theirs in ours and code >> 12 != 0xF:
+            wanted = ours[theirs]
+            wanted = (wanted,) if isinstance(wanted, str) else wanted
+            assert any(word in words for word in wanted), words
+    assert "see its manual" in describe_error(0xFF03)
+    assert "additional function" in describe_error(0xF001)
+    assert "heartbeat" in describe_error(0x8130)
+    assert "communication" in describe_error(0x8150)
+    assert "protocol" in describe_error(0x8250)
+    assert "encoder" in describe_error(0x7305)
+    assert describe_error(0xB000) == "error code 0xB000"
+
+
+def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
+    dictionary = canopen.import_od(str(EDS), 5)
+    types = {
+        datatypes.UNSIGNED8: [(0x1001, 0), (0x1029, 1), (0x1400, 2), (0x1800, 2), (0x1600, 0),
+                              (0x1A00, 0), (0x60C2, 1)],
+        datatypes.INTEGER8: [(0x6060, 0), (0x6061, 0), (0x60C2, 2)],
+        datatypes.UNSIGNED16: [(0x1017, 0), (0x603F, 0), (0x6040, 0), (0x6041, 0), (0x6072, 0)],
+        datatypes.INTEGER16: [(0x6007, 0), (0x6071, 0), (0x6077, 0)],
+        datatypes.UNSIGNED32: [(0x1000, 0), (0x1005, 0), (0x1006, 0), (0x1016, 1), (0x1018, 1),
+                               (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x6076, 0), (0x6502, 0),
+                               *((0x1400 + n, 1) for n in range(4)),
+                               *((0x1800 + n, 1) for n in range(4)),
+                               *((0x1600, sub) for sub in (1, 2)),
+                               *((0x1A00, sub) for sub in (1, 2, 3))],
+        datatypes.INTEGER32: [(0x6064, 0)],
+        datatypes.VISIBLE_STRING: [(0x1008, 0)],
+    }  # fmt: skip
+    for kind, places in types.items():
+        for index, sub in places:
+            assert dictionary.get_variable(index, sub).data_type == kind, f"{index:04X}:{sub}"
+    named = {
+        value
+        for key, value in vars(objects).items()
+        if key.isupper() and isinstance(value, int) and 0x1000 <= value <= 0x6FFF
+    }
+    assert named <= set(dictionary), "an object that set-up may need is not in the dictionary"
+
+
+def test_the_mapping_of_the_pdos():
+    assert objects.TPDO_ENTRIES == (0x60410010, 0x60640020, 0x60770010)
+    assert objects.RPDO_ENTRIES == (0x60400010, 0x60710010)
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.binary(max_size=8), st.sampled_from(["tpdo", "emergency", "heartbeat", "reply"]))
+def test_handlers_take_anything(data, kind):
+    inbox = Inbox("Drive")
+    inbox.watching = True
+    getattr(inbox, f"take_{kind}")(data)
+    valid = {"tpdo": len(data) == 8, "emergency": len(data) >= 3, "heartbeat": len(data) >= 1}
+    assert inbox.malformed == (not valid.get(kind, True))
+    assert inbox.replies == (kind == "tpdo" and len(data) == 8)
+
+
+def test_the_first_alarm_stays():
+    inbox = Inbox("Drive")
+    inbox.watching = True
+    inbox.take_emergency(struct.pack("<HB5x", 0x8130, 0x11))
+    first = inbox.alarm
+    inbox.take_emergency(struct.pack("<HB5x", 0x2310, 0x02))
+    inbox.take_heartbeat(b"\x7f")
+    assert inbox.alarm == first
+    assert "heartbeat of this computer" in first
+
+
+def test_a_toggle_bit_and_an_unknown_state_in_a_heartbeat():
+    inbox = Inbox("Drive")
+    inbox.watching = True
+    inbox.take_heartbeat(b"\x85")
+    assert not inbox.alarm
+    inbox.take_heartbeat(b"\x50")
+    assert "state 80" in inbox.alarm

@@ -1,0 +1,328 @@
+"""Ticks with a scripted drive: what goes out, what comes of what comes in."""
+
+import struct
+from dataclasses import replace
+
+import pytest
+
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import Acquisition
+
+PERIOD_NS = 1_000_000
+STEP_RAD = 7.0e-5
+
+
+class Ticks:
+    """Calls a drive as the engine does."""
+
+    def __init__(self, drive):
+        self.drive, self.tick = drive, 0
+
+    def __call__(self, n=1, torque_nm=None):
+        angles = []
+        for _ in range(n):
+            self.drive.latch(self.tick * PERIOD_NS)
+            angles.append(self.drive.read_angle())
+            if torque_nm is not None:
+                self.drive.command(torque_nm)
+            self.tick += 1
+        return angles
+
+
+@pytest.fixture
+def ticks(drive):
+    drive.connect()
+    return Ticks(drive)
+
+
+def test_the_angle_is_zero_where_the_drive_was_found(ticks, drive):
+    assert ticks() == [0.0]
+    assert not drive.angle_stale
+    assert drive.angle_time_ns > 0
+
+
+def test_the_angle_follows_the_count(ticks, scripted):
+    scripted.position = 1000 + 250
+    assert ticks() == [pytest.approx(250 * STEP_RAD)]
+    scripted.position = -40
+    assert ticks() == [pytest.approx(-1040 * STEP_RAD)]
+
+
+def test_a_drive_that_counts_the_other_way_round(make_drive, rig, settings, scripted):
+    drive = make_drive(replace(rig, cia402=replace(settings, direction=-1)))
+    drive.connect()
+    scripted.position += 10
+    assert Ticks(drive)() == [pytest.approx(-10 * STEP_RAD)]
+    drive.enable()
+    drive.command(0.25)
+    drive.latch(PERIOD_NS)
+    drive.read_angle()
+    assert scripted.torque == -500
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_the_counter_wraps_around(scripted, drive, direction):
+    scripted.position = direction * (2**31 - 5)
+    drive.connect()
+    ticks = Ticks(drive)
+    angles = []
+    for step in range(1, 5):
+        raw = direction * (2**31 - 5 + 3 * step)
+        scripted.position = (raw + 2**31) % 2**32 - 2**31
+        angles += ticks()
+    assert angles == pytest.approx([direction * 3 * k * STEP_RAD for k in range(1, 5)])
+
+
+def test_frames_of_a_tick(ticks, drive, scripted):
+    drive.enable()
+    scripted.seen.clear()
+    ticks(1, torque_nm=0.25)
+    ticks(1)
+    assert [frame for frame in scripted.seen if frame[0] != 0x764] == [
+        (0x080, b""),
+        (0x205, bytes.fromhex("0F00F401")),
+        (0x080, b""),
+    ]
+
+
+def test_torque_is_clipped_to_the_peak_and_rounded(ticks, drive, scripted):
+    drive.enable()
+    for torque_nm, per_mille in (
+        (0.1, 200), (-0.1, -200), (5.0, 1800), (-5.0, -1800), (float("inf"), 1800),
+        (0.00074, 1), (0.00076, 2), (0.0, 0),
+    ):  # fmt: skip
+        ticks(1, torque_nm)
+        ticks(1)
+        assert scripted.torque == per_mille
+
+
+def test_a_torque_that_is_not_a_number_is_refused(ticks, drive):
+    drive.enable()
+    with pytest.raises(DeviceError, match="not a number"):
+        ticks(1, float("nan"))
+
+
+def test_before_enabling_no_command_carries_torque_or_enables(ticks, scripted):
+    ticks(20, torque_nm=0.3)
+    sent = scripted.frames(0x205)
+    assert len(sent) >= 19
+    assert set(sent) == {bytes(4)}
+    assert scripted.state == "switch-on disabled"
+
+
+def test_heartbeats_go_out_by_the_ticks_time(ticks, scripted):
+    assert not scripted.frames(0x764)
+    ticks(1)
+    ticks(1)
+    assert scripted.frames(0x764) == [b"\x05"]
+    ticks(200)
+    assert len(scripted.frames(0x764)) == 11
+
+
+def test_one_lost_reply_makes_two_ticks_stale_and_the_angle_stands(make_drive, rig, scripted):
+    quick = replace(rig, acquisition=Acquisition("same_tick", 2e5))
+    drive = make_drive(quick)
+    drive.connect()
+    ticks = Ticks(drive)
+    ticks(3)
+    scripted.drop = 1
+    stale = []
+    for step in range(1, 5):
+        scripted.position = 1000 + step
+        angle = ticks()[0]
+        stale.append((drive.angle_stale, round(angle / STEP_RAD)))
+    # Whether the second is the late answer to the first SYNC cannot be known.
+    assert stale == [(True, 0), (True, 0), (False, 3), (False, 4)]
+
+
+def test_a_late_reply_is_never_taken_for_the_next_ticks(make_drive, rig, scripted):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive.connect()
+    ticks = Ticks(drive)
+    scripted.hold = 1
+    got = []
+    for step in range(1, 5):
+        scripted.position = 1000 + step
+        angle = ticks()[0]
+        got.append((drive.angle_stale, round(angle / STEP_RAD)))
+    assert got == [(True, 0), (False, 2), (False, 3), (False, 4)]
+
+
+def test_a_reply_that_comes_between_the_ticks_does_not_count(make_drive, rig, scripted):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive.connect()
+    ticks = Ticks(drive)
+    scripted.hold = 1
+    ticks()
+    assert drive.angle_stale
+    scripted.send(0x185, scripted.held.pop())
+    scripted.position = 1007
+    assert ticks() == [pytest.approx(7 * STEP_RAD)]
+    assert not drive.angle_stale
+
+
+def test_angles_of_the_tick_before(make_drive, rig, scripted):
+    drive = make_drive(replace(rig, acquisition=Acquisition("previous_tick", 5e5)))
+    drive.connect()
+    ticks = Ticks(drive)
+    scripted.on_sync = lambda it: setattr(it, "position", it.position + 1)
+    ticks()
+    assert drive.angle_stale  # no tick before it
+    got = []
+    times = []
+    for _ in range(4):
+        got.append(round(ticks()[0] / STEP_RAD))
+        assert not drive.angle_stale
+        times.append(drive.angle_time_ns)
+    assert got == [1, 2, 3, 4]
+    assert times == sorted(set(times))
+
+
+def test_a_lost_reply_in_the_mode_of_the_tick_before(make_drive, rig, scripted):
+    drive = make_drive(replace(rig, acquisition=Acquisition("previous_tick", 2e5)))
+    drive.connect()
+    ticks = Ticks(drive)
+    scripted.drop_at.add(scripted.syncs + 4)
+    ticks(3)
+    stale = []
+    for _ in range(6):
+        ticks()
+        stale.append(drive.angle_stale)
+    assert stale == [False, True, True, False, False, False]
+
+
+@pytest.mark.parametrize("garbage", ["", "50", "5002E8030000", "5002E80300000000" + "00"])
+def test_a_reply_of_the_wrong_length_counts_as_none(make_drive, rig, scripted, garbage):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive.connect()
+    ticks = Ticks(drive)
+    ticks(2)
+    garbage = bytes.fromhex(garbage)
+    scripted.garble.append(garbage[:8] if len(garbage) != 9 else garbage[:7])
+    ticks()
+    assert drive.angle_stale
+    ticks(2)
+    assert not drive.angle_stale
+
+
+def test_reading_twice_in_a_tick_gives_the_same(ticks, drive):
+    ticks()
+    assert drive.read_angle() == drive.read_angle() == 0.0
+    assert not drive.angle_stale
+
+
+def fault(scripted):
+    scripted.state = "fault"
+
+
+def emergency_and_fault(scripted):
+    scripted.state = "fault"
+    scripted.emergency(0x8611, b"\x01\x02\x00\x00\x00")
+
+
+def quick_stop(scripted):
+    scripted.state = "quick stop"
+
+
+def switched_off(scripted):
+    scripted.state = "switch-on disabled"
+
+
+def ignores_torque(scripted):
+    scripted.follows = False
+
+
+def restarts(scripted):
+    scripted.nmt = 0x7F
+    scripted.state = "switch-on disabled"
+    scripted.heartbeat(0)
+
+
+def leaves_operational(scripted):
+    scripted.nmt = 0x7F
+    scripted.heartbeat()
+
+
+def falls_silent(scripted):
+    scripted.heartbeat_every = 10**9
+
+
+@pytest.mark.parametrize(
+    ("happens", "words"),
+    [
+        (fault, ['"fault"', "rigd reset --profile scripted"]),
+        (
+            emergency_and_fault,
+            ["following error (error code 0x8611)", "01 02 00 00 00", "rigd reset"],
+        ),
+        (quick_stop, ['left "operation enabled"', '"quick stop active"', "0x0217"]),
+        (switched_off, ['left "operation enabled"', '"switch-on disabled"']),
+        (ignores_torque, ["ignores the target torque", "bit 12"]),
+        (restarts, ["restarted"]),
+        (leaves_operational, ["left operational for pre-operational"]),
+        (falls_silent, ["no heartbeat", "drive_heartbeat_timeout_s = 0.05 s"]),
+    ],
+)
+def test_what_ends_a_session(make_drive, rig, scripted, happens, words):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5)))
+    drive.connect()
+    ticks = Ticks(drive)
+    ticks(5)
+    drive.enable()
+    ticks(5, torque_nm=0.1)
+    happens(scripted)
+    with pytest.raises(DeviceError, match="node 5") as caught:
+        ticks(80, torque_nm=0.1)
+    for word in words:
+        assert word in str(caught.value)
+    drive.disable()
+    assert scripted.state in ("switch-on disabled", "fault")
+    assert scripted.torque == 0
+
+
+def test_silence_is_told_as_soon_as_it_is_too_long(ticks, drive, scripted):
+    scripted.heartbeat_every = 1
+    ticks(5)
+    scripted.heartbeat_every = 10**9
+    ticks(50)
+    with pytest.raises(DeviceError, match="no heartbeat"):
+        ticks(2)
+
+
+def test_an_emergency_message_before_enabling_ends_the_session_too(ticks, scripted):
+    scripted.emergency(0x3220)
+    with pytest.raises(DeviceError, match="under-voltage in the DC link"):
+        ticks(2)
+
+
+def test_the_end_of_an_emergency_is_none(ticks, scripted):
+    scripted.emergency(0x0000)
+    ticks(3)
+
+
+def test_broken_emergencies_and_heartbeats_are_passed_over(ticks, scripted):
+    for data in (b"", b"\x10", b"\x10\x81"):
+        scripted.send(0x085, data)
+    scripted.send(0x705, b"")
+    scripted.send(0x585, b"\x43\x61")
+    ticks(3)
+
+
+def test_a_bus_that_is_cut_is_told(ticks, scripted):
+    ticks(2)
+    scripted.cut()
+    with pytest.raises(DeviceError, match="CAN bus can0"):
+        ticks(5)
+
+
+def test_a_controller_off_the_bus_is_told(ticks, scripted):
+    scripted._link.sendall(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
+    with pytest.raises(DeviceError, match="bus-off"):
+        ticks(3)
+
+
+def test_what_is_not_connected_says_so(make_drive, rig):
+    drive = make_drive(rig)
+    for call in (lambda: drive.latch(0), drive.read_angle, drive.enable, lambda: drive.command(0)):
+        with pytest.raises(DeviceError, match="not connected"):
+            call()

@@ -1,0 +1,39 @@
+"""The fuzzing of ``fuzz_cia402.py``, a short one."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rigd.devices.parameters import Acquisition
+
+
+def load():
+    spec = importlib.util.spec_from_file_location(
+        "fuzz_cia402", Path(__file__).with_name("fuzz_cia402.py")
+    )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
+def test_only_device_errors_leave_the_driver(rig, settings, mode):
+    fuzzer = load()
+    quick = replace(
+        rig,
+        acquisition=Acquisition(mode, 1.0),
+        cia402=replace(settings, enable_timeout_s=0.003),
+    )
+    ends = fuzzer.fuzz(quick, 12_000)
+    assert 100 < ends < 12_000
+
+
+def test_the_fuzzer_finds_a_handler_that_raises(rig, settings, monkeypatch):
+    fuzzer = load()
+    from rigd.devices.cia402 import inbox
+
+    monkeypatch.setattr(inbox, "LengthError", ZeroDivisionError)
+    with pytest.raises(Exception, match="unpack requires a buffer of 8 bytes"):
+        fuzzer.fuzz(replace(rig, acquisition=Acquisition("same_tick", 1.0)), 12_000)

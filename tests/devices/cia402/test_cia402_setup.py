@@ -1,0 +1,359 @@
+"""Set-up against a scripted drive: order, read-back, refusals; and the reset of a fault."""
+
+import threading
+from dataclasses import replace
+
+import pytest
+
+from rigd.devices.cia402.drive import Cia402Drive
+from rigd.devices.cia402.setup import interpolation_time, sync_period_us, torque_limit_per_mille
+from rigd.devices.contracts import DeviceError
+
+TPDO1, RPDO1 = 0x40000185, 0x205
+
+
+def writes_to(scripted, *indices):
+    return [(i, s, v) for i, s, v in scripted.writes if i in indices]
+
+
+def test_what_the_drive_is_told(drive, scripted):
+    drive.connect()
+    told = {(index, sub): value for index, sub, value in scripted.writes}
+    assert told[0x1006, 0] == 1000
+    assert (told[0x60C2, 1], told[0x60C2, 2]) == (1, -3)
+    assert told[0x1016, 1] == 0x00640032
+    assert told[0x1017, 0] == 20
+    assert told[0x6007, 0] == 2
+    assert told[0x1029, 1] == 0
+    assert told[0x6072, 0] == 1800
+    assert told[0x6060, 0] == 10
+    assert (0x1005, 0) not in told
+
+
+def test_the_order_in_which_a_pdo_is_mapped(drive, scripted):
+    drive.connect()
+    assert writes_to(scripted, 0x1800, 0x1A00) == [
+        (0x1800, 1, 0xC0000185),
+        (0x1A00, 0, 0),
+        (0x1A00, 1, 0x60410010),
+        (0x1A00, 2, 0x60640020),
+        (0x1A00, 3, 0x60770010),
+        (0x1A00, 0, 3),
+        (0x1800, 2, 1),
+        (0x1800, 1, 0x40000185),
+    ]
+    assert writes_to(scripted, 0x1400, 0x1600) == [
+        (0x1400, 1, 0x80000205),
+        (0x1600, 0, 0),
+        (0x1600, 1, 0x60400010),
+        (0x1600, 2, 0x60710010),
+        (0x1600, 0, 2),
+        (0x1400, 2, 1),
+        (0x1400, 1, 0x205),
+    ]
+
+
+def test_other_pdos_are_disabled_where_they_exist(drive, scripted):
+    drive.connect()
+    assert scripted.objects[0x1801, 1] == 0xC0000285
+    assert scripted.objects[0x1401, 1] == 0x80000305
+    assert not writes_to(scripted, 0x1802, 0x1803, 0x1402, 0x1403)
+
+
+def test_pdos_that_are_disabled_are_left_alone(drive, scripted):
+    scripted.objects[0x1801, 1] |= 0x80000000
+    drive.connect()
+    assert not writes_to(scripted, 0x1801)
+
+
+def test_everything_written_is_read_back(drive, scripted):
+    drive.connect()
+    requests = scripted.frames(0x605)
+    for place, request in enumerate(requests):
+        if request[0] & 0xE0 == 0x20 and request[1:3] != b"\x40\x60":
+            following = requests[place + 1]
+            assert following[0] == 0x40
+            assert following[1:4] == request[1:4]
+
+
+def test_nothing_is_configured_but_in_pre_operational(drive, scripted):
+    drive.connect()
+    before_start = scripted.seen[: scripted.seen.index((0x000, b"\x01\x05"))]
+    assert before_start[0] == (0x000, b"\x80\x05")
+    assert {can_id for can_id, _ in before_start} == {0x000, 0x605}
+    after = scripted.seen[len(before_start) + 1 :]
+    assert {can_id for can_id, _ in after} == {0x080}
+
+
+def test_a_drive_that_makes_the_sync_itself_is_told_not_to(drive, scripted):
+    scripted.objects[0x1005, 0] = 0x40000080
+    drive.connect()
+    assert writes_to(scripted, 0x1005) == [(0x1005, 0, 0x80)]
+
+
+def test_a_bit_that_a_drive_may_set_by_itself_is_no_difference(drive, scripted):
+    """Bit 30 of a TPDO's identifier: no remote requests."""
+    write = dict.__setitem__
+
+    class Sets(dict):
+        def __setitem__(self, place, value):
+            write(self, place, value | 0x40000000 if place == (0x1800, 1) else value)
+
+    scripted.objects = Sets(scripted.objects)
+    drive.connect()
+
+
+def test_no_thread_outlives_the_set_up(drive, scripted):
+    drive.connect()
+    assert {thread for thread in threading.enumerate() if "Notifier" in thread.name} == set()
+
+
+def test_who_the_drive_is(drive):
+    drive.connect()
+    assert drive.identity() == {
+        "vendor_id": 0x1234,
+        "product_code": 0xABCD,
+        "revision": 0x10002,
+        "serial_number": 77,
+        "device_name": "SCRIPTED DRIVE",
+        "supported_modes": 0x3ED,
+        "rated_torque_counts": 5,
+        "rated_torque_nm": pytest.approx(0.5),
+    }
+
+
+def test_a_drive_without_name_and_serial_number(drive, scripted):
+    scripted.refuse[0x1008, 0] = 0x06020000
+    scripted.refuse[0x1018, 4] = 0x06090011
+    drive.connect()
+    assert drive.identity()["device_name"] == ""
+    assert drive.identity()["serial_number"] is None
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ((0x1018, 1), 0x99, ["vendor_id is 0x00001234", "0x00000099"]),
+        ((0x1018, 2), 0x1, ["product_code is 0x0000ABCD", "0x00000001"]),
+        ((0x6502, 0), 0x1ED, ["no cyclic synchronous torque", "6502 = 493"]),
+        ((0x6076, 0), 6, ["6076 = 6", "0.6 N·m", "0.5 N·m"]),
+    ],
+)
+def test_a_drive_that_is_not_the_profiles(drive, scripted, place, value, words):
+    scripted.objects[place] = value
+    with pytest.raises(DeviceError) as caught:
+        drive.connect()
+    for word in words:
+        assert word in str(caught.value)
+    assert not [place for place in scripted.writes if place[0] != 0x6040]
+
+
+def test_zero_in_the_profile_accepts_any_drive(make_drive, rig, settings, scripted):
+    scripted.objects[0x1018, 1] = 1
+    scripted.objects[0x1018, 2] = 2
+    scripted.refuse[0x6076, 0] = 0x06020000
+    any_drive = replace(settings, vendor_id=0, product_code=0, rated_torque_unit_nm=0.0)
+    drive = make_drive(replace(rig, cia402=any_drive))
+    drive.connect()
+    assert drive.identity()["rated_torque_counts"] is None
+
+
+@pytest.mark.parametrize(
+    "place",
+    [(0x1006, 0), (0x60C2, 1), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x1029, 1), (0x6072, 0),
+     (0x6060, 0), (0x1400, 1), (0x1800, 2), (0x1A00, 0), (0x1801, 1)],
+)  # fmt: skip
+@pytest.mark.parametrize("how", ["refuses", "keeps"])
+def test_an_object_that_does_not_take_its_value(drive, scripted, place, how):
+    scripted.objects[0x1029, 1] = 2
+    scripted.objects[0x60C2, 2] = 0
+    index, sub = place
+    if how == "refuses":
+        scripted.refuse[place] = 0x08000022
+        words = ["refuses", "present device state"]
+    else:
+        scripted.keep.add(place)
+        words = ["was set to", "and reads"]
+    with pytest.raises(DeviceError, match="node 5") as caught:
+        drive.connect()
+    for word in (*words, f"{index:04X}" + (f":{sub}" if sub else "")):
+        assert word in str(caught.value)
+
+
+def test_what_was_wanted_and_what_came(drive, scripted):
+    scripted.keep.add((0x6072, 0))
+    with pytest.raises(DeviceError, match=r"6072 \(Max torque\) was set to 1800 and reads 1000"):
+        drive.connect()
+
+
+def test_a_drive_left_enabled_is_switched_off_first(drive, scripted):
+    scripted.nmt, scripted.state = 5, "enabled"
+    drive.connect()
+    assert scripted.state == "switch-on disabled"
+    assert scripted.writes[0] == (0x6040, 0, 0)
+
+
+def test_a_drive_that_does_not_switch_off(drive, scripted):
+    scripted.state, scripted.obeys = "enabled", False
+    with pytest.raises(DeviceError, match='"switch-on disabled", it is in "operation enabled"'):
+        drive.connect()
+    scripted.obeys = True
+
+
+def test_a_drive_in_fault_is_left_to_the_operator(drive, scripted):
+    scripted.state = "fault"
+    scripted.objects[0x603F, 0] = 0x4310
+    with pytest.raises(DeviceError, match=r"0x4310.*rigd reset --profile scripted"):
+        drive.connect()
+    assert scripted.state == "fault"
+
+
+def test_a_fault_without_a_code_is_named_by_its_emergency_message(drive, scripted):
+    scripted.state = "fault"
+
+    def tell(can_id, data, take=scripted._take):
+        if can_id == 0x605 and data[1:3] == b"\x18\x10":
+            scripted.emergency(0x7300)
+        take(can_id, data)
+
+    scripted._take = tell
+    with pytest.raises(DeviceError, match="encoder"):
+        drive.connect()
+
+
+def test_resetting_a_fault(drive, scripted):
+    scripted.state = "fault"
+    scripted.objects[0x603F, 0] = 0x3210
+    assert drive.reset_fault() == "over-voltage in the DC link (error code 0x3210)"
+    assert scripted.state == "switch-on disabled"
+    assert [value for _, _, value in writes_to(scripted, 0x6040)] == [0x00, 0x80, 0x00]
+    assert not scripted.frames(0x205)
+    drive.connect()
+
+
+def test_resetting_after_a_session_that_ended_in_a_fault(drive, scripted):
+    drive.connect()
+    drive.enable()
+    scripted.state = "fault"
+    scripted.objects[0x603F, 0] = 0x8610
+    drive.latch(0)
+    with pytest.raises(DeviceError, match="fault"):
+        drive.read_angle()
+    assert "0x8610" in drive.reset_fault()
+    drive.connect()
+    drive.enable()
+    assert scripted.state == "enabled"
+
+
+def test_without_a_fault_there_is_nothing_to_reset(drive, scripted):
+    assert drive.reset_fault() is None
+    assert scripted.writes == [(0x1016, 1, 0)]
+
+
+def test_a_fault_whose_cause_stands(drive, scripted):
+    scripted.state = "fault"
+    scripted.objects[0x603F, 0] = 0x8611
+    with pytest.raises(DeviceError, match=r"cannot be reset: following error.*remove the cause"):
+        drive.reset_fault()
+
+
+def test_no_drive_on_the_bus(drive, scripted):
+    scripted.silent = True
+    with pytest.raises(DeviceError, match=r"no answer on CAN bus can0.*cia402\.node_id"):
+        drive.connect()
+
+
+def test_others_on_the_bus_are_named(make_drive, rig, settings, scripted):
+    drive = make_drive(replace(rig, cia402=replace(settings, node_id=6)))
+    with pytest.raises(DeviceError, match=r"node 6.*heard of node 5"):
+        threading.Timer(0.2, scripted.heartbeat).start()
+        drive.connect()
+
+
+def test_a_bus_that_is_cut_in_the_middle(drive, scripted):
+    def cut(can_id, data, take=scripted._take):
+        if can_id == 0x605 and data[1:3] == b"\x06\x10":
+            scripted.cut()
+        else:
+            take(can_id, data)
+
+    scripted._take = cut
+    with pytest.raises(DeviceError, match="CAN bus can0"):
+        drive.connect()
+    drive.close()
+
+
+def test_a_drive_that_does_not_become_operational(drive, scripted):
+    def stay(can_id, data, take=scripted._take):
+        if (can_id, data[:1]) == (0x000, b"\x01"):
+            scripted.heartbeat(0x7F)
+        else:
+            take(can_id, data)
+
+    scripted._take = stay
+    with pytest.raises(DeviceError, match=r"does not become operational \(its heartbeat says 127"):
+        drive.connect()
+
+
+def test_no_bus_at_all(link_to, rig):
+    drive = Cia402Drive(rig, link_to("nothing"))
+    with pytest.raises(DeviceError, match="start rigd simulate again"):
+        drive.connect()
+    drive.close()
+
+
+def test_an_angle_that_is_not_quantised_cannot_be_counted(make_drive, rig):
+    drive = make_drive(replace(rig, encoder=replace(rig.encoder, resolution_rad=0.0)))
+    with pytest.raises(DeviceError, match="resolution_rad"):
+        drive.connect()
+
+
+def test_connecting_again_after_closing(drive, scripted, make_drive, rig):
+    drive.connect()
+    drive.connect()
+    drive.enable()
+    assert scripted.state == "enabled"
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "period_us", "value", "exponent"),
+    [
+        (1000.0, 1000, 1, -3),
+        (500.0, 2000, 2, -3),
+        (100.0, 10000, 10, -3),
+        (4.0, 250000, 250, -3),
+        (2.0, 500000, 50, -2),
+        (2000.0, 500, 5, -4),
+        (800.0, 1250, 125, -5),
+        (8000.0, 125, 125, -6),
+    ],
+)
+def test_the_period_in_the_drives_terms(rate_hz, period_us, value, exponent):
+    assert sync_period_us(rate_hz) == period_us
+    assert interpolation_time(rate_hz) == (value, exponent)
+    assert value * 10.0**exponent == pytest.approx(1 / rate_hz)
+
+
+@pytest.mark.parametrize("rate_hz", [300.0, 7000.0])
+def test_a_period_that_the_drive_cannot_be_told(make_drive, rig, rate_hz, scripted):
+    with pytest.raises(DeviceError, match="choose another rate"):
+        sync_period_us(rate_hz)
+    drive = make_drive(replace(rig, rate_hz=rate_hz))
+    with pytest.raises(DeviceError, match="rate_hz"):
+        drive.connect()
+    assert not scripted.seen
+
+
+def test_a_period_of_whole_microseconds_that_60c2_cannot_hold():
+    assert sync_period_us(1e6 / 1001) == 1001
+    with pytest.raises(DeviceError, match="60C2"):
+        interpolation_time(1e6 / 1001)
+
+
+@pytest.mark.parametrize(
+    ("peak_nm", "rated_nm", "per_mille"),
+    [(0.9, 0.5, 1800), (0.9, 0.7, 1285), (0.3, 0.1, 3000), (33.0, 1.0, 32767)],
+)
+def test_the_limit_never_exceeds_the_peak_torque(rig, peak_nm, rated_nm, per_mille):
+    motor = replace(rig.motor, peak_torque_nm=peak_nm, rated_torque_nm=rated_nm)
+    assert torque_limit_per_mille(replace(rig, motor=motor)) == per_mille

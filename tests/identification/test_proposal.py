@@ -1,0 +1,78 @@
+"""Table, TOML and notes of estimates that are made up."""
+
+import tomllib
+from dataclasses import replace
+
+import pytest
+
+from rigd.identification.motor_estimate import MotorEstimate, Quantity
+from rigd.identification.proposal import _rounded, propose
+from rigd.profile import load_profile
+
+ESTIMATE = MotorEstimate(
+    inertia_kg_m2=Quantity(2.0123e-3, 2.1e-6),
+    viscous_nm_s_per_rad=Quantity(0.02004, 6e-5),
+    coulomb_nm=Quantity(-1e-5, 4e-5),
+    torque_scale=Quantity(1.1, 5e-4),
+    actuation_delay_s=Quantity(9.96e-4, 8e-6),
+    windows=72,
+    dropped=0,
+    misfit=1.0,
+    friction_departure_nm=1e-4,
+)
+
+
+def test_the_verdict_is_by_three_deviations(profile):
+    differs = {row.key: row.differs for row in propose(ESTIMATE, profile).rows}
+    assert differs["motor.inertia_kg_m2"] is True
+    assert differs["motor.viscous_nm_s_per_rad"] is False
+    assert differs["actuation.delay_s"] is False
+
+
+def test_the_rated_torque_takes_the_scale(profile):
+    toml = tomllib.loads("\n".join(propose(ESTIMATE, profile).toml()))
+    assert toml["motor"]["rated_torque_nm"]["value"] == pytest.approx(0.55)
+    assert toml["motor"]["inertia_kg_m2"] == {"value": 2.0123e-3, "source": "measured"}
+
+
+def test_the_drive_s_own_rated_torque_is_compared_in_the_same_measure():
+    proposal = propose(ESTIMATE, load_profile("antenna_can"))
+    toml = tomllib.loads("\n".join(proposal.toml()))
+    ratio = toml["motor"]["rated_torque_nm"]["value"] / 0.5
+    assert toml["cia402"]["rated_torque_unit_nm"]["value"] == pytest.approx(1e-3 * ratio)
+
+
+def test_what_cannot_be_negative_is_proposed_as_zero(profile):
+    toml = tomllib.loads("\n".join(propose(ESTIMATE, profile).toml()))
+    assert toml["motor"]["coulomb_nm"]["value"] == 0.0
+
+
+def test_a_scale_that_is_not_told_is_not_proposed(profile):
+    proposal = propose(replace(ESTIMATE, torque_scale=Quantity(1.0, None)), profile)
+    assert "rated_torque_nm" not in "\n".join(proposal.toml())
+    assert any("not told" in line for line in proposal.table())
+    assert "cannot be told" in proposal.notes[0]
+    assert proposal.as_dict()["torque_scale"] == {"value": 1.0, "std": None}
+    assert proposal.as_dict()["parameters"]["motor.rated_torque_nm"]["differs"] is None
+
+
+def test_misfit_and_missing_passes_are_told(profile):
+    notes = propose(replace(ESTIMATE, misfit=7.3, dropped=2), profile, unusable=3).notes
+    assert any("7.3 times" in note for note in notes)
+    assert any("5 of 77 passes were left out" in note for note in notes)
+    quiet = propose(ESTIMATE, profile).notes
+    assert not any("times what scatter" in note or "left out" in note for note in quiet)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "expected"),
+    [
+        (2.0123e-3, 2.1e-6, ("0.0020123", "2.1e-06")),
+        (0.0300123, 4.4e-5, ("0.030012", "4.4e-05")),
+        (9.9612e-4, 7.8e-6, ("9.961e-04", "7.8e-06")),
+        (1.00045, 5.2e-4, ("1.00045", "0.00052")),
+        (0.0, 1e-3, ("0.0000", "0.001")),
+    ],
+)
+def test_numbers_show_two_figures_of_their_deviation(value, std, expected):
+    assert _rounded(value, std) == expected

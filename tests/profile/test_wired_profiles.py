@@ -1,0 +1,116 @@
+"""Profiles of rigs on the wire: what the shipped ones say, and contradictions with the protocol."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rigd.control import check_stability, close_loop
+from rigd.excitation import chirp
+from rigd.planning import plan_session
+from rigd.profile import ProfileError, load_profile
+
+HW_PROFILES = Path(__file__).parents[2] / "hw_profiles"
+
+
+@pytest.fixture
+def refuse(tmp_path):
+    """Change a shipped profile, load it, and return the lines of the complaint."""
+
+    def attempt(name: str, *changes: tuple[str, str]) -> list[str]:
+        text = (HW_PROFILES / f"{name}.toml").read_text("utf-8")
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        path = tmp_path / "rig.toml"
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(ProfileError) as caught:
+            load_profile(path)
+        lines = str(caught.value).splitlines()
+        assert all(line.startswith(f"{path}: ") for line in lines)
+        return [line.removeprefix(f"{path}: ") for line in lines]
+
+    return attempt
+
+
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_every_number_says_where_it_comes_from(name):
+    profile = load_profile(name)
+    numbers = re.findall(r"^\w+ = \{", profile.text, re.MULTILINE)
+    assert len(profile.sources) == len(numbers) > 60
+
+
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_the_papers_chirp_is_within_the_limits_and_the_loop_stable(name):
+    profile = load_profile(name)
+    assert check_stability(close_loop(profile.loop_model())) is None
+    assert plan_session(profile, chirp(rate_hz=profile.rig.rate_hz)).warnings == ()
+
+
+def test_the_sections_of_the_chosen_devices_are_there_and_no_others():
+    can, serial = load_profile("antenna_can").rig, load_profile("antenna_serial").rig
+    assert can.can == serial.can
+    assert can.cia402 == serial.cia402
+    assert can.ati_can is not None
+    assert can.ati_serial is None
+    assert serial.ati_serial is not None
+    assert serial.ati_can is None
+    assert (can.name, serial.name) == ("antenna_can", "antenna_serial")
+
+
+def test_a_section_that_a_device_needs_is_asked_for(refuse):
+    (line,) = refuse("antenna_can", ('sensor = "ati_can"', 'sensor = "ati_serial"'))[:1]
+    assert line == (
+        'section [ati_serial] is missing, which devices.drive = "cia402" with devices.sensor = '
+        '"ati_serial" needs.'
+    )
+
+
+def test_a_section_that_nobody_reads_is_refused(refuse):
+    lines = refuse("antenna_can", ('drive = "cia402"', 'drive = "sim"'), (
+        'sensor = "ati_can"', 'sensor = "sim"'))  # fmt: skip
+    assert any(line.startswith("section [ati_can] belongs to none of") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "complaint"),
+    [
+        ("antenna_can", 'mode = "same_tick"', 'mode = "next_tick"', r'acquisition.mode = "next_t'
+         r'ick" must be "same_tick" or "previous_tick"\.'),
+        ("antenna_can", 'mode = "same_tick"', 'mode = "previous_tick"',
+         r"encoder.delay_s = 5.5e-05 s is less than the reply of the previous tick alone: at lea"
+         r"st 0.001 s\."),
+        ("antenna_can", "deadline_us = { value = 700.0", "deadline_us = { value = 1000.0",
+         r"acquisition.deadline_us = 1000 µs is not below the period of 1000 µs"),
+        ("antenna_can", "direction = { value = 1,", "direction = { value = 0,",
+         r"cia402.direction = 0 must be 1, or -1"),
+        ("antenna_can", "host_node_id = { value = 127,", "host_node_id = { value = 1,",
+         r"cia402.host_node_id = 1 is the drive's own"),
+        ("antenna_can", "heartbeat_timeout_s = { value = 0.05,",
+         "heartbeat_timeout_s = { value = 0.015,",
+         r"cia402.heartbeat_timeout_s = 0.015 s is below twice cia402.heartbeat_period_s"),
+        ("antenna_can", "heartbeat_period_s = { value = 0.01,",
+         "heartbeat_period_s = { value = 0.0104,",
+         r"cia402.heartbeat_period_s = 0.0104 s must be a whole number of milliseconds"),
+        ("antenna_can", "peak_torque_nm = { value = 0.9,", "peak_torque_nm = { value = 20.0,",
+         r"motor.peak_torque_nm is 40 times"),
+        ("antenna_can", "delay_s = { value = 1.0e-3,", "delay_s = { value = 0.5e-3,",
+         r"actuation.delay_s = 0.0005 s is less than a torque that takes effect at the next SYNC"),
+        ("antenna_can", "base_id = { value = 0x68,", "base_id = { value = 0x80,",
+         r"ati_can.base_id = 128 must be at most 127"),
+        ("antenna_can", "bitrate_bit_s = { value = 1_000_000,", "bitrate_bit_s = { value = 1e6,",
+         r"can.bitrate_bit_s = 1e\+06 bit/s must be a whole number"),
+        ("antenna_can", 'serial_number = ""', "serial_number = 5",
+         r"ati_can.serial_number = 5 must be text in quotes"),
+        ("antenna_serial", "baud = { value = 1_250_000,", "baud = { value = 115_200,",
+         r"ati_serial.stream_hz = 7000 Hz does not fit ati_serial.baud = 115200, which carries "
+         r"806 records a second"),
+        ("antenna_serial", "delay_s = { value = 5.33e-4,", "delay_s = { value = 0.0,",
+         r"sensor.delay_s = 0 s is less than .* at least 0.000428571 s"),
+        ("antenna_serial", "stream_hz = { value = 7000.0,", "stream_hz = { value = 700.0,",
+         r"ati_serial.stream_hz = 700 Hz is below rig.rate_hz"),
+    ],
+)  # fmt: skip
+def test_a_contradiction_with_the_protocol_is_told(refuse, name, old, new, complaint):
+    lines = refuse(name, (old, new))
+    assert any(re.match(complaint, line) for line in lines), lines

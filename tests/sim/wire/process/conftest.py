@@ -1,0 +1,174 @@
+"""Stand-ins for the nodes, and a world that lives in memory."""
+
+import struct
+
+import pytest
+
+from rigd.profile import load_profile
+from rigd.sim.devices import SimulatedRig
+from rigd.sim.wire.log import EventLog
+from rigd.sim.wire.world import World
+
+PERIOD_NS = 1_000_000
+
+
+def frame(can_id, data=b""):
+    """16 bytes of struct can_frame, packed by hand."""
+    return struct.pack("=IB3x8s", can_id, len(data), data)
+
+
+SYNC = frame(0x80)
+
+
+class Drive:
+    """Answers each SYNC with the number of periods that the rig has moved so far."""
+
+    def __init__(self, step, send):
+        self.frozen = False
+        self.angle_offset_counts = 0
+        self.heard = []
+        self.ticks_s = []
+        self.emergencies = []
+        self.step, self.send = step, send
+        self.moved = lambda: 0
+
+    def receive(self, can_id, data):
+        if self.frozen:
+            return
+        self.heard.append((can_id, data))
+        if can_id == 0x80:
+            self.step()
+            self.send(0x181, struct.pack("<I", self.moved()))
+
+    def tick(self, now_s):
+        self.ticks_s.append(now_s)
+
+    def emergency(self, code, register, vendor):
+        self.emergencies.append((code, register, vendor))
+
+
+class Sensor:
+    """Answers a poll with two frames."""
+
+    def __init__(self, send):
+        self.frozen = False
+        self.saturate = None
+        self.status_bits = 0
+        self.heard = []
+        self.send = send
+
+    def receive(self, can_id, data):
+        self.heard.append((can_id, data))
+        if can_id == 0x680 and not self.frozen:
+            self.send(0x680, b"first")
+            self.send(0x681, b"second")
+
+    def tick(self, now_s):
+        pass
+
+
+class SerialSensor:
+    """Streams one numbered record of 13 bytes for every reading."""
+
+    def __init__(self, write, records_per_period):
+        self.frozen = False
+        self.saturate = None
+        self.status_bits = 0
+        self.heard = b""
+        self.write = write
+        self.records_per_period = records_per_period
+        self.emitted = 0
+
+    def receive(self, data):
+        self.heard += data
+
+    def emit(self):
+        first, self.emitted = self.emitted, self.emitted + self.records_per_period
+        self.write(b"".join(bytes([n % 256]) * 13 for n in range(first, self.emitted)))
+
+    def tick(self, now_s):
+        pass
+
+
+class Recording:
+    """A world, and all that came out of it."""
+
+    def __init__(self, rig, *, lock_step, serial, log):
+        self.sent = []
+        self.written = b""
+        self.cuts = []
+        self.log = log
+        simulated = SimulatedRig(rig)
+        self.simulated = simulated
+        self.world = World(
+            rig,
+            simulated,
+            lock_step=lock_step,
+            now_ns=0,
+            send=lambda raw, origin: self.sent.append((raw, origin)),
+            write=self._write,
+            cut=self.cuts.append,
+            log=log,
+        )
+        self.drive = Drive(self.world.step, self.world.can_port("drive"))
+        self.drive.moved = lambda: self.world.moved
+        self.world.join("drive", self.drive)
+        if serial:
+            self.sensor = SerialSensor(self.world.serial_port(), simulated.records_per_period)
+            self.world.join_serial(self.sensor)
+        else:
+            self.sensor = Sensor(self.world.can_port("sensor"))
+            self.world.join("sensor", self.sensor)
+
+    def _write(self, data):
+        self.written += data
+
+    def sync(self, *ticks):
+        """Hear a SYNC on each of these ticks, fractions allowed."""
+        for tick in ticks:
+            self.world.hear([SYNC], "host", round(tick * PERIOD_NS))
+
+    def from_nodes(self):
+        """What the nodes sent, as (identifier, data)."""
+        return [unpack(raw) for raw, origin in self.sent if origin is None]
+
+    def answers(self):
+        """What the drive answered."""
+        return [
+            struct.unpack("<I", data)[0] for can_id, data in self.from_nodes() if can_id == 0x181
+        ]
+
+
+def unpack(raw):
+    can_id, length, data = struct.unpack("=IB3x8s", raw)
+    return can_id, data[:length]
+
+
+class Events(EventLog):
+    """Keeps what is logged."""
+
+    def __init__(self):
+        super().__init__(None, quiet=True)
+        self.entries = []
+
+    def __call__(self, device, what, **values):
+        self.entries.append((round(self.time_s, 6), device, what, values))
+
+    def of(self, what):
+        return [entry for entry in self.entries if entry[2] == what]
+
+
+@pytest.fixture
+def sim_rig():
+    return load_profile("sim").rig
+
+
+@pytest.fixture
+def make_world(sim_rig):
+    def make(*, lock_step=False, serial=False):
+        rig = sim_rig
+        if serial:
+            rig = load_profile("antenna_serial").rig
+        return Recording(rig, lock_step=lock_step, serial=serial, log=Events())
+
+    return make

@@ -1,0 +1,104 @@
+"""How faults are written, and what is said of those that are not."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigd.sim.wire.faults import KINDS, FaultError, parse_fault
+
+whole = st.integers
+sender = st.sampled_from(["drive", "sensor", "host"])
+device = st.sampled_from(["drive", "sensor"])
+positive = st.floats(1e-6, 1e6)
+identifier = whole(0, 0x7FF)
+frames = whole(1, 10**9)
+OPTIONAL = {
+    "drop": ({"from": sender}, {"id": identifier, "frames": frames}),
+    "delay": ({"from": sender, "ms": positive}, {"id": identifier, "frames": frames}),
+    "corrupt": ({"from": sender}, {"id": identifier, "frames": frames, "byte": whole(0, 255)}),
+    "reorder": ({"from": sender}, {"id": identifier, "frames": frames}),
+    "freeze": ({"device": device}, {"for": positive}),
+    "emcy": ({"code": whole(0, 0xFFFF)}, {"register": whole(0, 255)}),
+    "saturate": ({"gauge": whole(0, 5)}, {"for": positive}),
+    "status": ({"bits": whole(0, 0xFFFF)}, {"for": positive}),
+    "jump": ({"counts": whole(-(2**31), 2**31 - 1)}, {}),
+    "cut": ({}, {"device": st.sampled_from(["bus", "sensor"])}),
+}
+asked = st.one_of(
+    *(
+        st.tuples(
+            st.just(kind),
+            st.fixed_dictionaries(needed, optional=optional),
+            st.none() | st.floats(0, 1e6),
+        )
+        for kind, (needed, optional) in OPTIONAL.items()
+    )
+)
+
+
+def test_every_kind_is_tried_here():
+    assert OPTIONAL.keys() == KINDS.keys()
+
+
+@settings(deadline=None, max_examples=200)
+@given(asked, st.randoms())
+def test_what_is_written_is_understood_and_written_back(question, random):
+    kind, values, after_s = question
+    words = [
+        f"{key}={value!r}" if isinstance(value, float) else f"{key}={value}"
+        for key, value in values.items()
+    ]
+    random.shuffle(words)
+    spec = ",".join([kind, *words]) + ("" if after_s is None else f"@{after_s!r}")
+    fault = parse_fault(spec)
+    assert fault.kind == kind
+    assert fault.after_s == after_s
+    assert dict(fault.values) | values == dict(fault.values)
+    again = parse_fault(str(fault))
+    assert (again.kind, dict(again.values), again.after_s) == (kind, dict(fault.values), after_s)
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.text(max_size=40) | st.text(alphabet="dropfmes=,@0x1.-", max_size=20))
+def test_anything_else_is_refused_with_a_sentence(text):
+    try:
+        fault = parse_fault(text)
+    except FaultError as error:
+        assert str(error).startswith(f"Fault '{text}': ")
+        assert str(error).endswith(".")
+    else:
+        assert fault.kind in KINDS
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("dorp,from=drive", "'dorp' is no fault; choose drop, delay, corrupt, reorder, freeze"),
+        ("drop", "drop needs from: drive or sensor or host"),
+        ("drop,from=cat", "from=cat: give drive or sensor or host"),
+        ("drop,from=drive,colour=red", "drop has no 'colour'; choose from, id, frames, bytes"),
+        ("drop,from=drive,frames=0", "frames=0: give a whole number from 1"),
+        ("drop,from=drive,id=0x800", "id=0x800: give a whole number from 0 to 2047"),
+        ("drop,from=drive,from=host", "'from' stands twice"),
+        ("drop,from=sensor,frames=2,bytes=3", "give frames or bytes, not both"),
+        ("delay,from=drive", "delay needs ms: a number above 0"),
+        ("delay,from=drive,ms=nan", "ms=nan: give a number above 0"),
+        ("saturate,gauge=6", "gauge=6: give a whole number from 0 to 5"),
+        ("emcy", "emcy needs code"),
+        ("cut@soon", "'@soon': give the seconds after enabling"),
+        ("cut@-1", "'@-1': give the seconds after enabling"),
+        ("cut@", "'@': give the seconds after enabling"),
+    ],
+)
+def test_the_wrong_word_is_named(spec, said):
+    with pytest.raises(FaultError) as caught:
+        parse_fault(spec)
+    assert said in str(caught.value)
+
+
+def test_defaults():
+    assert dict(parse_fault("drop,from=drive").values) == {"from": "drive", "frames": 1}
+    assert dict(parse_fault("drop,from=sensor,bytes=5").values) == {"from": "sensor", "bytes": 5}
+    assert dict(parse_fault("emcy,code=0x8130").values) == {"code": 0x8130, "register": 1}
+    assert dict(parse_fault("cut").values) == {"device": "bus"}
+    assert parse_fault("cut@2.5").after_s == 2.5

@@ -1,0 +1,401 @@
+"""``rigd simulate`` and ``rigd inject`` as an operator runs them; the host packs bytes by hand."""
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import serial
+
+from rigd.devices.simulator import find_simulator
+
+pytestmark = pytest.mark.xdist_group("realtime")
+
+RUN = (
+    "import typer\n"
+    "from rigd.cli.simulate import inject, simulate\n"
+    "app = typer.Typer(pretty_exceptions_enable=False)\n"
+    "app.command()(simulate)\n"
+    "app.command()(inject)\n"
+    "app()\n"
+)
+START_S = 20.0
+
+
+def command(*arguments):
+    return [sys.executable, "-c", RUN, *map(str, arguments)]
+
+
+def rigd(*arguments):
+    return subprocess.run(
+        command(*arguments), capture_output=True, text=True, timeout=30, check=False
+    )
+
+
+class Simulator:
+    """A running ``rigd simulate``."""
+
+    def __init__(self, folder, profile="antenna_can", *options):
+        self.profile = profile
+        self.log = folder / f"{profile}.jsonl"
+        self.process = subprocess.Popen(
+            command("simulate", "--profile", profile, "--log", self.log, *options),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.address = None
+        give_up = time.monotonic() + START_S
+        while self.address is None and self.process.poll() is None:
+            assert time.monotonic() < give_up
+            time.sleep(0.01)
+            self.address = find_simulator(profile)
+
+    def end(self, how=signal.SIGTERM):
+        """Returns exit code, standard output and standard error."""
+        if self.process.poll() is None:
+            self.process.send_signal(how)
+        out, err = self.process.communicate(timeout=30)
+        return self.process.returncode, out, err
+
+    def events(self, device=None, what=None):
+        entries = [json.loads(line) for line in self.log.read_text().splitlines()]
+        return [
+            entry
+            for entry in entries
+            if device in (None, entry["device"]) and what in (None, entry["what"])
+        ]
+
+    def wait_for(self, device, what, **values):
+        give_up = time.monotonic() + START_S
+        while time.monotonic() < give_up:
+            for entry in self.events(device, what):
+                if entry.items() >= values.items():
+                    return entry
+            time.sleep(0.02)
+        raise AssertionError(f"{device}: {what} {values} has not happened: {self.events()}")
+
+
+class Host:
+    """A master that knows a few frames by heart."""
+
+    def __init__(self, path):
+        self.link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self.link.connect(path)
+        except OSError:
+            self.link.close()
+            raise
+        self.link.settimeout(5.0)
+
+    def send(self, *frames):
+        self.link.sendall(
+            b"".join(struct.pack("=IB3x8s", can_id, len(data), data) for can_id, data in frames)
+        )
+
+    def receive(self, *wanted):
+        """Return identifier and data of the next of these frames."""
+        while True:
+            raw = self.link.recv(16, socket.MSG_WAITALL)
+            if not raw:
+                raise ConnectionError
+            can_id, length, data = struct.unpack("=IB3x8s", raw)
+            if can_id in wanted:
+                return can_id, data[:length]
+
+    def write(self, index, sub, value, size):
+        command = {1: 0x2F, 2: 0x2B, 4: 0x23}[size]
+        data = struct.pack("<BHB", command, index, sub) + value.to_bytes(size, "little")
+        self.send((0x601, data.ljust(8, b"\0")))
+        _, reply = self.receive(0x581)
+        assert reply[0] == 0x60, (hex(index), sub, reply.hex())
+
+    def set_up(self):
+        """TPDO1: statusword, position, torque; RPDO1: controlword, torque; both at SYNC."""
+        for record, mapping, can_id, entries in (
+            (0x1800, 0x1A00, 0x181, (0x60410010, 0x60640020, 0x60770010)),
+            (0x1400, 0x1600, 0x201, (0x60400010, 0x60710010)),
+        ):
+            self.write(record, 1, 0x8000_0000 | can_id, 4)
+            self.write(mapping, 0, 0, 1)
+            for sub, entry in enumerate(entries, 1):
+                self.write(mapping, sub, entry, 4)
+            self.write(mapping, 0, len(entries), 1)
+            self.write(record, 2, 1, 1)
+            self.write(record, 1, can_id, 4)
+        self.write(0x1016, 1, 127 << 16 | 50, 4)
+        self.write(0x6060, 0, 10, 1)
+        self.send((0x000, b"\x01\x01"), (0x77F, b"\x05"))
+
+    def tick(self, controlword=None, torque=0):
+        """One exchange: SYNC, its TPDO, then the RPDO for the next; returns the TPDO."""
+        self.send((0x080, b""))
+        _, data = self.receive(0x181)
+        if controlword is not None:
+            self.send((0x201, struct.pack("<Hh", controlword, torque)))
+        return struct.unpack("<HiH", data)
+
+    def enable(self):
+        for word in (0x06, 0x07, 0x0F):
+            self.tick(word)
+        for _ in range(3):
+            status, *_ = self.tick(0x0F)
+        assert status & 0x6F == 0x27
+
+    def close(self):
+        self.link.close()
+
+
+@pytest.fixture
+def runtime(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    return folder / "rigd"
+
+
+@pytest.fixture
+def simulate(tmp_path, runtime):
+    started = []
+
+    def start(*arguments):
+        started.append(Simulator(tmp_path, *arguments))
+        return started[-1]
+
+    yield start
+    for simulator in started:
+        simulator.process.kill()
+        simulator.process.communicate()
+
+
+@pytest.fixture
+def connect():
+    hosts = []
+
+    def connect(simulator):
+        hosts.append(Host(simulator.address.can_socket))
+        return hosts[-1]
+
+    yield connect
+    for host in hosts:
+        host.close()
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_it_says_where_it_is_and_ends_without_a_trace(simulate, runtime, how):
+    simulator = simulate()
+    address = simulator.address
+    assert address.pid == simulator.process.pid
+    code, out, err = simulator.end(how)
+    assert (code, err) == (0, "")
+    assert address.can_socket in out
+    assert "rigd run chirp --profile antenna_can\n" in out
+    assert [path.name for path in runtime.iterdir()] == ["antenna_can.lock"]
+    assert simulator.events()[-1]["what"] == "ended"
+
+
+def test_quiet_is_quiet(simulate):
+    assert simulate("antenna_can", "--quiet").end() == (0, "", "")
+
+
+def test_there_is_one_for_each_rig(simulate):
+    first = simulate()
+    second = rigd("simulate", "--profile", "antenna_can")
+    assert second.returncode == 1
+    assert f"runs already (process {first.process.pid})" in second.stderr
+    assert first.process.poll() is None
+    assert simulate("antenna_serial").address is not None
+
+
+def test_a_killed_one_is_not_found_and_does_not_stand_in_the_way(simulate, connect):
+    first = simulate()
+    first.end(signal.SIGKILL)
+    assert find_simulator("antenna_can") is None
+    again = simulate()
+    assert again.address.pid == again.process.pid
+    connect(again).set_up()
+
+
+def test_a_host_drives_the_motor(simulate, connect):
+    host = connect(simulate("antenna_can", "--lock-step"))
+    host.set_up()
+    host.enable()
+    start = host.tick()[1]
+    for _ in range(100):
+        host.send((0x77F, b"\x05"))
+        _, counts, permille = host.tick(0x0F, 400)
+    assert permille == 400
+    # 0.2 N·m less 0.03 of friction on some 2 to 3 g·m² for 0.1 s.
+    assert 0.1 < (counts - start) * 7e-5 < 0.5
+
+
+def test_in_lock_step_everything_can_be_repeated(simulate, connect):
+    logs, replies = [], []
+    for pause_s in (0.0, 0.002):
+        simulator = simulate("antenna_can", "--lock-step")
+        host = connect(simulator)
+        host.set_up()
+        host.enable()
+        got = []
+        for tick in range(150):
+            time.sleep(pause_s)
+            host.send((0x680, b""), (0x77F, b"\x05"))
+            got.append(host.receive(0x680)[1] + host.receive(0x681)[1])
+            got.append(host.tick(0x0F, 300 if tick < 60 else -100))
+        host.tick(0x00)
+        host.tick()
+        simulator.end()
+        replies.append(got)
+        torques = simulator.events("drive", "torque")
+        since = torques[0]["t_s"]
+        logs.append([(round(e["t_s"] - since, 6), e["torque_nm"], e["enabled"]) for e in torques])
+    assert replies[0] == replies[1]
+    assert logs[0] == logs[1]
+    assert [(torque, on) for _, torque, on in logs[0]] == [
+        (0.0, True),
+        (pytest.approx(0.15), True),
+        (pytest.approx(-0.05), True),
+        (0.0, False),
+    ]
+
+
+@pytest.mark.parametrize("options", [(), ("--lock-step",)])
+def test_a_drive_whose_host_is_gone_switches_off(simulate, connect, options):
+    simulator = simulate("antenna_can", *options)
+    host = connect(simulator)
+    host.set_up()
+    host.enable()
+    for _ in range(5):
+        host.send((0x77F, b"\x05"))
+        host.tick(0x0F, 300)
+        time.sleep(0.0 if options else 0.001)
+    host.close()
+    gone = time.monotonic()
+    off = simulator.wait_for("drive", "torque", torque_nm=0.0, enabled=False)
+    assert time.monotonic() - gone < 4.0  # lock-step waits 5 s for a host that is still there
+    pushed = simulator.events("drive", "torque")
+    last = max(e["t_s"] for e in pushed if e["torque_nm"])
+    assert off["t_s"] - last < 0.08
+    assert simulator.process.poll() is None
+
+
+def test_time_passes_by_the_wall_clock(simulate, connect):
+    simulator = simulate()
+    before = simulator.events("simulator", "started")[0]
+    time.sleep(0.3)
+    simulator.end()
+    ended = simulator.events("simulator", "ended")[0]
+    assert "monotonic_ns" in before
+    assert ended["t_s"] >= 0.3
+
+
+def test_faults_are_injected_while_it_runs(simulate, connect):
+    simulator = simulate("antenna_can", "--lock-step", "--fault", "drop,from=drive,frames=2@0")
+    host = connect(simulator)
+    done = rigd("inject", "--profile", "antenna_can", "jump,counts=-500", "drop,from=host,id=0x77f")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "jump,counts=-500\ndrop,from=host,id=0x77f,frames=1\n"
+    wrong = rigd("inject", "--profile", "antenna_can", "dorp")
+    assert wrong.returncode == 1
+    assert "'dorp' is no fault; choose drop" in wrong.stderr
+    standing = rigd("inject", "--profile", "antenna_can")
+    assert "clients: 1\n" in standing.stdout
+    assert "disturbed: ['host']\n" in standing.stdout
+    host.set_up()
+    assert host.tick()[1] == -500
+    for word in (0x06, 0x07, 0x0F):
+        host.tick(word)
+    host.send((0x080, b""), (0x080, b""), (0x080, b""))
+    host.receive(0x181)  # of the SYNC that enabled it, or the one after the two lost
+    simulator.end()
+    dropped = simulator.events("simulator", "drop")
+    assert [entry["can_id"] for entry in dropped] == [0x77F, 0x181, 0x181]
+    assert [entry["fault"] for entry in simulator.events("simulator", "fault")] == [
+        "jump,counts=-500",
+        "drop,from=host,id=0x77f,frames=1",
+        "drop,from=drive,frames=2@0.0",
+    ]
+
+
+def test_a_cut_bus_stays_cut(simulate, connect):
+    simulator = simulate()
+    host = connect(simulator)
+    assert rigd("inject", "--profile", "antenna_can", "cut").returncode == 0
+    with pytest.raises(ConnectionError):
+        host.receive(0x181)
+    with pytest.raises(OSError, match=r"No such file|refused"):
+        connect(simulator)
+    assert find_simulator("antenna_can") is not None
+
+
+def test_the_serial_sensor_streams_with_the_periods(simulate, connect):
+    simulator = simulate("antenna_serial", "--lock-step")
+    host = connect(simulator)
+    with serial.Serial(simulator.address.serial_port, 1_250_000, parity="E", timeout=5.0) as line:
+        line.write(bytes.fromhex("0A4655A39D"))
+        assert line.read(5).hex() == "0a4601a262"
+        host.set_up()
+        for _ in range(3):
+            host.tick()
+        simulator.wait_for("sensor", "stream started")
+        before = line.in_waiting
+        for _ in range(4):
+            host.tick()
+        stream = line.read(before + 4 * 7 * 13)
+        for at in range(0, len(stream), 13):
+            record = stream[at : at + 13]
+            assert record[12] == sum(record[:12]) & 0x7F
+        assert rigd("inject", "--profile", "antenna_serial", "cut,device=sensor").returncode == 0
+        with pytest.raises(serial.SerialException):
+            line.read(1)
+    simulator.end()
+    assert simulator.events("line", "port opened")
+
+
+def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_path, monkeypatch):
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    simulator = simulate()
+    connect(simulator).set_up()
+    sockets = Path(simulator.address.can_socket).parent
+    assert len(os.fsencode(simulator.address.control_socket)) < 108
+    assert simulator.end()[0] == 0
+    assert not sockets.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("simulate", "--profile", "sim"), 1, "nothing to put on the wire"),
+        (("simulate", "--profile", "nothing"), 2, "There is no profile 'nothing'"),
+        (("simulate", "--profile", "antenna_can", "--fault", "cut@x"), 2, "'@x'"),
+        (
+            ("simulate", "--profile", "antenna_can", "--fault", "cut,device=sensor"),
+            2,
+            "no line of its own",
+        ),
+        (("simulate", "--profile", "antenna_can", "--log", "/nowhere/log"), 1, "cannot be written"),
+        (("inject", "--profile", "antenna_can", "cut"), 1, "start it with: rigd simulate"),
+    ],
+)
+def test_wrong_use_is_told_in_a_sentence(runtime, arguments, code, said):
+    done = rigd(*arguments)
+    assert done.returncode == code
+    assert done.stderr.startswith("Error: ")
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert find_simulator("antenna_can") is None
+
+
+def test_the_help_names_every_fault():
+    from rigd.sim.wire.faults import KINDS
+
+    shown = rigd("inject", "--help").stdout
+    assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in KINDS)

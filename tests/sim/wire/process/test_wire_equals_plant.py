@@ -1,0 +1,145 @@
+"""A session's devices over the wire see what the bare simulation of the same profile does.
+
+In lock-step every tick is determined, so angles have to be equal and wrenches equal but for the
+gauges' resolution: pairing, order, scaling and every delay, through the drivers of the rig.
+"""
+
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigd.devices.registry import open_devices
+from rigd.devices.simulator import find_simulator
+from rigd.profile import load_profile
+from rigd.sim.devices import SimulatedRig
+from rigd.sim.wire.control import ask
+
+PERIOD_NS = 1_000_000
+PROFILES = Path(__file__).parents[4] / "hw_profiles"
+RUN = (
+    "import sys\n"
+    "from rigd.profile import load_profile\n"
+    "from rigd.sim.wire.simulate import SimulatorOptions, run_simulator\n"
+    "options = SimulatorOptions(lock_step=True, quiet=True)\n"
+    "sys.exit(run_simulator(load_profile(sys.argv[1]).rig, options))\n"
+)
+
+
+def torque_nm(tick):
+    """In whole steps of the drive, 1/1000 of 0.5 N·m; it changes in every tick."""
+    return 0.0005 * (300 if tick < 60 else -250) + 0.0005 * (tick * 7 % 5)
+
+
+def edit(text, key, value):
+    """Set a key of a profile that is there once, or in the section given before a colon."""
+    section, _, key = key.rpartition(":")
+    start = text.index(f"[{section}]") if section else 0
+    pattern = rf"^{key} = (\{{ value = )?[^,\n]*"
+    found = re.search(pattern, text[start:], re.MULTILINE)
+    assert found is not None, key
+    head = f"{key} = {found[1] or ''}"
+    return text[:start] + text[start:].replace(found[0], head + value, 1)
+
+
+@pytest.fixture
+def simulated_profile(tmp_path, monkeypatch):
+    """Write a profile without noise, and run its simulator."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    processes = []
+
+    def make(name, changes):
+        text = (PROFILES / f"{name}.toml").read_text()
+        changes = {"torque_noise_nm": "0.0", "force_noise_n": "0.0", "name": '"still"'} | changes
+        for key, value in changes.items():
+            text = edit(text, key, value)
+        path = tmp_path / "still.toml"
+        path.write_text(text)
+        processes.append(subprocess.Popen([sys.executable, "-c", RUN, str(path)]))
+        while find_simulator("still") is None:
+            assert processes[-1].poll() is None
+            time.sleep(0.01)
+        return load_profile(path).rig
+
+    yield make
+    for process in processes:
+        process.terminate()
+        assert process.wait() == 0
+
+
+def over_the_wire(rig, ticks):
+    devices = open_devices(rig)
+    address = find_simulator(rig.name)
+    drive, sensor = devices.drive, devices.sensor
+    readings = []
+    try:
+        drive.connect()
+        sensor.connect()
+        for tick in range(-20, ticks):
+            if tick == -5:
+                drive.enable()
+            drive.latch(tick * PERIOD_NS)
+            sensor.request(tick * PERIOD_NS)
+            angle, wrench = drive.read_angle(), sensor.read_wrench()
+            drive.command(torque_nm(tick) if tick >= 0 else 0.0)
+            # Replies that are taken a tick later have come by then, as they have in real time; the
+            # simulator serves one after the other, so its second answer is behind all of this.
+            ask(address, {"status": True})
+            ask(address, {"status": True})
+            if tick >= 0:
+                assert not drive.angle_stale
+                assert not sensor.wrench_stale
+                readings.append((angle, wrench))
+    finally:
+        drive.close()
+        sensor.close()
+    return readings
+
+
+def bare(rig, ticks):
+    simulated = SimulatedRig(rig)
+    simulated.plant.enable()
+    simulated.advance(20)
+    readings = []
+    for tick in range(ticks):
+        readings.append((simulated.read_angle(), simulated.sensor.read_wrench()))
+        simulated.plant.command(torque_nm(tick))
+        simulated.advance(1)
+    return readings
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("antenna_can", {}),
+        ("antenna_can", {"direction": "-1", "torque_delivery": '"on_arrival"'}),
+        (
+            "antenna_can",
+            {
+                "mode": '"previous_tick"',
+                "encoder:delay_s": "1.055e-3",
+                "sensor:delay_s": "1.3e-3",
+                "actuation:delay_s": "1.4e-3",
+            },
+        ),
+        ("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
+        ("antenna_serial", {}),
+    ],
+)
+def test_the_wire_changes_nothing(simulated_profile, name, changes):
+    rig = simulated_profile(name, changes)
+    ticks = 120
+    expected = bare(rig, ticks)
+    got = over_the_wire(rig, ticks)
+    assert [angle for angle, _ in got] == pytest.approx([angle for angle, _ in expected], abs=1e-9)
+    assert max(abs(angle) for angle, _ in got) > 0.01
+    # The sensor's bias is its own; what counts is the change, as with a tare.
+    changes = [np.subtract(wrench, got[0][1]) for _, wrench in got]
+    wanted = [np.subtract(wrench, expected[0][1]) for _, wrench in expected]
+    off = np.max(np.abs(np.subtract(changes, wanted)), axis=0)
+    assert np.all(off <= rig.sensor.resolution)
+    assert max(abs(change[5]) for change in changes) > 0.02

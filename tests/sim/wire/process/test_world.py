@@ -1,0 +1,373 @@
+"""The world between its lines: periods, routing and faults, frame by frame."""
+
+import random
+import struct
+
+import pytest
+
+from rigd.sim.wire.faults import FaultError, parse_fault
+
+PERIOD_NS = 1_000_000
+RPDO, POLL = 0x201, 0x680
+
+
+def frame(can_id, data=b""):
+    return struct.pack("=IB3x8s", can_id, len(data), data)
+
+
+SYNC = frame(0x80)
+
+
+def numbered(n):
+    return frame(RPDO, struct.pack("<I", n))
+
+
+def numbers(frames, can_id=RPDO):
+    return [struct.unpack("<I", data)[0] for got, data in frames if got == can_id]
+
+
+# Periods
+
+
+def test_each_sync_moves_the_rig_before_the_drive_answers(make_world):
+    rig = make_world()
+    rig.sync(1, 2, 3)
+    assert rig.answers() == [1, 2, 3]
+    assert rig.drive.ticks_s == pytest.approx([0.001, 0.002, 0.003])
+
+
+def test_missed_syncs_pass_as_periods_before_the_next_one(make_world):
+    rig = make_world()
+    rig.sync(1, 2, 5)
+    assert rig.answers() == [1, 2, 5]
+    assert len(rig.drive.ticks_s) == 5
+
+
+def test_without_sync_the_world_moves_by_the_clock(make_world):
+    rig = make_world()
+    rig.world.elapse(round(20.6 * PERIOD_NS))
+    assert rig.world.moved == 20
+    rig.sync(21)
+    assert rig.answers() == [21]
+
+
+def test_syncs_read_together_after_a_pause_are_a_period_each(make_world):
+    rig = make_world()
+    rig.sync(*range(1, 11))
+    rig.world.hear([SYNC, numbered(1), SYNC, numbered(2), SYNC], "host", 13 * PERIOD_NS)
+    rig.world.elapse(round(13.2 * PERIOD_NS))
+    rig.sync(14)
+    assert rig.answers() == [*range(1, 15)]
+
+
+def test_the_loop_may_wait_until_a_sync_is_overdue_or_long_where_none_comes(make_world):
+    rig = make_world()
+    assert rig.world.wait_s(0, 0.01) == 0.01
+    rig.sync(*range(1, 20))
+    assert rig.world.wait_s(19 * PERIOD_NS, 0.01) == pytest.approx(0.0015)
+    assert rig.world.wait_s(21 * PERIOD_NS, 0.01) == 0.0
+    rig.world.elapse(200 * PERIOD_NS)
+    assert rig.world.wait_s(200 * PERIOD_NS, 0.01) == 0.01
+
+
+def test_a_frozen_drive_does_not_stop_the_world(make_world):
+    rig = make_world()
+    rig.drive.frozen = True
+    rig.sync(1, 2)
+    rig.drive.frozen = False
+    rig.sync(3)
+    assert rig.answers() == [3]
+
+
+def test_in_lock_step_only_syncs_move_the_rig_while_a_host_is_there(make_world):
+    rig = make_world(lock_step=True)
+    rig.simulated.plant.enable()
+    rig.sync(0.1, 0.2, 700, 701)
+    rig.world.elapse(round(900 * PERIOD_NS))
+    assert rig.answers() == [1, 2, 3, 4]
+    assert rig.world.moved == 4
+
+
+def test_in_lock_step_a_dead_host_is_noticed(make_world):
+    rig = make_world(lock_step=True)
+    rig.simulated.plant.enable()
+    rig.sync(1)
+    rig.world.left_alone(2 * PERIOD_NS)
+    rig.world.elapse(52 * PERIOD_NS)
+    assert rig.drive.ticks_s[-1] == pytest.approx(0.051)
+    assert rig.world.moved == 51
+
+
+def test_in_lock_step_a_rig_at_rest_waits_while_its_nodes_are_set_up(make_world):
+    rig = make_world(lock_step=True)
+    rig.world.elapse(500 * PERIOD_NS)
+    assert rig.drive.ticks_s[-1] == pytest.approx(0.5)
+    assert rig.world.moved == 0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lock_step_does_not_depend_on_when_frames_come(make_world, seed):
+    chance = random.Random(seed)
+    rig = make_world(lock_step=True)
+    rig.simulated.plant.enable()
+    now = 0
+    angles = []
+    for tick in range(300):
+        now += chance.randrange(1, 5_000_000)
+        rig.simulated.plant.command(0.2 if tick < 100 else -0.1)
+        rig.world.hear([SYNC], "host", now)
+        rig.world.elapse(now + 1000)
+        angles.append((rig.simulated.plant.angle_rad, rig.simulated.sensor.measure()))
+    direct = make_world().simulated
+    direct.plant.enable()
+    for tick in range(300):
+        direct.plant.command(0.2 if tick < 100 else -0.1)
+        direct.advance(1)
+        assert angles[tick] == (direct.plant.angle_rad, direct.sensor.measure())
+
+
+# Routing
+
+
+def test_a_host_is_heard_by_every_node_and_by_other_hosts(make_world):
+    rig = make_world()
+    rig.world.hear([numbered(7)], "host", 0)
+    assert rig.drive.heard == rig.sensor.heard == [(RPDO, struct.pack("<I", 7))]
+    assert rig.sent == [(numbered(7), "host")]
+
+
+def test_nodes_hear_each_other_but_not_themselves(make_world):
+    rig = make_world()
+    rig.sync(1)
+    rig.world.hear([frame(POLL)], "host", PERIOD_NS)
+    assert [can_id for can_id, _ in rig.sensor.heard] == [0x80, 0x181, POLL]
+    assert [can_id for can_id, _ in rig.drive.heard] == [0x80, POLL, 0x680, 0x681]
+    assert [origin for _, origin in rig.sent] == ["host", None, "host", None, None]
+
+
+def test_what_is_no_plain_frame_is_nobody_s_business(make_world):
+    rig = make_world()
+    remote, long_id, error = 0x4000_0181, 0x8000_0080, 0x2000_0004
+    flagged = [struct.pack("=IB3x8s", can_id, 0, b"") for can_id in (remote, long_id, error)]
+    rig.world.hear(flagged, "host", PERIOD_NS)
+    assert rig.drive.heard == []
+
+
+# Faults of a line
+
+
+def through(rig, first, last):
+    for n in range(first, last):
+        rig.world.hear([numbered(n)], "host", n * 1000)
+    return numbers(rig.drive.heard)
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        ("drop,from=host,frames=3", [3, 4, 5, 6, 7]),
+        ("drop,from=host,id=0x201,frames=2", [2, 3, 4, 5, 6, 7]),
+        ("drop,from=host,id=0x202,frames=2", [0, 1, 2, 3, 4, 5, 6, 7]),
+        ("drop,from=drive,frames=2", [0, 1, 2, 3, 4, 5, 6, 7]),
+        ("reorder,from=host", [1, 0, 2, 3, 4, 5, 6, 7]),
+        ("reorder,from=host,frames=3", [1, 0, 3, 2, 5, 4, 6, 7]),
+        ("corrupt,from=host,frames=2", [0xFF, 0xFE, 2, 3, 4, 5, 6, 7]),
+        ("corrupt,from=host,byte=3", [0xFF000000, 1, 2, 3, 4, 5, 6, 7]),
+        ("corrupt,from=host,byte=4", [0, 1, 2, 3, 4, 5, 6, 7]),
+    ],
+)
+def test_line_faults_hit_exactly_the_frames_asked_for(make_world, spec, expected):
+    rig = make_world()
+    rig.world.inject(parse_fault(spec))
+    assert through(rig, 0, 8) == expected
+
+
+def test_two_faults_hit_one_frame_after_the_other(make_world):
+    rig = make_world()
+    rig.world.inject(parse_fault("drop,from=host,frames=2"))
+    rig.world.inject(parse_fault("corrupt,from=host,frames=2"))
+    assert through(rig, 0, 6) == [2 ^ 0xFF, 3 ^ 0xFF, 4, 5]
+    assert rig.world.disturbed == []
+    hits = [what for _, device, what, _ in rig.log.entries if what in ("drop", "corrupt")]
+    assert hits == ["drop", "drop", "corrupt", "corrupt"]
+
+
+def test_other_hosts_hear_what_the_nodes_hear(make_world):
+    rig = make_world()
+    rig.world.inject(parse_fault("drop,from=host"))
+    rig.world.inject(parse_fault("corrupt,from=host"))
+    through(rig, 0, 3)
+    assert [raw for raw, _ in rig.sent] == [numbered(0xFE), numbered(2)]
+
+
+def test_a_delayed_reply_comes_when_its_time_has_come(make_world):
+    rig = make_world()
+    rig.sync(1)
+    rig.world.inject(parse_fault("delay,from=drive,ms=0.3,frames=2"))
+    rig.sync(2)
+    assert rig.answers() == [1]
+    assert rig.world.wait_s(2 * PERIOD_NS, 0.01) == pytest.approx(0.0003)
+    rig.world.elapse(round(2.29 * PERIOD_NS))
+    assert rig.answers() == [1]
+    rig.world.elapse(round(2.31 * PERIOD_NS))
+    assert rig.answers() == [1, 2]
+    rig.sync(3)
+    rig.sync(4)
+    assert rig.answers() == [1, 2, 4]
+    rig.world.elapse(round(4.1 * PERIOD_NS))
+    assert rig.answers() == [1, 2, 4, 3]
+
+
+def test_in_lock_step_a_delay_is_of_simulated_time(make_world):
+    rig = make_world(lock_step=True)
+    rig.world.inject(parse_fault("delay,from=drive,ms=2"))
+    rig.sync(1)
+    rig.world.elapse(round(4.9e9))
+    rig.sync(4901)
+    assert rig.answers() == [2]
+    rig.sync(4902)
+    assert rig.answers() == [2, 3, 1]
+
+
+def test_a_lost_sync_passes_as_a_period_that_no_node_hears(make_world):
+    rig = make_world(lock_step=True)
+    rig.sync(1)
+    rig.world.inject(parse_fault("drop,from=host,id=0x80,frames=2"))
+    rig.sync(2, 3, 4)
+    assert rig.answers() == [1, 4]
+
+
+# Faults of devices
+
+
+def test_a_fault_waits_until_the_drive_is_enabled(make_world):
+    rig = make_world()
+    rig.world.inject(parse_fault("jump,counts=-500@0.02"))
+    rig.sync(*range(1, 11))
+    rig.simulated.plant.enable()
+    rig.sync(*range(11, 31))
+    assert rig.drive.angle_offset_counts == 0
+    rig.sync(31)
+    assert rig.drive.angle_offset_counts == -500
+    assert rig.log.of("fault") == [
+        (0.031, "simulator", "fault", {"fault": "jump,counts=-500@0.02"})
+    ]
+
+
+def test_a_fault_that_comes_in_later_counts_from_the_enabling_too(make_world):
+    rig = make_world()
+    rig.simulated.plant.enable()
+    rig.sync(*range(1, 11))
+    rig.world.inject(parse_fault("jump,counts=1@0.015"))
+    rig.world.inject(parse_fault("jump,counts=10@0.001"))
+    rig.sync(11)
+    assert rig.drive.angle_offset_counts == 10
+    rig.sync(12, 13, 14, 15, 16)
+    assert rig.drive.angle_offset_counts == 11
+
+
+@pytest.mark.parametrize(
+    ("spec", "device", "attribute", "normal", "value"),
+    [
+        ("freeze,device=drive,for=0.003", "drive", "frozen", False, True),
+        ("freeze,device=sensor,for=0.003", "sensor", "frozen", False, True),
+        ("saturate,gauge=4,for=0.003", "sensor", "saturate", None, 4),
+        ("status,bits=0x0080,for=0.003", "sensor", "status_bits", 0, 0x80),
+    ],
+)
+def test_a_fault_with_an_end_ends(make_world, spec, device, attribute, normal, value):
+    rig = make_world()
+    rig.sync(1)
+    rig.world.inject(parse_fault(spec))
+    seen = []
+    for tick in range(2, 7):
+        seen.append(getattr(getattr(rig, device), attribute))
+        rig.sync(tick)
+    assert seen == [value, value, value, normal, normal]
+    assert [time_s for time_s, *_ in rig.log.of("fault over")] == [0.004]
+
+
+def test_an_emergency_is_the_drive_s(make_world):
+    rig = make_world()
+    rig.world.inject(parse_fault("emcy,code=0x8130,register=0x11"))
+    assert rig.drive.emergencies == [(0x8130, 0x11, bytes(5))]
+
+
+def test_the_bus_is_cut_by_who_holds_it(make_world):
+    rig = make_world()
+    rig.world.inject(parse_fault("cut"))
+    assert rig.cuts == ["bus"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("cut,device=sensor", "no line of its own"),
+        ("drop,from=sensor,bytes=3", "bytes is for a sensor on a serial line"),
+    ],
+)
+def test_a_fault_that_this_rig_cannot_have_is_refused(make_world, spec, said):
+    rig = make_world()
+    with pytest.raises(FaultError, match=said):
+        rig.world.inject(parse_fault(spec + "@5"))
+
+
+# The serial line
+
+
+def records(rig):
+    assert len(rig.written) % 13 == 0
+    split = [rig.written[at : at + 13] for at in range(0, len(rig.written), 13)]
+    assert all(record == record[:1] * 13 for record in split)
+    return [record[0] for record in split]
+
+
+def test_each_period_brings_its_records(make_world):
+    rig = make_world(serial=True)
+    rig.sync(1, 2)
+    rig.world.elapse(round(4.6 * PERIOD_NS))
+    assert records(rig) == [*range(28)]
+
+
+def test_a_rig_that_waits_in_lock_step_streams_nothing(make_world):
+    rig = make_world(serial=True, lock_step=True)
+    rig.world.elapse(500 * PERIOD_NS)
+    rig.sync(501)
+    assert records(rig) == [*range(7)]
+
+
+def test_records_are_lost_and_swapped_one_by_one(make_world):
+    rig = make_world(serial=True)
+    rig.sync(1)
+    rig.world.inject(parse_fault("drop,from=sensor,frames=8"))
+    rig.world.inject(parse_fault("reorder,from=sensor,frames=2"))
+    rig.sync(2, 3)
+    assert records(rig) == [*range(7), 16, 15, 18, 17, 19, 20]
+
+
+def test_a_record_comes_late_or_with_a_wrong_byte(make_world):
+    rig = make_world(serial=True)
+    rig.world.inject(parse_fault("corrupt,from=sensor,byte=12"))
+    rig.sync(1)
+    assert rig.written[:13] == bytes([0] * 12 + [0xFF])
+    rig.written = b""
+    rig.world.inject(parse_fault("delay,from=sensor,ms=0.5"))
+    rig.sync(2)
+    rig.world.elapse(round(2.6 * PERIOD_NS))
+    assert records(rig) == [8, 9, 10, 11, 12, 13, 7]
+
+
+def test_bytes_are_lost_across_records(make_world):
+    rig = make_world(serial=True)
+    rig.world.inject(parse_fault("drop,from=sensor,bytes=16"))
+    rig.sync(1)
+    assert rig.written[:10] == bytes([1] * 10)
+    assert len(rig.written) == 7 * 13 - 16
+
+
+def test_on_a_serial_line_there_are_no_identifiers(make_world):
+    rig = make_world(serial=True)
+    with pytest.raises(FaultError, match="id is for a sensor on CAN"):
+        rig.world.inject(parse_fault("drop,from=sensor,id=1"))
+    rig.world.inject(parse_fault("cut,device=sensor"))
+    assert rig.cuts == ["sensor"]

@@ -1,0 +1,112 @@
+"""Every row of docs/faults.md: a fault on the wire, and how the session and the drive end."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from rigd.session import Status, read_session
+
+# Sessions of several processes share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+AT_S = 1.0  # after the drive was enabled: in the middle of the chirp
+SHORT = {"duration_s": 2.0, "rest_s": 0.1, "ring_down_s": 0.1}
+
+FATAL, BORNE = "## Faults that end a session", "## Faults that a session bears"
+MESSAGES = {
+    "angle lost": r"angle.*10 ticks",
+    "wrench lost": r"wrench.*10 ticks",
+    "half of each wrench lost": r"wrench.*10 ticks",
+    "drive silent": r"angle.*10 ticks",
+    "sensor silent": r"wrench.*10 ticks",
+    "emergency message": r"Drive .*0x2310",
+    "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
+    "encoder jumps": r"speed|tracking error",
+    "statusword corrupted": r"Drive .*statusword",
+    "sensor reports an error": r"Sensor .*0x8040.*calibration",
+    "gauge at its end": r"sensor's f. of .* N exceeds its limit",
+    "bus cut": r"CAN bus .*cut off",
+    "loop's frames lost": r"10 ticks",
+    "loop's heartbeat lost": r"Drive .*0x8130",
+    "serial line cut": r"Sensor ATI Digital F/T on /dev/pts",
+    "stream silent": r"wrench.*10 ticks",
+    "stream reports an error": r"Sensor ATI Digital F/T .*error",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A fault as documented."""
+
+    name: str
+    fault: str
+    profile: str
+    ticks: int
+    last: str
+
+
+def rows(heading):
+    text = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
+    section = text[text.index(heading) + len(heading) :].partition("\n## ")[0]
+    cells = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in section.splitlines()
+        if line.startswith("|") and "`" in line
+    ]
+    return [Row(c[0], c[1].strip("`"), c[2], int(c[3]), c[4]) for c in cells]
+
+
+def named(row):
+    return row.name.replace(" ", "_")
+
+
+def test_every_row_has_its_message():
+    assert [row.name for row in rows(FATAL)] == list(MESSAGES)
+
+
+@pytest.mark.parametrize("row", rows(FATAL), ids=named)
+def test_a_fault_ends_in_a_drive_without_torque(
+    row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
+):
+    profile, log = quiet_profile(row.profile), tmp_path / "drive.jsonl"
+    simulator = start_simulator(
+        profile, "--lock-step", "--log", log, "--fault", f"{row.fault}@{AT_S}"
+    )
+    result = run_order(load(profile), "session", fast=True, **SHORT)
+    assert result.outcome == "fault"
+    assert re.search(MESSAGES[row.name], result.reason), result.reason
+    assert result.scheduled == result.recorded + result.missed + result.lost
+    assert result.lost == 0
+    session = read_session(result.path)
+    assert session.outcome["outcome"] == "fault"
+    assert session.samples[-1]["status"] & Status.TORQUE_OFF
+    simulator.terminate()
+    assert simulator.wait(10.0) == 0
+
+    said = drive_log(log)
+    (begun,) = said.of("fault", "simulator")
+    end = said.last_torque
+    assert (end["enabled"], end["torque_nm"]) == (False, 0.0)
+    off = next(e for e in said.of("torque") if e["t_s"] >= begun["t_s"] and not e["enabled"])
+    assert off["torque_nm"] == 0.0
+    assert round((off["t_s"] - begun["t_s"]) * 1000) <= row.ticks
+
+
+@pytest.mark.parametrize("row", rows(BORNE), ids=named)
+def test_a_passing_fault_is_flagged_and_borne(
+    row, quiet_profile, start_simulator, run_order, load, tmp_path
+):
+    profile = quiet_profile(row.profile)
+    start_simulator(profile, "--lock-step", "--fault", f"{row.fault}@{AT_S}")
+    result = run_order(load(profile), "session", fast=True, **SHORT)
+    assert result.went_well, result.reason
+    status = read_session(result.path).samples["status"]
+    stale = status & (Status.ANGLE_STALE | Status.WRENCH_STALE)
+    if row.ticks:
+        flag = Status[row.last.upper().replace(" ", "_")]
+        assert 1 <= (status & flag != 0).sum() <= row.ticks
+        assert not (stale & ~int(flag)).any()
+    else:
+        assert not stale.any()

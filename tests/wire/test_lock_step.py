@@ -1,0 +1,68 @@
+"""Through the wires, one period a SYNC, the samples are those of the direct simulation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.devices.parameters import Selection
+from rigd.session import read_session
+
+# Sessions of several processes share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("antenna_can", ()),
+        ("antenna_can", (('torque_delivery = "at_sync"', 'torque_delivery = "on_arrival"'),)),
+        (
+            "antenna_can",
+            (
+                ('mode = "same_tick"', 'mode = "previous_tick"'),
+                ("delay_s = { value = 5.5e-5,", "delay_s = { value = 1.0e-3,"),
+                ("delay_s = { value = 0.0,", "delay_s = { value = 1.0e-3,"),
+            ),
+        ),
+        ("antenna_can", (("direction = { value = 1,", "direction = { value = -1,"),)),
+        ("antenna_serial", ()),
+        ("antenna_serial", (('filter = "mean"', 'filter = "triangle"'), (
+            "delay_s = { value = 5.33e-4,", "delay_s = { value = 9.6e-4,"))),
+    ],
+    ids=["can", "on_arrival", "previous_tick", "turned_round", "serial", "triangle"],
+)  # fmt: skip
+def test_samples_equal_those_of_the_direct_simulation(
+    name, changes, quiet_profile, start_simulator, run_order, load, tmp_path
+):
+    path = quiet_profile(name, *changes)
+    profile = load(path)
+    direct = replace(
+        profile, rig=replace(profile.rig, devices=Selection(drive="sim", sensor="sim"))
+    )
+    start_simulator(path, "--lock-step")
+    for which, rig_profile in (("wired", profile), ("direct", direct)):
+        result = run_order(rig_profile, which, fast=True)
+        assert result.went_well, result.reason
+        assert result.scheduled == result.recorded == 4800
+        assert result.missed == result.lost == 0
+    wired = read_session(tmp_path / "wired.mcap")
+    expected = read_session(tmp_path / "direct.mcap")
+    assert (wired.metadata["simulated"], wired.metadata["drive"]) == ("true", "cia402")
+    ours, theirs = wired.samples, expected.samples
+    assert np.array_equal(ours["status"], theirs["status"])
+    rig = profile.rig
+    # One step of the encoder, and of the torque that the drive takes in thousandths.
+    angle = np.abs(ours["angle_rad"] - theirs["angle_rad"]) / rig.encoder.resolution_rad
+    _, end = wired.segments["sweep"]
+    assert angle[:end].max() < 1.01
+    # A motor that comes to rest sticks on whichever side of the set-point such a step leaves it.
+    assert angle[end:].max() < 10
+    torque = ours["coupling_torque_nm"] - theirs["coupling_torque_nm"]
+    # A step of the sensor and one of a raw gauge on either side, the tare's own, and what the
+    # torque's thousandths do to the motion.
+    assert np.abs(torque).max() < 6 * rig.sensor.resolution[5]
+    assert torque.std() < rig.sensor.resolution[5]
+    # The controller amplifies an encoder step: compare what the torque does on the whole.
+    command = ours["torque_command_nm"] - theirs["torque_command_nm"]
+    assert command.std() < 0.05 * theirs["torque_command_nm"].std()

@@ -1,0 +1,157 @@
+"""`rigd simulate` in one terminal, `rigd run` in the other, in real time."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigd.session import Status, read_session, read_timings
+
+# Sessions in real time share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+RIGD = Path(sys.executable).parent / "rigd"
+
+# A virtual machine that is short of processor time stands still for 0.1 s at a time.
+PATIENT = (
+    ("stale_ticks_in_a_row = { value = 10", "stale_ticks_in_a_row = { value = 400"),
+    ("missed_ticks_in_a_row = { value = 25", "missed_ticks_in_a_row = { value = 400"),
+    ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
+    ("\nheartbeat_timeout_s = { value = 0.05", "\nheartbeat_timeout_s = { value = 1.0"),
+    ("drive_heartbeat_timeout_s = { value = 0.1", "drive_heartbeat_timeout_s = { value = 1.0"),
+)
+
+
+@pytest.fixture
+def run_chirp(tmp_path):
+    def run(profile, *options):
+        arguments = ["run", "chirp", "--profile", profile, "--duration", "4", "--rest", "0.2"]
+        arguments += ["--ring-down", "0.3", "--stop-hz", "10", "--json", *options]
+        return subprocess.run(
+            [RIGD, *map(str, arguments)],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+
+    return run
+
+
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_a_chirp_through_the_wires_is_recorded_whole(
+    name, quiet_profile, start_simulator, run_chirp, drive_log, tmp_path
+):
+    profile = quiet_profile(name, *PATIENT)
+    log = tmp_path / "drive.jsonl"
+    simulator = start_simulator(profile, "--log", log)
+    done = run_chirp(profile)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"No hardware: {name} is simulated (rigd simulate, by the clock)." in done.stderr
+    (counts,) = json.loads(done.stdout)["sessions"]
+    assert counts["outcome"] == "complete"
+    assert counts["lost"] == 0
+    assert counts["scheduled"] == 4500 == counts["recorded"] + counts["missed"]
+
+    session = read_session(tmp_path / counts["path"])
+    metadata = session.metadata
+    assert metadata["simulated"] == "true"
+    assert metadata["acquisition_mode"] == "same_tick"
+    assert ("sensor_filter" in metadata) == (name == "antenna_serial")
+    calibration = json.loads(session.attachments["calibration.json"])
+    assert np.shape(calibration["matrix"]) == (6, 6)
+    fresh = (session.samples["status"] & (Status.ANGLE_STALE | Status.WRENCH_STALE)) == 0
+    assert fresh.mean() > 0.8
+    error = session.samples["angle_rad"] - session.samples["angle_reference_rad"]
+    assert np.abs(error).max() < 0.04  # the whole amplitude, and more, at 10 Hz
+
+    timings = read_timings(tmp_path / counts["path"])
+    assert np.array_equal(timings["tick"], session.samples["tick"])
+    # Asked for after the tick was due, in the same tick.
+    asked = -timings["angle_age_s"][fresh]
+    assert np.all(asked >= 0)
+    assert np.median(asked) < 0.9e-3
+    assert np.median(-timings["wrench_age_s"][fresh]) < 1e-3
+
+    simulator.send_signal(signal.SIGTERM)
+    assert simulator.wait(10.0) == 0
+    said = drive_log(log)
+    assert said.last_torque["enabled"] is False
+    assert said.last_torque["torque_nm"] == 0.0
+    assert max(abs(entry["torque_nm"]) for entry in said.of("torque")) > 0.02
+    assert not said.of("emergency")
+
+
+def test_ctrl_c_stops_the_motor_over_the_wire(quiet_profile, start_simulator, drive_log, tmp_path):
+    profile = quiet_profile("antenna_can", *PATIENT)
+    log = tmp_path / "drive.jsonl"
+    simulator = start_simulator(profile, "--log", log)
+    running = subprocess.Popen(
+        [RIGD, "run", "chirp", "--profile", profile, "--json"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ,
+        start_new_session=True,
+    )
+    try:
+        assert _recording(tmp_path)
+        os.killpg(running.pid, signal.SIGINT)
+        out, err = running.communicate(timeout=20)
+    finally:
+        running.kill()
+        running.wait()
+    assert running.returncode == 130, err
+    (counts,) = json.loads(out)["sessions"]
+    assert counts["outcome"] == "stopped"
+    last = read_session(tmp_path / counts["path"]).samples[-1]
+    assert last["torque_command_nm"] == 0.0
+    assert last["status"] & Status.TORQUE_OFF
+    simulator.send_signal(signal.SIGTERM)
+    assert simulator.wait(10.0) == 0
+    said = drive_log(log)
+    assert (said.last_torque["enabled"], said.last_torque["torque_nm"]) == (False, 0.0)
+    assert not said.of("emergency")
+
+
+def _recording(folder: Path, within_s: float = 20.0) -> bool:
+    """Wait until a session is being recorded in a folder and has its first samples."""
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        if any(part.stat().st_size > 100_000 for part in folder.glob("sessions/*.part")):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_without_hardware_and_simulator_the_message_says_what_to_do(
+    quiet_profile, run_chirp, runtime_folder
+):
+    done = run_chirp(quiet_profile("antenna_can"))
+    assert done.returncode == 1
+    assert "rigd simulate" in done.stderr + done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def test_real_time_cannot_be_skipped_unless_in_lock_step(
+    quiet_profile, start_simulator, run_chirp, runtime_folder
+):
+    profile = quiet_profile("antenna_can")
+    done = run_chirp(profile, "--fast")
+    assert done.returncode == 2
+    assert "--fast: the hardware of" in done.stderr
+    start_simulator(profile)
+    done = run_chirp(profile, "--fast")
+    assert done.returncode == 2
+    assert "start rigd simulate with --lock-step" in done.stderr
+    done = run_chirp(profile, "--seed", "3")
+    assert done.returncode == 2
+    assert "--seed: the noise of rigd simulate" in done.stderr
