@@ -53,8 +53,9 @@ def _ask(profile: Profile, devices: Devices, moves: Reality, rows: list[Row]) ->
         else:
             yield from measured_rows(sensor.measure(MEASURED_S), rig)
 
-    drive_answers = _try("drive", about_drive(), rows)
+    # The drive last: once it is operational it expects a SYNC every period.
     sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)
+    drive_answers = _try("drive", about_drive(), rows)
     if moves is Reality.SIMULATED:
         rows.append(Row("exchange", "ticks", "simulated in this process", "", Verdict.SKIPPED))
     elif drive_answers and sensor_answers:

@@ -7,7 +7,8 @@ In every tick the cycle calls, in this order: ``drive.latch``, ``sensor.request`
 ``drive.read_angle``, ``sensor.read_wrench``, ``drive.command``. A driver that has no fresh value
 returns the last one and says so in ``angle_stale`` or ``wrench_stale``; it never blocks longer
 than the deadline its profile gives. ``due_ns`` is the tick's scheduled time on the engine's clock;
-it grows by one period a tick, and by more where ticks were missed.
+it grows by one period a tick, and by more where ticks were missed. The sensor is connected first,
+and the drive right before the first tick: once it is operational it expects one every period.
 """
 
 from dataclasses import dataclass

@@ -36,13 +36,18 @@ def runtime_folder() -> Path:
 
 
 def announce(rig_name: str, address: SimulatorAddress) -> Path:
-    """Write down where the simulator of a rig is; the file goes when it ends."""
+    """Write down where the simulator of a rig is, until `forget`; return the file."""
     path = _address_file(rig_name)
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     fresh = path.with_suffix(f".{os.getpid()}")
     fresh.write_text(json.dumps(asdict(address)), encoding="utf-8")
     fresh.replace(path)
     return path
+
+
+def forget(rig_name: str) -> None:
+    """Take the address of a simulator away, its own or what a dead one left."""
+    _address_file(rig_name).unlink(missing_ok=True)
 
 
 def find_simulator(rig_name: str) -> SimulatorAddress | None:

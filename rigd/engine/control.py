@@ -74,8 +74,9 @@ def conduct(
     recorded = False
     procedure: Procedure | None = None
     try:
-        devices.drive.connect()
+        # The drive last: once it is operational it expects a SYNC every period.
         devices.sensor.connect()
+        devices.drive.connect()
         calibration = devices.sensor.calibration()
         procedure = Procedure(job.profile, job.excitation, cycle, clock, channels, parent, stop)
         tare = procedure.tare()

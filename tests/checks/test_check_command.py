@@ -108,7 +108,7 @@ def test_hardware_that_is_not_there(rigd, can_profile, tmp_path):
     code, text, _ = rigd("check", "--profile", path, "--json")
     assert code == 1
     failed = [row for row in json.loads(text)["rows"] if row["verdict"] == "FAIL"]
-    assert [row["group"] for row in failed] == ["drive", "sensor"]
+    assert [row["group"] for row in failed] == ["sensor", "drive"]
     assert all("nocan9" in row["found"] for row in failed)
 
 

@@ -34,7 +34,7 @@ def test_no_torque_and_everything_closed(can_profile, stand_ins):
     inspect_devices(can_profile)
     calls = stand_ins.calls
     assert not {"drive.enable", "drive.command"} & set(calls)
-    assert calls.index("drive.connect") < calls.index("sensor.connect")
+    assert calls.index("sensor.connect") < calls.index("drive.connect")
     assert stand_ins.closed
     assert calls[-2:] == ["drive.close", "sensor.close"]
     # As in a session: the angle is latched before the sensor is polled.

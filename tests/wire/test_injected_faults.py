@@ -27,7 +27,7 @@ MESSAGES = {
     "statusword corrupted": r"Drive .*statusword",
     "sensor reports an error": r"Sensor .*0x8040.*calibration",
     "gauge at its end": r"sensor's f. of .* N exceeds its limit",
-    "bus cut": r"CAN bus .*cut off",
+    "bus cut": r"CAN bus .*(cut off|takes no more frames)",
     "loop's frames lost": r"10 ticks",
     "loop's heartbeat lost": r"Drive .*0x8130",
     "serial line cut": r"Sensor ATI Digital F/T on /dev/pts",

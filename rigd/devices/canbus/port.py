@@ -48,8 +48,11 @@ class CanPort(Protocol):
     def wait(self, timeout_s: float) -> None:
         """Return as soon as a frame may have arrived, or after the timeout."""
 
-    def accept(self, can_ids: Iterable[int]) -> None:
-        """Let in only these identifiers from now on, and what the controller says of itself."""
+    def accept(self, can_ids: Iterable[int] | None) -> None:
+        """Let in only these identifiers from now on, and what the controller says of itself.
+
+        None lets in everything again.
+        """
 
     def open_bus(self) -> "can.BusABC":
         """Return a python-can bus on this port, for set-up; closing it leaves the port open."""
@@ -100,13 +103,12 @@ class SocketPort:
         """Wait for a frame."""
         select.select(self._fd, (), (), timeout_s)
 
-    def accept(self, can_ids: Iterable[int]) -> None:
+    def accept(self, can_ids: Iterable[int] | None) -> None:
         """Have the kernel drop all other identifiers; a simulated bus brings them all."""
         if self._link.family == getattr(socket, "AF_CAN", None):
-            filters = b"".join(
-                struct.pack("=II", can_id, SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG)
-                for can_id in sorted(set(can_ids))
-            )
+            exactly = SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
+            wanted = [(0, 0)] if can_ids is None else [(i, exactly) for i in sorted(set(can_ids))]
+            filters = b"".join(struct.pack("=II", *each) for each in wanted)
             self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
 
     def open_bus(self) -> "can.BusABC":
@@ -162,7 +164,7 @@ class PythonCanPort:
         if self._next is None:
             self._next = self._receive(timeout_s)
 
-    def accept(self, can_ids: Iterable[int]) -> None:
+    def accept(self, can_ids: Iterable[int] | None) -> None:
         """Nothing: filters of python-can end a poll at each frame they drop, and drop reports."""
 
     def open_bus(self) -> "can.BusABC":

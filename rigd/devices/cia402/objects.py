@@ -9,6 +9,7 @@ from typing import Final
 SYNC_COB_ID: Final = 0x1005
 SYNC_PERIOD_US: Final = 0x1006
 DEVICE_NAME: Final = 0x1008
+SOFTWARE_VERSION: Final = 0x100A
 HEARTBEAT_CONSUMER: Final = 0x1016
 """Sub 1: watched node in bits 23 to 16, its time-out in ms in bits 15 to 0."""
 HEARTBEAT_PRODUCER_MS: Final = 0x1017

@@ -84,6 +84,7 @@ class SdoAccess:
         self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_EDS), node_id))
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
         self._node.sdo.MAX_RETRIES = _SDO_TRIES
+        port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
         self._network = canopen.Network(port.open_bus())
         self._network.NOTIFIER_CYCLE = _RECEIVER_POLL_S
         self._network.listeners = [_Receiver(self._network)]
@@ -332,6 +333,7 @@ def _read_identity(sdo: SdoAccess) -> dict[str, object]:
     for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
         identity[key] = _read_if_there(sdo, objects.IDENTITY, sub)
     identity["device_name"] = sdo.read_text(objects.DEVICE_NAME)
+    identity["software_version"] = sdo.read_text(objects.SOFTWARE_VERSION)
     identity["supported_modes"] = sdo.read(objects.SUPPORTED_MODES)
     return identity
 

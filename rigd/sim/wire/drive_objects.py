@@ -17,6 +17,7 @@ NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE = 0, 10
 _DEVICE_TYPE = 0x0002_0192  # a servo drive, by CiA 402
 _VENDOR_ID, _PRODUCT_CODE, _REVISION, _SERIAL_NUMBER = 0x5249_4744, 0x402, 0x0001_0000, 1
 _DEVICE_NAME = b"simulated servo drive"
+_SOFTWARE_VERSION = b"1"
 _SUPPORTED_MODES = 1 << (CYCLIC_SYNCHRONOUS_TORQUE - 1)
 
 _TORQUE_UNIT_NM = 1e-3
@@ -99,6 +100,7 @@ def add_drive_objects(
     sync_cob_id = add(0x1005, Entry("I", 0x80, check=_check_sync_id))
     sync_period_us = add(0x1006, Entry("I"))
     add(0x1008, Entry("s", access="ro", text=_DEVICE_NAME))
+    add(0x100A, Entry("s", access="ro", text=_SOFTWARE_VERSION))
     identity = drive.vendor_id or _VENDOR_ID, drive.product_code or _PRODUCT_CODE
     numbers = (*identity, _REVISION, _SERIAL_NUMBER)
     objects.add_record(0x1018, {sub: Entry("I", n, "ro") for sub, n in enumerate(numbers, 1)})

@@ -19,7 +19,13 @@ from typing import Any
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
-from rigd.devices.simulator import SimulatorAddress, announce, find_simulator, runtime_folder
+from rigd.devices.simulator import (
+    SimulatorAddress,
+    announce,
+    find_simulator,
+    forget,
+    runtime_folder,
+)
 from rigd.sim.devices import SimulatedRig
 from rigd.sim.wire.control import ControlSocket, ask
 from rigd.sim.wire.faults import Fault, FaultError, parse_fault
@@ -77,6 +83,12 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
             f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): there is "
             "nothing to put on the wire. Its devices are simulated within a session already."
         )
+    if options.lock_step and rig.ati_serial is not None and not _in_same_tick(rig):
+        raise DeviceError(
+            f"The profile {rig.name} takes the replies of the previous tick, and its sensor "
+            "streams: in lock-step nothing tells which records belong to which tick. Leave out "
+            "--lock-step, or take acquisition.mode same_tick."
+        )
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
     with ExitStack() as stack:
@@ -125,7 +137,7 @@ def without_transport(rig: RigParameters) -> RigParameters:
     DeviceError
         If the profile states less than the exchange takes.
     """
-    if rig.acquisition is None or rig.acquisition.mode == "same_tick":
+    if _in_same_tick(rig):
         return rig
     period_s = 1 / rig.rate_hz
     for name, delay_s in (("encoder", rig.encoder.delay_s), ("sensor", rig.sensor.delay_s)):
@@ -192,8 +204,8 @@ class _Process:
         )
         for line in self._invitation():
             self._log.tell(line)
-        path = announce(self._rig.name, self._address)
-        self._stack.callback(path.unlink, missing_ok=True)
+        announce(self._rig.name, self._address)
+        self._stack.callback(forget, self._rig.name)
         # Set-up leaves objects that never go: no need to look through them again and again.
         gc.collect()
         gc.freeze()
@@ -242,7 +254,16 @@ class _Process:
             cut=self._cut,
             log=self._log,
         )
-        drive = DriveNode(rig, simulated, world.step, world.can_port("drive"), self._log)
+        assert rig.cia402 is not None
+        drive = DriveNode(
+            rig,
+            simulated,
+            world.step,
+            world.can_port("drive"),
+            self._log,
+            # How long a drive bears silence is not known: as long as its heartbeat may stay away.
+            sync_timeout_s=rig.cia402.heartbeat_timeout_s,
+        )
         world.join("drive", drive)
         if rig.ati_serial is not None:
             from rigd.sim.wire.ati_serial_device import AtiSerialDevice
@@ -309,6 +330,10 @@ class _Process:
         return {"error": "A request has to be 'inject' or 'status'."}
 
 
+def _in_same_tick(rig: RigParameters) -> bool:
+    return rig.acquisition is None or rig.acquisition.mode == "same_tick"
+
+
 def _nowhere(data: bytes) -> None:
     """Take what a rig without a serial line never writes."""
 
@@ -336,7 +361,7 @@ def _only_one(rig_name: str) -> Iterator[None]:
                 "use that one."
             ) from None
         # What a dead one left must go first: it names the sockets that are about to live again.
-        (folder / f"{rig_name}.json").unlink(missing_ok=True)
+        forget(rig_name)
         yield
 
 

@@ -245,8 +245,8 @@ class ScriptedDrive(threading.Thread):
         command, index, sub = struct.unpack_from("<BHB", data)
         reply = struct.pack("<HB", index, sub)
         abort = self.refuse.get((index, sub))
-        readable = (index, sub) in self.objects or index in (0x1008, 0x6041, 0x6061)
-        if command >> 5 == 3:  # segment of the name
+        readable = (index, sub) in self.objects or index in (0x1008, 0x100A, 0x6041, 0x6061)
+        if command >> 5 == 3:  # segment of a text
             toggle, part, self._rest = command & 0x10, self._rest[:7], self._rest[7:]
             head = toggle | (7 - len(part)) << 1 | (not self._rest)
             self.send(0x580 + NODE, bytes([head]) + part.ljust(7, b"\0"))
@@ -255,8 +255,8 @@ class ScriptedDrive(threading.Thread):
         elif abort or not readable:
             code = struct.pack("<I", abort or 0x06020000)
             self.send(0x580 + NODE, b"\x80" + reply + code)
-        elif command == 0x40 and index == 0x1008:
-            self._rest = self._told_name
+        elif command == 0x40 and index in (0x1008, 0x100A):
+            self._rest = self._told_name if index == 0x1008 else b"V2.10 beta"
             size = struct.pack("<I", len(self._rest))
             self.send(0x580 + NODE, b"\x41" + reply + size)
         elif command == 0x40:

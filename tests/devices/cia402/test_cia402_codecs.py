@@ -204,7 +204,7 @@ def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
                                *((0x1600, sub) for sub in (1, 2)),
                                *((0x1A00, sub) for sub in (1, 2, 3))],
         datatypes.INTEGER32: [(0x6064, 0)],
-        datatypes.VISIBLE_STRING: [(0x1008, 0)],
+        datatypes.VISIBLE_STRING: [(0x1008, 0), (0x100A, 0)],
     }  # fmt: skip
     for kind, places in types.items():
         for index, sub in places:

@@ -116,6 +116,7 @@ def test_who_the_drive_is(drive):
         "revision": 0x10002,
         "serial_number": 77,
         "device_name": "SCRIPTED DRIVE",
+        "software_version": "V2.10 beta",
         "supported_modes": 0x3ED,
         "rated_torque_counts": 5,
         "rated_torque_nm": pytest.approx(0.5),
@@ -124,9 +125,11 @@ def test_who_the_drive_is(drive):
 
 def test_a_drive_without_name_and_serial_number(drive, scripted):
     scripted.refuse[0x1008, 0] = 0x06020000
+    scripted.refuse[0x100A, 0] = 0x06020000
     scripted.refuse[0x1018, 4] = 0x06090011
     drive.connect()
     assert drive.identity()["device_name"] == ""
+    assert drive.identity()["software_version"] == ""
     assert drive.identity()["serial_number"] is None
 
 
