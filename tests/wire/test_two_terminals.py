@@ -28,6 +28,27 @@ PATIENT = (
 )
 
 
+def _recording(folder: Path, within_s: float = 20.0) -> bool:
+    """Wait until a session is being recorded in a folder and has its first samples."""
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        if any(part.stat().st_size > 100_000 for part in folder.glob("sessions/*.part")):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def _control_process(supervisor: int) -> int:
+    """Return the process that talks to the devices."""
+    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
+    (control,) = (
+        int(child)
+        for child in children
+        if b"rigd.engine.control" in Path(f"/proc/{child}/cmdline").read_bytes()
+    )
+    return control
+
+
 @pytest.fixture
 def run_chirp(tmp_path):
     def run(profile, *options):
@@ -43,6 +64,30 @@ def run_chirp(tmp_path):
         )
 
     return run
+
+
+@pytest.fixture
+def start_chirp(tmp_path):
+    """Start the paper's chirp and leave it running."""
+    started = []
+
+    def start(profile):
+        started.append(
+            subprocess.Popen(
+                [RIGD, "run", "chirp", "--profile", str(profile), "--json"],
+                cwd=tmp_path,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,  # a process group of its own, as in a terminal
+            )
+        )
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
@@ -89,26 +134,16 @@ def test_a_chirp_through_the_wires_is_recorded_whole(
     assert not said.of("emergency")
 
 
-def test_ctrl_c_stops_the_motor_over_the_wire(quiet_profile, start_simulator, drive_log, tmp_path):
+def test_ctrl_c_stops_the_motor_over_the_wire(
+    quiet_profile, start_simulator, start_chirp, drive_log, tmp_path
+):
     profile = quiet_profile("antenna_can", *PATIENT)
     log = tmp_path / "drive.jsonl"
     simulator = start_simulator(profile, "--log", log)
-    running = subprocess.Popen(
-        [RIGD, "run", "chirp", "--profile", profile, "--json"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ,
-        start_new_session=True,
-    )
-    try:
-        assert _recording(tmp_path)
-        os.killpg(running.pid, signal.SIGINT)
-        out, err = running.communicate(timeout=20)
-    finally:
-        running.kill()
-        running.wait()
+    running = start_chirp(profile)
+    assert _recording(tmp_path)
+    os.killpg(running.pid, signal.SIGINT)
+    out, err = running.communicate(timeout=20)
     assert running.returncode == 130, err
     (counts,) = json.loads(out)["sessions"]
     assert counts["outcome"] == "stopped"
@@ -120,16 +155,6 @@ def test_ctrl_c_stops_the_motor_over_the_wire(quiet_profile, start_simulator, dr
     said = drive_log(log)
     assert (said.last_torque["enabled"], said.last_torque["torque_nm"]) == (False, 0.0)
     assert not said.of("emergency")
-
-
-def _recording(folder: Path, within_s: float = 20.0) -> bool:
-    """Wait until a session is being recorded in a folder and has its first samples."""
-    deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline:
-        if any(part.stat().st_size > 100_000 for part in folder.glob("sessions/*.part")):
-            return True
-        time.sleep(0.02)
-    return False
 
 
 def test_without_hardware_and_simulator_the_message_says_what_to_do(
@@ -155,3 +180,34 @@ def test_real_time_cannot_be_skipped_unless_in_lock_step(
     done = run_chirp(profile, "--seed", "3")
     assert done.returncode == 2
     assert "--seed: the noise of rigd simulate" in done.stderr
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_without_the_loop_the_drive_goes_off_by_itself(
+    how, quiet_profile, start_simulator, start_chirp, drive_log, tmp_path
+):
+    patient = [change for change in PATIENT if "\nheartbeat_timeout_s" not in change[0]]
+    timeout = ("\nheartbeat_timeout_s = { value = 0.05", "\nheartbeat_timeout_s = { value = 0.3")
+    profile = quiet_profile("antenna_can", *patient, timeout)
+    log = tmp_path / "drive.jsonl"
+    simulator = start_simulator(profile, "--log", log)
+    running = start_chirp(profile)
+    assert _recording(tmp_path)
+    os.kill(_control_process(running.pid), how)
+    deadline = time.monotonic() + 10.0
+    while not any(e["code"] == 0x8130 for e in drive_log(log).of("emcy")):
+        assert time.monotonic() < deadline, "the drive does not miss the loop"
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)  # the supervisor kills a process that does not answer
+    running.communicate(timeout=30)
+    simulator.send_signal(signal.SIGTERM)
+    assert simulator.wait(10.0) == 0
+
+    said = drive_log(log)
+    end = said.last_torque
+    assert (end["enabled"], end["torque_nm"]) == (False, 0.0)
+    (lost,) = [e for e in said.of("emcy") if e["code"] == 0x8130]
+    assert end["t_s"] == pytest.approx(lost["t_s"], abs=2e-3)
+    # The last command of the loop came with a SYNC, the last heartbeat up to 10 ms before it.
+    last_told = said.of("torque")[-2]
+    assert end["t_s"] - last_told["t_s"] <= 0.3 + 2e-3

@@ -1,0 +1,75 @@
+"""Which rig is opened: the hardware, the simulated one that stands in for it, or neither."""
+
+import os
+import socket
+from dataclasses import replace
+
+import pytest
+
+from rigd.devices import wired_rig
+from rigd.devices.contracts import DeviceError
+from rigd.devices.registry import Reality, open_devices, reality
+from rigd.devices.simulator import SimulatorAddress, announce
+from rigd.profile import load_profile
+
+
+@pytest.fixture
+def rig():
+    return load_profile("antenna_can").rig
+
+
+@pytest.fixture
+def stand_in(runtime_folder):
+    """Announce a simulated rig whose control socket answers, and nothing more."""
+    path = str(runtime_folder / "control")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(path)
+        listener.listen(8)
+        yield lambda name, **more: announce(name, SimulatorAddress(os.getpid(), path, **more))
+
+
+def test_what_would_move(rig, stand_in):
+    assert reality(load_profile("sim").rig) is Reality.SIMULATED
+    assert reality(rig) is Reality.HARDWARE
+    stand_in("another_rig")
+    assert reality(rig) is Reality.HARDWARE
+    stand_in(rig.name)
+    assert reality(rig) is Reality.SIMULATOR
+    stand_in(rig.name, lock_step=True)
+    assert reality(rig) is Reality.LOCK_STEP
+
+
+def test_only_where_nothing_waits_for_the_clock_may_time_be_skipped():
+    assert {each for each in Reality if each.any_clock} == {Reality.SIMULATED, Reality.LOCK_STEP}
+
+
+def test_devices_say_whether_they_are_simulated(rig, stand_in):
+    assert not open_devices(rig).simulated
+    stand_in(rig.name, can_socket="/nowhere")
+    assert open_devices(rig).simulated
+
+
+def test_colliding_identifiers_are_refused_before_anything_is_sent(rig, runtime_folder):
+    colliding = replace(rig, ati_can=replace(rig.ati_can, base_id=0x20))
+    with pytest.raises(DeviceError, match=r"0x201"):
+        open_devices(colliding)
+
+
+def test_hardware_beside_a_simulated_rig_is_refused(rig, stand_in, tmp_path, monkeypatch):
+    stand_in(rig.name, can_socket="/nowhere")
+    monkeypatch.setattr(wired_rig, "_INTERFACES", tmp_path)
+    assert open_devices(rig).simulated
+    (tmp_path / "can0").mkdir()
+    with pytest.raises(DeviceError, match=r"is running .* and the CAN interface can0 of the real"):
+        open_devices(rig)
+
+
+def test_a_serial_port_beside_a_simulated_one_is_refused(stand_in, tmp_path):
+    rig = load_profile("antenna_serial").rig
+    port = tmp_path / "ttyUSB0"
+    rig = replace(rig, ati_serial=replace(rig.ati_serial, port=str(port)))
+    stand_in(rig.name, can_socket="/nowhere", serial_port="/dev/null")
+    assert open_devices(rig).simulated
+    port.touch()
+    with pytest.raises(DeviceError, match=r"the serial port .*ttyUSB0 of the real one"):
+        open_devices(rig)
