@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check bench fuzz clean
 
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
@@ -22,6 +22,13 @@ check: $(VENV)/ready
 
 bench: $(VENV)/ready
 	for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
+
+# The long run of what the tests do briefly: a million frames at each parser, some minutes.
+fuzz: $(VENV)/ready
+	$(BIN)/python tests/devices/cia402/fuzz_cia402.py 1000000
+	$(BIN)/python tests/devices/ati/fuzz_ati.py 1000000
+	$(BIN)/python tests/sim/wire/drive/fuzz_drive_node.py 1000000
+	$(BIN)/python tests/sim/wire/ati/fuzz_ati_nodes.py 1000000
 
 $(VENV)/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "rigd needs Python 3.11 or newer; set PYTHON=/path/to/it")'
