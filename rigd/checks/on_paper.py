@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from rigd.checks.rows import Row, Verdict, grade
+from rigd.devices.ati.stream import RECORD_BITS
 from rigd.devices.canbus.identifiers import check_identifiers
 from rigd.devices.canbus.load import BusLoad, bus_load
 from rigd.devices.parameters import AtiSerial, RigParameters
@@ -12,9 +13,6 @@ MAX_LOAD = 0.9
 """Of a bus or line, with the most stuffed bits: above, a frame may miss its period."""
 HIGH_LOAD = 0.7
 """Above, one more device does not fit, nor do repeated frames after a disturbance."""
-
-# A record of the Digital F/T's stream: 13 bytes of 8 data bits, parity, start and stop.
-_RECORD_BITS = 13 * 11
 
 
 def profile_rows(profile: Profile) -> Iterator[Row]:
@@ -59,7 +57,7 @@ def _bus_row(load: BusLoad, bitrate_bit_s: int) -> Row:
 
 
 def _line_row(serial: AtiSerial) -> Row:
-    load = _RECORD_BITS * serial.stream_hz / serial.baud
+    load = RECORD_BITS * serial.stream_hz / serial.baud
     return Row(
         "serial line",
         "load",

@@ -3,25 +3,20 @@
 import json
 import os
 import signal
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
+from rigd.cli.options import AsJson, ProfileName, profile_named
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
 
-ProfileName = Annotated[
-    str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
-]
-
 
 def check(
     profile: ProfileName = "sim",
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Write one JSON document to standard output.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check everything that can be checked without a torque: profile, buses, devices, loop.
 
@@ -30,7 +25,7 @@ def check(
     Example: rigd check --profile antenna_can
     """
     _end_as_by_ctrl_c()
-    rig_profile = _load(profile)
+    rig_profile = _openable_profile(profile)
     from rigd.checks import overall
     from rigd.checks.rig import check_rig
 
@@ -53,7 +48,7 @@ def reset(profile: ProfileName = "sim") -> None:
     Example: rigd reset --profile antenna_can
     """
     _end_as_by_ctrl_c()
-    rig_profile = _load(profile)
+    rig_profile = _openable_profile(profile)
     from rigd.checks.reset import reset_drive
     from rigd.devices.contracts import DeviceError
 
@@ -63,17 +58,17 @@ def reset(profile: ProfileName = "sim") -> None:
         fail(str(error), EXIT_FAILED)
 
 
-def _load(name: str) -> "Profile":
+def _openable_profile(name: str) -> "Profile":
+    """Load a profile whose devices this installation can open; any other ends the command."""
     from rigd.engine.process import SINGLE_THREADED
 
     os.environ.update(SINGLE_THREADED)
     from rigd.devices.registry import UnknownDeviceError, check_selection
-    from rigd.profile import ProfileError, load_profile
 
+    profile = profile_named(name)
     try:
-        profile = load_profile(name)
         check_selection(profile.rig.devices)
-    except (ProfileError, UnknownDeviceError) as error:
+    except UnknownDeviceError as error:
         fail(str(error), EXIT_WRONG_USE)
     return profile
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
+from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed, profile_named
 from rigd.cli.start import start_crew
 
 if TYPE_CHECKING:
@@ -34,12 +35,8 @@ def identify() -> None:
 
 @identify_app.command()
 def motor(
-    profile: Annotated[
-        str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
-    ] = "sim",
-    output: Annotated[Path, typer.Option("--output", help="Folder for the session files.")] = Path(
-        "sessions"
-    ),
+    profile: ProfileName = "sim",
+    output: Output = SESSIONS,
     torque_percent: Annotated[
         float,
         typer.Option("--torque-percent", help="Largest predicted torque, % of the rated torque."),
@@ -57,16 +54,9 @@ def motor(
             help="Estimate from a file recorded before, and move nothing; once for each file.",
         ),
     ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, help="Of a simulated rig's noise (default: the profile's)."),
-    ] = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="Do not wait for real time (simulated rigs only).")
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Write one JSON document to standard output.")
-    ] = False,
+    seed: Seed = None,
+    fast: Fast = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure inertia, friction, torque constant and delay of the motor, with deviations.
 
@@ -169,19 +159,16 @@ def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Pro
     from rigd.identification.motor_estimate import EstimateError, estimate_motor
     from rigd.identification.proposal import propose
     from rigd.identification.records import read_recording
-    from rigd.profile import ProfileError, load_profile
     from rigd.session import SessionError
 
+    profile = profile_named(profile_name)
     try:
-        profile = load_profile(profile_name)
         recording = read_recording(files, profile.rig.actuation.delay_s)
         estimate = estimate_motor(
             recording.windows,
             recording.timing,
             tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
         )
-    except ProfileError as error:
-        fail(str(error), EXIT_WRONG_USE)
     except (SessionError, EstimateError) as error:
         fail(str(error), EXIT_FAILED)
     return estimate, propose(estimate, profile, unusable=recording.unusable)

@@ -7,13 +7,12 @@ from typing import Annotated
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, fail
+from rigd.cli.options import AsJson
 
 
 def info(
     path: Annotated[Path, typer.Argument(metavar="FILE", readable=False, help="A session file.")],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Write one JSON document to standard output.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say what is in a session file.
 

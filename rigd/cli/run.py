@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
+from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed
 from rigd.cli.start import start_crew
 
 if TYPE_CHECKING:
@@ -53,30 +54,19 @@ def excitation_command(build: Build) -> Build:
 
 def run_sessions(
     build: Callable[[float], "Excitation"],
-    profile: Annotated[
-        str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
-    ] = "sim",
-    output: Annotated[Path, typer.Option("--output", help="Folder for the session files.")] = Path(
-        "sessions"
-    ),
+    profile: ProfileName = "sim",
+    output: Output = SESSIONS,
     repeat: Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")] = 1,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, help="Of a simulated rig's noise (default: the profile's)."),
-    ] = None,
+    seed: Seed = None,
     operator: Annotated[str, typer.Option("--operator", help="Goes into the file.")] = "",
     specimen: Annotated[str, typer.Option("--specimen", help="Goes into the file.")] = "",
     note: Annotated[str, typer.Option("--note", help="Goes into the file.")] = "",
-    fast: Annotated[
-        bool, typer.Option("--fast", help="Do not wait for real time (simulated rigs only).")
-    ] = False,
+    fast: Fast = False,
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Annotated[
         bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
     ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Write one JSON document to standard output.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
     notes = {"operator": operator, "specimen": specimen, "note": note}

@@ -1,15 +1,12 @@
 """``rigd simulate`` and ``rigd inject``: the simulated rig on the wire, and its faults."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
-
-ProfileName = Annotated[
-    str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
-]
+from rigd.cli.options import ProfileName, profile_named
 
 
 def simulate(
@@ -47,7 +44,7 @@ def simulate(
             faults=tuple(simulator.parse_fault(spec) for spec in fault or ()),
             quiet=quiet,
         )
-        code = simulator.run_simulator(_load(profile).rig, options)
+        code = simulator.run_simulator(profile_named(profile).rig, options)
     except simulator.FaultError as error:
         fail(str(error), EXIT_WRONG_USE)
     except simulator.DeviceError as error:
@@ -85,16 +82,7 @@ def inject(
 
     simulator = registry.simulator()
     try:
-        lines = simulator.inject(_load(profile).rig.name, fault or [])
+        lines = simulator.inject(profile_named(profile).rig.name, fault or [])
     except simulator.DeviceError as error:
         fail(str(error), EXIT_FAILED)
     typer.echo("\n".join(lines))
-
-
-def _load(profile: str) -> Any:  # noqa: ANN401 - a Profile, imported late
-    from rigd.profile import ProfileError, load_profile
-
-    try:
-        return load_profile(profile)
-    except ProfileError as error:
-        fail(str(error), EXIT_WRONG_USE)

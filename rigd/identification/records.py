@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from rigd.identification.experiments import TOP_HZ, lay_out_passes, read_layout
-from rigd.identification.motor_estimate import EstimateError, Timing, Window
+from rigd.identification.motor_estimate import EstimateError, Window
+from rigd.identification.motor_moments import Timing
 from rigd.session import Session, Status, read_session
 
 _USELESS = int(

@@ -21,7 +21,8 @@ from rigd.identification.experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.identification.motor_estimate import Timing, Window, estimate_motor
+from rigd.identification.motor_estimate import Window, estimate_motor
+from rigd.identification.motor_moments import Timing
 from rigd.identification.tuning import cautious, tuned
 from rigd.profile import load_profile
 from rigd.safety import LimitWatch

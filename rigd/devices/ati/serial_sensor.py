@@ -1,4 +1,4 @@
-"""A Digital F/T sensor on a serial line, streaming: set up over Modbus, then read record by record.
+"""A Digital F/T sensor on a serial line, streaming: set up, then read record by record.
 
 The sensor streams several records for each tick of the loop. The profile's decimating filter and
 the calibration are one matrix, applied to the newest records in one product.
@@ -7,38 +7,19 @@ the calibration are one matrix, applied to the newest records in one product.
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from itertools import chain
 from struct import Struct
 
 import numpy as np
 
-from rigd.devices.ati import modbus
-from rigd.devices.ati.calibration import same_serial_number
-from rigd.devices.ati.calibration_block import (
-    BLOCK_REGISTERS,
-    CalibrationBlock,
-    first_register,
-    parse_block,
-)
+from rigd.devices.ati.calibration_block import CalibrationBlock
 from rigd.devices.ati.serial_line import SerialLine
+from rigd.devices.ati.serial_setup import SILENCE_S, SerialSetup
 from rigd.devices.ati.status import SERIAL_CRITICAL, serial_status
-from rigd.devices.ati.stream import ERROR_BIT, RECORD_SIZE, RecordStream
+from rigd.devices.ati.stream import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
 from rigd.devices.contracts import DeviceError, Wrench
 from rigd.devices.parameters import RigParameters
 from rigd.devices.simulator import SimulatorAddress
 
-BITS_PER_BYTE = 11
-"""On the line: start, eight, parity, stop."""
-
-# Anything sent while the sensor streams stops it; other drivers send 14 bytes.
-_JAM = bytes(range(1, 15))
-_JAM_TRIES = 3
-_QUIET_S = 0.05
-_DRAIN_LIMIT_S = 0.5
-_REPLY_TIMEOUT_S = 0.3
-_TRIES = 3
-# Modbus: a frame is over when the line has been silent for this long.
-_SILENCE_S = 0.002
 _FIRST_RECORDS_TIMEOUT_S = 0.5
 # The error bit is not covered by the checksum; one flipped bit must not end a session.
 _ERRORS_IN_A_ROW = 7
@@ -130,14 +111,15 @@ class AtiSerialSensor:
         self._check_line_rate()
         self._line = SerialLine(self._port, self._settings.baud, self._name)
         try:
-            self._stop_streaming()
-            self._check_status()
-            self._block = self._read_block()
-            self._load_amplifiers(self._block)
-            self._check_status()
+            setup = SerialSetup(self._line, self._settings, self._name)
+            setup.stop_streaming()
+            self._check_status(setup)
+            self._block = setup.read_block()
+            setup.load_amplifiers(self._block)
+            self._check_status(setup)
             rows = self._block.calibration.wrench_per_wire_count()
             self._operator = np.kron(np.array(self._weights), np.array(rows))
-            self._start_streaming()
+            self._start_streaming(setup)
         except BaseException:
             self._release()
             raise
@@ -247,8 +229,9 @@ class AtiSerialSensor:
         """Stop the stream, ask the status word once more, and release the port. Never raises."""
         if self._line is not None:
             with suppress(DeviceError):
-                self._stop_streaming()
-                self.status = serial_status(self._read_status())
+                setup = SerialSetup(self._line, self._settings, self._name)
+                setup.stop_streaming()
+                self.status = serial_status(setup.read_status())
         self._release()
 
     def _release(self) -> None:
@@ -305,7 +288,7 @@ class AtiSerialSensor:
 
     def _check_line_rate(self) -> None:
         settings = self._settings
-        needed = settings.stream_hz * RECORD_SIZE * BITS_PER_BYTE
+        needed = settings.stream_hz * RECORD_BITS
         if needed > settings.baud:
             raise DeviceError(
                 f"{self._name}: {settings.stream_hz:g} records a second need {needed:.0f} bit/s "
@@ -318,50 +301,8 @@ class AtiSerialSensor:
                 f"loop's {self._rate_hz:g} ticks; change ati_serial.stream_hz or rate_hz."
             )
 
-    def _stop_streaming(self) -> None:
-        line = self._open_line()
-        for _ in range(_JAM_TRIES):
-            line.write(_JAM)
-            if line.drain(_QUIET_S, _DRAIN_LIMIT_S):
-                return
-        raise DeviceError(
-            f"{self._name}: it goes on sending although it was told to stop; switch it off and on, "
-            "and check that no other device is on this line."
-        )
-
-    def _ask(self, request: bytes, what: str) -> bytes:
-        """Return what the reply to a request holds; disturbed ones are asked for again."""
-        line, problem = self._open_line(), ""
-        for _ in range(_TRIES):
-            time.sleep(_SILENCE_S)
-            length = modbus.reply_length(request)
-            try:
-                return modbus.content_of(request, line.transact(request, length, _REPLY_TIMEOUT_S))
-            except modbus.Refused as error:
-                raise DeviceError(
-                    f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
-                    "Digital F/T sensor, and ati_serial.calibration."
-                ) from None
-            except modbus.BadReply as error:
-                problem = str(error)
-        raise DeviceError(
-            f"{self._name}: asked to {what}, it gave no usable reply in {_TRIES} tries: {problem}. "
-            "Check power, cable (A and B swapped?), ati_serial.port and ati_serial.baud."
-        )
-
-    def _read(self, first: int, count: int, what: str) -> tuple[int, ...]:
-        registers: tuple[int, ...] = ()
-        while len(registers) < count:
-            piece = min(modbus.MAX_REGISTERS, count - len(registers))
-            request = modbus.read_registers(first + len(registers), piece)
-            registers += modbus.registers_of(self._ask(request, what))
-        return registers
-
-    def _read_status(self) -> int:
-        return self._read(modbus.STATUS_WORD, 1, "tell its status")[0]
-
-    def _check_status(self) -> None:
-        word = self._read_status()
+    def _check_status(self, setup: SerialSetup) -> None:
+        word = setup.read_status()
         self.status = serial_status(word)
         if word & SERIAL_CRITICAL:
             raise DeviceError(
@@ -370,56 +311,14 @@ class AtiSerialSensor:
                 "properly: look at sensor, cable and supply."
             )
 
-    def _read_block(self) -> CalibrationBlock:
-        number, wanted = self._settings.calibration, self._settings.serial_number
-        what = f"read out calibration {number}"
-        registers = self._read(first_register(number), BLOCK_REGISTERS, what)
-        try:
-            block = parse_block(registers)
-        except ValueError as error:
-            raise DeviceError(f"{self._name}, ati_serial.calibration {number}: {error}") from None
-        found = block.calibration.serial_number
-        if not same_serial_number(wanted, found):
-            raise DeviceError(
-                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
-                f"for {wanted} (ati_serial.serial_number). Check which sensor is on the rig."
-            )
-        return block
-
-    def _load_amplifiers(self, block: CalibrationBlock) -> None:
-        """Make the amplifiers' settings those that the calibration was done with."""
-        self._ask(modbus.UNLOCK, "unlock its memory")
-        try:
-            for first, values in (
-                (modbus.ACTIVE_GAINS, block.gains),
-                (modbus.ACTIVE_OFFSETS, block.offsets),
-            ):
-                self._ask(modbus.write_registers(first, values), "load gains and offsets")
-        finally:
-            self._ask(modbus.LOCK, "lock its memory")
-        written = tuple(chain(block.gains, block.offsets))
-        active = self._read(modbus.ACTIVE_GAINS, len(written), "tell its gains and offsets")
-        if active != written:
-            raise DeviceError(
-                f"{self._name}: gains and offsets read back as {active}, where {written} were "
-                "written. Switch it off and on; without them its calibration does not hold."
-            )
-
-    def _start_streaming(self) -> None:
-        line, request = self._open_line(), modbus.START_STREAMING
-        time.sleep(_SILENCE_S)
-        length = modbus.reply_length(request)
-        reply = line.transact(request, length, _REPLY_TIMEOUT_S)
-        try:
-            # The first records may be behind the reply already.
-            modbus.content_of(request, reply[:length])
-        except ValueError as error:
-            raise DeviceError(f"{self._name}: it does not start streaming: {error}.") from None
+    def _start_streaming(self, setup: SerialSetup) -> None:
+        line = self._open_line()
+        begun = setup.start_streaming()
         self._history = b""
         self._errors_in_a_row = 0
         self.stream.start(aligned=True)
         before, first = self._arrived, self.stream.records
-        self._take(reply[length:])
+        self._take(begun)
         end_ns = time.monotonic_ns() + int(_FIRST_RECORDS_TIMEOUT_S * 1e9)
         # A simulated rig in lock-step sends the first records with the first tick.
         while not self._lock_step and self.stream.records - first < len(self._weights):
@@ -430,7 +329,7 @@ class AtiSerialSensor:
                     f"only {self.stream.records - first} were sound records. Check cable, "
                     "ati_serial.baud and ati_serial.stream_hz."
                 )
-            line.wait(_SILENCE_S)
+            line.wait(SILENCE_S)
             self._take(line.read())
         if self._history:
             # What stands where the first tick finds no new records.

@@ -6,25 +6,19 @@ Sources: devices.md 1.1 for NETCANOEM and 2.1 for Digital F/T. They differ in bi
 CAN_BAD_CALIBRATION = 0x0040
 CAN_BUS_ERROR = 0x4000
 
-_WATCHDOG = "its watchdog has reset the board"
-_EXCITATION_HIGH = "the gauges' excitation is too high"
-_EXCITATION_LOW = "the gauges' excitation is too low"
-_GROUND = "its artificial analogue ground is out of range"
-_SUPPLY_HIGH = "its supply voltage is too high"
-_SUPPLY_LOW = "its supply voltage is too low"
-_MEMORY = "its memory (EEPROM) has failed"
-_CONFIGURATION = "its configuration is invalid"
-
+_COMMON_WORDS = {
+    0: "its watchdog has reset the board",
+    1: "the gauges' excitation is too high",
+    2: "the gauges' excitation is too low",
+    3: "its artificial analogue ground is out of range",
+    4: "its supply voltage is too high",
+    5: "its supply voltage is too low",
+    7: "its memory (EEPROM) has failed",
+    8: "its configuration is invalid",
+}
 _CAN_WORDS = {
-    0: _WATCHDOG,
-    1: _EXCITATION_HIGH,
-    2: _EXCITATION_LOW,
-    3: _GROUND,
-    4: _SUPPLY_HIGH,
-    5: _SUPPLY_LOW,
+    **_COMMON_WORDS,
     6: "the active calibration is bad",
-    7: _MEMORY,
-    8: _CONFIGURATION,
     11: "the sensor is too hot",
     12: "the sensor is too cold",
     14: "it has seen errors on the CAN bus",
@@ -33,14 +27,7 @@ CAN_CRITICAL = 0x18FE
 """Bits 1 to 7, 11 and 12."""
 
 _SERIAL_WORDS = {
-    0: _WATCHDOG,
-    1: _EXCITATION_HIGH,
-    2: _EXCITATION_LOW,
-    3: _GROUND,
-    4: _SUPPLY_HIGH,
-    5: _SUPPLY_LOW,
-    7: _MEMORY,
-    8: _CONFIGURATION,
+    **_COMMON_WORDS,
     9: "the bridges take too much current (broken gauge or cable)",
     10: "the bridges take too little current (broken gauge or cable)",
     11: "the reading of its thermistor is too high",

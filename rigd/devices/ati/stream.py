@@ -13,6 +13,8 @@ rest are nearly alike, so that a false beginning that fits once may well fit aga
 """
 
 RECORD_SIZE = 13
+RECORD_BITS = RECORD_SIZE * 11
+"""On the line: each byte with start, parity and stop bit."""
 SYNC_RECORDS = 6
 """Records in a row that must fit. Less than come in a tick of 1 ms, so that one damaged record
 makes no tick go without any."""

@@ -14,7 +14,7 @@ from rigd.devices.cia402.frames import NodeFrames
 from rigd.devices.cia402.inbox import Inbox
 from rigd.devices.cia402.node import Node
 from rigd.devices.cia402.objects import HEARTBEAT_CONSUMER
-from rigd.devices.cia402.setup import reset_fault, set_up, torque_limit_per_mille
+from rigd.devices.cia402.setup import reset_fault, set_up
 from rigd.devices.cia402.states import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
@@ -26,6 +26,7 @@ from rigd.devices.cia402.states import (
     state_of,
 )
 from rigd.devices.cia402.switching import step_up, switch_off
+from rigd.devices.cia402.values import torque_limit_per_mille
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 

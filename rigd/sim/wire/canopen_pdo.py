@@ -87,6 +87,7 @@ class Pdo:
         self.size = 0
         self.entries: list[Entry] = []
         self._struct = Struct("<")
+        self.forget()
 
     def compile(self) -> None:
         """Get ready to carry what the dictionary says now."""
@@ -165,18 +166,6 @@ class ReceivePdo(Pdo):
 
     direction = "r"
 
-    def __init__(
-        self,
-        objects: ObjectDictionary,
-        communication: int,
-        mapping: int,
-        cob_id: int,
-        mapped: tuple[int, ...],
-        changed: Callable[[], None],
-    ) -> None:
-        super().__init__(objects, communication, mapping, cob_id, mapped, changed)
-        self.forget()
-
     def forget(self) -> None:
         """Drop what has been received."""
         self.pending: bytes | None = None
@@ -204,23 +193,10 @@ class TransmitPdo(Pdo):
 
     direction = "t"
 
-    def __init__(
-        self,
-        objects: ObjectDictionary,
-        communication: int,
-        mapping: int,
-        cob_id: int,
-        mapped: tuple[int, ...],
-        changed: Callable[[], None],
-    ) -> None:
-        super().__init__(objects, communication, mapping, cob_id, mapped, changed)
-        self._readers: list[Callable[[], int]] = []
-        self.forget()
-
     def compile(self) -> None:
         """Get ready to carry what the dictionary says now."""
         super().compile()
-        self._readers = [entry.live or entry.get for entry in self.entries]
+        self._readers: list[Callable[[], int]] = [entry.live or entry.get for entry in self.entries]
 
     def forget(self) -> None:
         """Start as on entering operational: every event is news."""

@@ -4,34 +4,27 @@ One thread, one loop: it waits for frames, for bytes of the serial line, and for
 The operator's commands come over the control socket.
 """
 
-import fcntl
 import gc
 import os
 import select
-import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
-from rigd.devices.simulator import (
-    SimulatorAddress,
-    announce,
-    find_simulator,
-    forget,
-    runtime_folder,
-)
+from rigd.devices.simulator import SimulatorAddress, announce, find_simulator, forget
 from rigd.sim.devices import SimulatedRig
 from rigd.sim.wire.control import ControlSocket, ask
 from rigd.sim.wire.faults import Fault, FaultError, parse_fault
 from rigd.sim.wire.hub import Handlers, Hub, VirtualCan, is_virtual
 from rigd.sim.wire.log import EventLog
+from rigd.sim.wire.lone_process import only_one, socket_folder, stop_requested
 from rigd.sim.wire.pty_line import PtyLine
+from rigd.sim.wire.transport import takes_same_tick, without_transport
 from rigd.sim.wire.world import World
 
 __all__ = [
@@ -43,10 +36,8 @@ __all__ = [
     "run_simulator",
 ]
 
-_LONGEST_SOCKET_NAME = 107
 _IDLE_S = 0.01
 """How often the loop looks up while nothing hurries."""
-_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +74,7 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
             f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): there is "
             "nothing to put on the wire. Its devices are simulated within a session already."
         )
-    if options.lock_step and rig.ati_serial is not None and not _in_same_tick(rig):
+    if options.lock_step and rig.ati_serial is not None and not takes_same_tick(rig):
         raise DeviceError(
             f"The profile {rig.name} takes the replies of the previous tick, and its sensor "
             "streams: in lock-step nothing tells which records belong to which tick. Leave out "
@@ -92,11 +83,11 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
     with ExitStack() as stack:
-        stack.enter_context(_only_one(rig.name))
+        stack.enter_context(only_one(rig.name))
         log = EventLog(options.log, quiet=options.quiet)
         stack.callback(log.close)
         process = _Process(rig, options, log, stack)
-        stop = stack.enter_context(_stop_requested())
+        stop = stack.enter_context(stop_requested())
         process.start()
         process.serve(stop)
     return 0
@@ -126,34 +117,6 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     return [str(ask(address, {"inject": spec})["injected"]) for spec in specs]
 
 
-def without_transport(rig: RigParameters) -> RigParameters:
-    """Return the rig with the delays that are left to simulate behind the wire.
-
-    With replies taken a tick later the exchange itself brings one period of what the profile
-    states; the decimating filter's delay is seen to by :class:`rigd.sim.devices.SimulatedRig`.
-
-    Raises
-    ------
-    DeviceError
-        If the profile states less than the exchange takes.
-    """
-    if _in_same_tick(rig):
-        return rig
-    period_s = 1 / rig.rate_hz
-    for name, delay_s in (("encoder", rig.encoder.delay_s), ("sensor", rig.sensor.delay_s)):
-        if delay_s < period_s * (1 - 1e-9):
-            raise DeviceError(
-                f"The profile {rig.name} has {name}.delay_s = {delay_s:g} s, but with "
-                f"acquisition.mode previous_tick values are at least one period old "
-                f"({period_s:g} s); correct one of the two."
-            )
-    return replace(
-        rig,
-        encoder=replace(rig.encoder, delay_s=max(0.0, rig.encoder.delay_s - period_s)),
-        sensor=replace(rig.sensor, delay_s=max(0.0, rig.sensor.delay_s - period_s)),
-    )
-
-
 class _Process:
     """The lines to the outside, and the loop that serves them."""
 
@@ -166,7 +129,7 @@ class _Process:
         self._log = log
         self._stack = stack
         self._handlers: Handlers = {}
-        folder = stack.enter_context(_socket_folder(rig.name))
+        folder = stack.enter_context(socket_folder(rig.name))
         self._bus: Hub | VirtualCan
         can_socket = ""
         if rig.can.interface == "socketcan" and is_virtual(rig.can.channel):
@@ -330,62 +293,5 @@ class _Process:
         return {"error": "A request has to be 'inject' or 'status'."}
 
 
-def _in_same_tick(rig: RigParameters) -> bool:
-    return rig.acquisition is None or rig.acquisition.mode == "same_tick"
-
-
 def _nowhere(data: bytes) -> None:
     """Take what a rig without a serial line never writes."""
-
-
-@contextmanager
-def _only_one(rig_name: str) -> Iterator[None]:
-    """Refuse to start beside another simulated rig of the same name."""
-    folder = runtime_folder()
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        lock = (folder / f"{rig_name}.lock").open("w")
-    except OSError as error:
-        raise DeviceError(
-            f"The simulated rig cannot use the folder {folder} ({error.strerror}); set "
-            "XDG_RUNTIME_DIR to one that is yours."
-        ) from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            running = find_simulator(rig_name)
-            who = "" if running is None else f" (process {running.pid})"
-            raise DeviceError(
-                f"A simulated rig of the profile {rig_name} runs already{who}; end it first, or "
-                "use that one."
-            ) from None
-        # What a dead one left must go first: it names the sockets that are about to live again.
-        forget(rig_name)
-        yield
-
-
-@contextmanager
-def _socket_folder(rig_name: str) -> Iterator[Path]:
-    """Make room for the sockets, whose names must be short."""
-    folder = runtime_folder()
-    if len(os.fsencode(folder / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
-        yield folder
-        return
-    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short:
-        yield Path(short)
-
-
-@contextmanager
-def _stop_requested() -> Iterator[Callable[[], bool]]:
-    """Say whether one of the signals that end the process has come; one ignored before stays so."""
-    requested: list[int] = []
-    before = {number: signal.getsignal(number) for number in _STOPPING}
-    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
-    for number in caught:
-        signal.signal(number, lambda got, _: requested.append(got))
-    try:
-        yield lambda: bool(requested)
-    finally:
-        for number in caught:
-            signal.signal(number, before[number])

@@ -40,9 +40,9 @@ def open_sensor(serial_rig, digital_ft):
 @pytest.fixture
 def quick(monkeypatch):
     """No long waits for replies that never come."""
-    monkeypatch.setattr("rigd.devices.ati.serial_sensor._REPLY_TIMEOUT_S", 0.02)
+    monkeypatch.setattr("rigd.devices.ati.serial_setup._REPLY_TIMEOUT_S", 0.02)
     monkeypatch.setattr("rigd.devices.ati.serial_sensor._FIRST_RECORDS_TIMEOUT_S", 0.05)
-    monkeypatch.setattr("rigd.devices.ati.serial_sensor._DRAIN_LIMIT_S", 0.1)
+    monkeypatch.setattr("rigd.devices.ati.serial_setup._DRAIN_LIMIT_S", 0.1)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from rigd.profile import load_profile
 from rigd.sim.wire.control import ControlSocket, ask
 from rigd.sim.wire.log import EventLog
 from rigd.sim.wire.pty_line import PtyLine
-from rigd.sim.wire.simulate import without_transport
+from rigd.sim.wire.transport import without_transport
 
 # The serial line
 

@@ -1,0 +1,36 @@
+"""Options that several commands have, and the profile that one of them names."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rigd.cli.exits import EXIT_WRONG_USE, fail
+
+if TYPE_CHECKING:
+    from rigd.profile import Profile
+
+ProfileName = Annotated[
+    str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
+]
+Output = Annotated[Path, typer.Option("--output", help="Folder for the session files.")]
+SESSIONS = Path("sessions")
+"""Where session files go unless told otherwise."""
+Seed = Annotated[
+    int | None,
+    typer.Option("--seed", min=0, help="Of a simulated rig's noise (default: the profile's)."),
+]
+Fast = Annotated[
+    bool, typer.Option("--fast", help="Do not wait for real time (simulated rigs only).")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Write one JSON document to standard output.")]
+
+
+def profile_named(name: str) -> "Profile":
+    """Load a profile; one that cannot be used ends the command."""
+    from rigd.profile import ProfileError, load_profile
+
+    try:
+        return load_profile(name)
+    except ProfileError as error:
+        fail(str(error), EXIT_WRONG_USE)

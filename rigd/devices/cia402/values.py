@@ -1,0 +1,49 @@
+"""Numbers of the profile in the units of the drive's objects."""
+
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
+
+_ROUNDING = 1e-9
+
+
+def sync_period_us(rate_hz: float) -> int:
+    """Return the period in whole microseconds, for object 1006.
+
+    Raises
+    ------
+    DeviceError
+        If it is none.
+    """
+    period_us = 1e6 / rate_hz
+    if abs(period_us - round(period_us)) > _ROUNDING * period_us:
+        raise DeviceError(
+            f"rig.rate_hz = {rate_hz:g} Hz: its period is no whole number of microseconds, which "
+            "a CANopen drive needs; choose another rate, such as 1000 Hz."
+        )
+    return round(period_us)
+
+
+def interpolation_time(rate_hz: float) -> tuple[int, int]:
+    """Return value (1 to 255) and power of ten in s of the period, for object 60C2.
+
+    Milliseconds come first: some drives take nothing else.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such pair.
+    """
+    for exponent in (-3, -4, -5, -6, -2, -1, 0):
+        value = 10.0**-exponent / rate_hz
+        if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING * value:
+            return round(value), exponent
+    raise DeviceError(
+        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "
+        "1 to 255 times a power of ten of a second); choose another rate, such as 1000 Hz."
+    )
+
+
+def torque_limit_per_mille(rig: RigParameters) -> int:
+    """Return the peak torque in 1/1000 of the rated torque, rounded down, within 16 bits."""
+    motor = rig.motor
+    return min(int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING), 32767)
