@@ -1,9 +1,7 @@
 """The drive on its bus: set-up, the exchange of every tick, its guards, enabling and disabling.
 
-What a tick cannot know: a TPDO does not say which SYNC it answers. Replies are counted. Where one
-did not come in time, the next tick wants two, and takes a single one for late; if no second comes
-before the SYNC after it, the missing one counts as lost. A reply that is late by more than a whole
-period every time would therefore be paired with the SYNC after its own; that is why
+A TPDO does not say which SYNC it answers: :mod:`rigd.devices.cia402.pairing` counts both. Replies
+that are all late by the same whole number of periods it cannot tell; that is why
 :meth:`Cia402Drive.connect` measures the delay of a reply to the first SYNC, which is alone.
 """
 
@@ -81,8 +79,6 @@ class Cia402Drive:
         self._may_be_on = False
         self._guard_mask, self._guard_value = FAULT_BIT, 0
         self._awaiting = False
-        # The SYNC before the last was not answered in time; its reply may still come.
-        self._overdue = False
         self._heard_ns = 0
         self._position = 0
         self._counts = 0
@@ -121,8 +117,8 @@ class Cia402Drive:
         self.angle_rad = 0.0
         self.angle_stale = False
         self.angle_time_ns = node.sync_ns
-        # That reply is of no tick.
-        self._awaiting = self._overdue = False
+        node.pairing.settle()  # that reply is of no tick
+        self._awaiting = False
         node.resume()
 
     def identity(self) -> dict[str, object]:
@@ -160,10 +156,10 @@ class Cia402Drive:
         self._enabled = True
         self._guard_mask = STATE_BITS | FOLLOWS_TARGET
         self._guard_value = ENABLED | FOLLOWS_TARGET
-        self._resume(node)
+        node.resume()
 
     def latch(self, due_ns: int) -> None:
-        """Send SYNC, on which the drive latches its angle, and the heartbeat when it is due.
+        """Send SYNC, on which the drive latches its angle.
 
         Parameters
         ----------
@@ -177,21 +173,16 @@ class Cia402Drive:
         """
         node = self._connected()
         if not self._same_tick:
-            if self._awaiting:
-                self._settle_previous(node)
-            else:
-                self.angle_stale = True
-        elif self._awaiting or self.angle_stale:
-            # A reply that comes before the next SYNC is sent is late, and nothing else.
-            node.exchange.drain()
-            self._overdue = not self._inbox.replies and (self._overdue or self._awaiting)
+            self._settle_previous(node)
         node.send_sync()
         self._awaiting = True
         node.now_ns = node.now_ns + node.period_ns if node.lock_step else due_ns
-        node.send_heartbeat()
 
     def read_angle(self) -> float:
         """Return the angle in rad at the output shaft, from the position at :meth:`connect`.
+
+        The heartbeat goes out here when it is due: sent with the SYNC it would come between that
+        and the sensor's request.
 
         Raises
         ------
@@ -199,10 +190,13 @@ class Cia402Drive:
             If the drive has reported a fault, has left the state it should be in, or is silent.
         """
         node = self._connected()
-        if self._same_tick and self._awaiting:
+        if self._awaiting:
             self._awaiting = False
-            node.exchange.wait_until(self._answered, node.sync_ns + node.deadline_ns)
-            self._settle(node)
+            if self._same_tick:
+                caught_up = node.pairing.has_caught_up
+                node.exchange.wait_until(caught_up, node.sync_ns + node.deadline_ns)
+                self._settle(node)
+            node.send_heartbeat()
         inbox = self._inbox
         if inbox.heard:
             inbox.heard = False
@@ -260,7 +254,7 @@ class Cia402Drive:
             return
         if switch_off(node):
             self._may_be_on = False
-        self._resume(node)
+        node.resume()
 
     def reset_fault(self) -> str | None:
         """Reset a fault, for the operator; the drive stays disabled and has to be connected anew.
@@ -312,32 +306,20 @@ class Cia402Drive:
         exchange.subscribe(self._frames.heartbeat_id, self._inbox.take_heartbeat)
         exchange.subscribe(self._frames.reply_id, self._inbox.take_reply)
 
-    def _resume(self, node: Node) -> None:
-        """Go on with the ticks after switching; the reply to its last SYNC has come, or is lost."""
-        node.resume()
-        self._awaiting = True
-        self._overdue = False
-
-    def _answered(self) -> bool:
-        return self._inbox.replies > self._overdue
-
     def _settle_previous(self, node: Node) -> None:
         """Take the reply to the SYNC of the tick before, which should have come by now."""
-        if node.lock_step:
-            node.exchange.wait_until(self._answered, node.sync_ns + node.deadline_ns)
+        if node.lock_step and node.pairing.owed:
+            node.exchange.wait_until(node.pairing.has_caught_up, node.sync_ns + node.deadline_ns)
         else:
             node.exchange.drain()
         self._settle(node)
 
     def _settle(self, node: Node) -> None:
         """Take the position if it is the reply to the last SYNC."""
-        inbox = self._inbox
-        fresh = inbox.replies > self._overdue
-        self._overdue = not inbox.replies
-        inbox.replies = 0
+        fresh = node.pairing.settle()
         self.angle_stale = not fresh
         if fresh:
-            position = inbox.position
+            position = self._inbox.position
             # The counter of 32 bits wraps around.
             self._counts += (position - self._position + _HALF_TURN & _ALL_COUNTS) - _HALF_TURN
             self._position = position

@@ -15,7 +15,7 @@ _TOGGLE_BIT = 0x80
 
 
 class Inbox:
-    """The drive's last words. A frame of the wrong length counts as one that has not come.
+    """The drive's last words. A frame of the wrong length changes nothing but counts.
 
     Parameters
     ----------
@@ -27,7 +27,9 @@ class Inbox:
     statusword, position
         Of the last TPDO; position in counts.
     replies : int
-        TPDOs since somebody set this to zero.
+        TPDOs since somebody set this to zero, whatever was in them.
+    legible : bool
+        The last TPDO had the right length.
     nmt_state : int or None
         Of the last heartbeat.
     heard : bool
@@ -49,6 +51,7 @@ class Inbox:
         "alarm",
         "emergency",
         "heard",
+        "legible",
         "malformed",
         "name",
         "nmt_state",
@@ -69,6 +72,7 @@ class Inbox:
         self.statusword = 0
         self.position = 0
         self.replies = 0
+        self.legible = False
         self.nmt_state: int | None = None
         self.heard = False
         self.watching = False
@@ -78,12 +82,13 @@ class Inbox:
 
     def take_tpdo(self, data: bytes) -> None:
         """Take statusword and position."""
+        self.replies += 1
         try:
             self.statusword, self.position, _ = unpack_tpdo(data)
+            self.legible = True
         except LengthError:
+            self.legible = False
             self.malformed += 1
-            return
-        self.replies += 1
 
     def take_emergency(self, data: bytes) -> None:
         """Take an emergency message; a code of zero only ends one."""

@@ -7,6 +7,7 @@ from math import ceil
 from rigd.devices.canbus import CanExchange
 from rigd.devices.cia402.frames import OPERATIONAL, NodeFrames, is_written
 from rigd.devices.cia402.inbox import Inbox
+from rigd.devices.cia402.pairing import ReplyPairing
 from rigd.devices.cia402.states import FAULT_BIT, state_of
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
@@ -36,6 +37,8 @@ class Node:
 
     Attributes
     ----------
+    pairing : ReplyPairing
+        Tells whether the last TPDO answers the last SYNC.
     lock_step : bool
         The drive is a simulated one whose time passes with the SYNCs: replies are waited for, and
         nothing is paced.
@@ -54,6 +57,7 @@ class Node:
         self.exchange = exchange
         self.frames = frames
         self.inbox = inbox
+        self.pairing = ReplyPairing(inbox)
         self.settings = rig.cia402
         self.rate_hz = rig.rate_hz
         self.period_ns = round(1e9 / rig.rate_hz)
@@ -126,8 +130,9 @@ class Node:
         )
 
     def send_sync(self) -> None:
-        """Send SYNC; replies are counted anew."""
-        self.inbox.replies = 0
+        """Send SYNC; what came before it is no answer to it."""
+        self.exchange.drain()
+        self.pairing.ask()
         self.sync_ns = time.monotonic_ns()
         self.exchange.send(self.frames.sync)
 

@@ -230,7 +230,8 @@ def test_handlers_take_anything(data, kind):
     getattr(inbox, f"take_{kind}")(data)
     valid = {"tpdo": len(data) == 8, "emergency": len(data) >= 3, "heartbeat": len(data) >= 1}
     assert inbox.malformed == (not valid.get(kind, True))
-    assert inbox.replies == (kind == "tpdo" and len(data) == 8)
+    assert inbox.replies == (kind == "tpdo")
+    assert inbox.legible == (kind == "tpdo" and len(data) == 8)
 
 
 def test_the_first_alarm_stays():
