@@ -10,7 +10,7 @@ from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
 from rigd.devices.parameters import RigParameters
 from rigd.devices.simulator import SimulatorAddress, find_simulator
 
-_LOCK_STEP_PATIENCE_US = 0.3e6
+_LOCK_STEP_PATIENCE_US = 0.5e6
 """In lock-step the world waits for the replies, so a tick can wait for them too."""
 
 _INTERFACES = Path("/sys/class/net")

@@ -88,6 +88,11 @@ def _drive(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _serial(values: Mapping[str, Any]) -> Iterator[str]:
+    if values["acquisition.mode"] != "same_tick":
+        yield (
+            'acquisition.mode = "previous_tick" does not go with [ati_serial]: a sensor that '
+            'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
+        )
     baud, stream_hz = values["ati_serial.baud"], values["ati_serial.stream_hz"]
     most_hz = baud / (_BITS_PER_BYTE * _BYTES_PER_RECORD)
     if stream_hz > most_hz:

@@ -14,8 +14,6 @@ import serial
 from rigd.devices.contracts import DeviceError
 
 _READ_SIZE = 65_536
-# The kernel hands out at most 4 kB at once; a shorter piece was the last.
-_PERHAPS_MORE = 1_024
 
 
 class SerialLine:
@@ -78,7 +76,7 @@ class SerialLine:
             If the line is gone.
         """
         data = b""
-        while True:
+        while True:  # a short piece need not be the last: the kernel moves bytes on as it is asked
             try:
                 piece = os.read(self._fd, _READ_SIZE)
             except BlockingIOError:
@@ -88,8 +86,6 @@ class SerialLine:
             if not piece:
                 raise self._gone("hung up")
             data = data + piece if data else piece
-            if len(piece) < _PERHAPS_MORE:
-                return data
 
     def write(self, data: bytes) -> None:
         """Send some bytes; so few that they always fit into the kernel's buffer.

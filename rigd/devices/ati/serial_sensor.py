@@ -25,6 +25,8 @@ _FIRST_RECORDS_TIMEOUT_S = 0.5
 _ERRORS_IN_A_ROW = 7
 # Unread for longer than this, the kernel's 4 kB may overflow at 91 kB/s and what is left is old.
 _IDLE_NS = 20_000_000
+_STEADY_TICKS = 3
+"""Ticks that bring their own records after which what is still missing counts as lost."""
 
 _RECORD = np.dtype([("gauges", ">i2", 6), ("check", "u1")])
 
@@ -69,6 +71,7 @@ class AtiSerialSensor:
             self._port, self._lock_step = simulator.serial_port, simulator.lock_step
         self._name = f"Sensor ATI Digital F/T on {self._port}"
         self._rate_hz = rig.rate_hz
+        self._period_ns = 1e9 / rig.rate_hz
         self._bytes_per_tick = settings.records_per_tick(rig.rate_hz) * RECORD_SIZE
         self._weights = settings.weights(rig.rate_hz)
         self._limit = settings.saturation_counts
@@ -78,7 +81,6 @@ class AtiSerialSensor:
         self._patience_ns = self._deadline_ns
         if not self._lock_step:
             self._patience_ns = min(self._deadline_ns, int(1e9 / settings.stream_hz))
-        self._waits = acquisition.mode == "same_tick"
         self._line: SerialLine | None = None
         self._block: CalibrationBlock | None = None
         self._operator = np.zeros((6, 6 * len(self._weights)))
@@ -90,10 +92,12 @@ class AtiSerialSensor:
         self._errors_in_a_row = 0
         self._arrived = 0
         self._arrived_ns = 0
+        # How many bytes should have come by this tick; a record or two less is no lag.
         self._due = 0
+        self._tick_ns: int | None = None
+        self._steady_ticks = 0
         self._asked_ns = 0
         self._looked_ns = 0
-        self._wait_now = False
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.wrench_stale = True
         self.wrench_saturated = False
@@ -149,16 +153,19 @@ class AtiSerialSensor:
             "filter_weights": list(self._weights),
         }
 
-    def request(self, due_ns: int) -> None:  # noqa: ARG002
+    def request(self, due_ns: int) -> None:
         """Begin the tick; the sensor streams, so nothing is sent."""
         now_ns = self._asked_ns = time.monotonic_ns()
-        self._wait_now = self._waits
+        periods = 1
+        if self._tick_ns is not None and not self._lock_step:
+            periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
+        self._tick_ns = due_ns
+        self._due += periods * self._bytes_per_tick
         if now_ns - self._looked_ns > _IDLE_NS and not self._lock_step:
             # What has piled up is old, and perhaps full of holes: only what comes now counts.
             self._take(self._open_line().read())
             self._history = b""
             self._due = self._arrived - self.stream.pending + RECORD_SIZE
-            self._wait_now = True
 
     def read_wrench(self) -> Wrench:
         """Return the wrench in N and N·m: the filter over the newest records.
@@ -168,9 +175,9 @@ class AtiSerialSensor:
         DeviceError
             If the line is gone or the sensor reports an error.
         """
-        line, wait = self._open_line(), self._wait_now
+        line = self._open_line()
         new = self._take(line.read())
-        while wait and self._arrived < self._due:
+        while self._arrived < self._due:
             lacks_one = self._due - self._arrived <= RECORD_SIZE
             patience_ns = self._patience_ns if lacks_one else self._deadline_ns
             left_ns = self._asked_ns + patience_ns - time.monotonic_ns()
@@ -179,14 +186,29 @@ class AtiSerialSensor:
             line.wait(left_ns * 1e-9)
             new += self._take(line.read())
         self._looked_ns = time.monotonic_ns()
-        self._due = self._arrived - self.stream.pending + self._bytes_per_tick
-        if not new:
-            self.wrench_stale = True
+        self.wrench_stale = self._lags(len(new)) or not new
+        if self.wrench_stale:
             return self._wrench
-        self.wrench_stale = False
         gauges = self._unpack(new)
         self.wrench_saturated = max(gauges) >= self._limit or min(gauges) <= -self._limit
         return self._filter()
+
+    def _lags(self, new: int) -> bool:
+        """Whether the newest record is a tick or more behind, with `new` bytes of records now.
+
+        Records that are late catch up. Lost ones do not: where each of some ticks brings its own
+        and the gap stays, they count as lost. Less than a tick is the drift between two clocks, or
+        the sensor's phase.
+        """
+        complete = self._arrived - self.stream.pending
+        if self._due - complete >= self._bytes_per_tick:
+            in_step = abs(new - self._bytes_per_tick) <= RECORD_SIZE
+            self._steady_ticks = self._steady_ticks + 1 if in_step else 0
+            if self._steady_ticks < _STEADY_TICKS:
+                return True
+        self._steady_ticks = 0
+        self._due = complete
+        return False
 
     def measure(self, duration_s: float) -> dict[str, float]:
         """Watch the stream for a while, between `connect` and the first tick.
@@ -335,4 +357,6 @@ class AtiSerialSensor:
             # What stands where the first tick finds no new records.
             self._filter()
         self._looked_ns = time.monotonic_ns()
-        self._due = self._arrived - self.stream.pending + self._bytes_per_tick
+        self._due = self._arrived - self.stream.pending
+        self._tick_ns = None
+        self._steady_ticks = 0

@@ -24,7 +24,7 @@ from rigd.sim.wire.hub import Handlers, Hub, VirtualCan, is_virtual
 from rigd.sim.wire.log import EventLog
 from rigd.sim.wire.lone_process import only_one, socket_folder, stop_requested
 from rigd.sim.wire.pty_line import PtyLine
-from rigd.sim.wire.transport import takes_same_tick, without_transport
+from rigd.sim.wire.transport import without_transport
 from rigd.sim.wire.world import World
 
 __all__ = [
@@ -73,12 +73,6 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
         raise DeviceError(
             f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): there is "
             "nothing to put on the wire. Its devices are simulated within a session already."
-        )
-    if options.lock_step and rig.ati_serial is not None and not takes_same_tick(rig):
-        raise DeviceError(
-            f"The profile {rig.name} takes the replies of the previous tick, and its sensor "
-            "streams: in lock-step nothing tells which records belong to which tick. Leave out "
-            "--lock-step, or take acquisition.mode same_tick."
         )
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses

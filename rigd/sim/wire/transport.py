@@ -6,11 +6,6 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 
 
-def takes_same_tick(rig: RigParameters) -> bool:
-    """Whether a tick of the host waits for its own replies."""
-    return rig.acquisition is None or rig.acquisition.mode == "same_tick"
-
-
 def without_transport(rig: RigParameters) -> RigParameters:
     """Return the rig with the delays that are left to simulate behind the wire.
 
@@ -22,7 +17,7 @@ def without_transport(rig: RigParameters) -> RigParameters:
     DeviceError
         If the profile states less than the exchange takes.
     """
-    if takes_same_tick(rig):
+    if rig.acquisition is None or rig.acquisition.mode == "same_tick":
         return rig
     period_s = 1 / rig.rate_hz
     for name, delay_s in (("encoder", rig.encoder.delay_s), ("sensor", rig.sensor.delay_s)):

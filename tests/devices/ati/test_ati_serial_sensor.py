@@ -210,37 +210,69 @@ def test_a_tick_without_records_keeps_the_last_value_and_says_so(
     assert tick(sensor) == before
     assert sensor.wrench_stale
     assert sensor.wrench_time_ns == time_ns
-    emitted(fakes, digital_ft, [(0, 0, 0, 0, 0, 9)] * 3)
+    emitted(fakes, digital_ft, [(0, 0, 0, 0, 0, 9)] * 21)
     tick(sensor)
     assert not sensor.wrench_stale
     assert sensor.wrench_time_ns > time_ns
 
 
 def test_the_start_of_the_stream_stands_until_the_first_tick(open_sensor, fakes):
-    sensor = open_sensor(mode="previous_tick")
+    sensor = open_sensor(deadline_us=1.0)
     sensor.connect()
     assert tick(sensor) == pytest.approx(wrench_of(fakes, fakes.GAUGES), rel=1e-12)
     assert sensor.wrench_stale
 
 
-def test_with_the_previous_tick_there_is_no_wait(
-    open_sensor, digital_ft, fakes, unhurried, settled
-):
-    sensor = open_sensor(mode="previous_tick")
-    sensor.connect()
-    settled(sensor)
-    sensor._line.wait = None
-    tick(sensor)
-    assert sensor.wrench_stale
-    emitted(fakes, digital_ft, [(7, 0, 0, 0, 0, 0)] * 7)
-    assert tick(sensor) == pytest.approx(wrench_of(fakes, (7, 0, 0, 0, 0, 0)), abs=1e-15)
-    assert not sensor.wrench_stale
-    del sensor._line.wait
+PERIOD_NS = 1_000_000
+
+
+@pytest.fixture
+def follow(open_sensor, digital_ft, fakes, settled):
+    """Run ticks on which so many records arrive; returns what each shows: number, or stale."""
+
+    def run(counts, lost=(), due_ns=lambda tick: tick * PERIOD_NS):
+        sensor = open_sensor(deadline_us=3000.0)
+        sensor.connect()
+        settled(sensor)
+        number, shown = 0, []
+        for index, count in enumerate(counts):
+            sensor.request(due_ns(index + 1))
+            if index in lost:
+                number += 7
+            emitted(fakes, digital_ft, [(number + k, 0, 0, 0, 0, 0) for k in range(count)])
+            number += count
+            wrench = sensor.read_wrench()
+            newest = wrench[0] / wrench_of(fakes, (1, 0, 0, 0, 0, 0))[0] + 3
+            shown.append("stale" if sensor.wrench_stale else round(newest))
+        return shown
+
+    return run
+
+
+def test_records_that_are_late_are_not_taken_for_those_of_the_tick(follow):
+    # The adapter held a tick's records back once; then each tick finds the ones before its own.
+    assert follow([7, 0, 7, 7, 14, 7]) == [6, "stale", "stale", "stale", 34, 41]
+
+
+def test_lost_records_are_given_up_after_some_ticks(follow):
+    shown = follow([7, 0, 7, 7, 7, 7], lost={1})
+    assert shown == [6, "stale", "stale", "stale", 34, 41]
+
+
+def test_missed_ticks_bring_their_records_with_them(follow):
+    late = lambda index: (index + 3 * (index > 1)) * PERIOD_NS  # noqa: E731
+    assert follow([7, 28, 7], due_ns=late)[1:] == [34, 41]
+
+
+@pytest.mark.parametrize("extra", [-1, 1])
+def test_another_clock_is_no_lag(follow, extra):
+    shown = follow([7, 7 + extra, 7, 7 + extra, 7, 7, 7 + extra, 7])
+    assert "stale" not in shown
 
 
 def test_after_a_pause_only_new_records_count(open_sensor, digital_ft, fakes, monkeypatch, settled):
     monkeypatch.setattr("rigd.devices.ati.serial_sensor._IDLE_NS", 1_000_000)
-    sensor = open_sensor(mode="previous_tick")
+    sensor = open_sensor()
     sensor.connect()
     settled(sensor)
     emitted(fakes, digital_ft, [(1000, 0, 0, 0, 0, 0)] * 300)
