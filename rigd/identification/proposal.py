@@ -22,6 +22,14 @@ class Row:
     profile_value: float
     source: str
     """Of the profile's value."""
+    least: float = 0.0
+    """Smallest value that the profile's other settings allow."""
+
+    @property
+    def is_below_least(self) -> bool:
+        """Whether the measured value is smaller than can be, by more than its scatter."""
+        lowest = self.least - _DIFFERS * (self.measured.std or 0.0)
+        return self.least > 0.0 and self.measured.value < lowest
 
     @property
     def differs(self) -> bool | None:
@@ -31,9 +39,11 @@ class Row:
         return abs(self.measured.value - self.profile_value) > _DIFFERS * self.measured.std
 
     def toml(self) -> str:
-        """Return the line to paste; what cannot be negative is not."""
+        """Return the line to paste: within its scatter no value is smaller than it can be."""
         std = self.measured.std or 0.0
-        value, deviation = _rounded(max(0.0, self.measured.value), std)
+        value, deviation = _rounded(self.measured.value, std)
+        if not self.is_below_least and float(value) < self.least:
+            value = f"{self.least:g}"
         name = self.key.rpartition(".")[2]
         return f'{name} = {{ value = {value}, source = "measured" }}  # ± {deviation} {self.unit}'
 
@@ -151,8 +161,18 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         unit_nm = rig.cia402.rated_torque_unit_nm
         key = "cia402.rated_torque_unit_nm"
         found.append((key, "N·m", _times(unit_nm, estimate.torque_scale), unit_nm))
-    rows = tuple(Row(*row, profile.sources.get(row[0], "assumed")) for row in found)
-    return Proposal(estimate, rows, tuple(_notes(estimate, profile, unusable)))
+    waits = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
+    least = {"actuation.delay_s": 1 / rig.rate_hz} if waits else {}
+    rows = tuple(
+        Row(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0)) for row in found
+    )
+    notes = _notes(estimate, profile, unusable)
+    if any(row.is_below_least for row in rows if row.key in least):
+        notes.append(
+            "The torque acts before the next SYNC: this drive takes it on arrival, whatever the "
+            'type of its RPDO. Set cia402.torque_delivery = "on_arrival" together with the delay.'
+        )
+    return Proposal(estimate, rows, tuple(notes))
 
 
 def _times(factor: float, quantity: Quantity) -> Quantity:

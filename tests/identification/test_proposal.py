@@ -76,3 +76,20 @@ def test_misfit_and_missing_passes_are_told(profile):
 )
 def test_numbers_show_two_figures_of_their_deviation(value, std, expected):
     assert _rounded(value, std) == expected
+
+
+@pytest.mark.parametrize(("delay_s", "pasted"), [(9.96e-4, 1e-3), (1.004e-3, 1.004e-3)])
+def test_a_delay_just_below_what_the_protocol_takes_is_pasted_as_that(delay_s, pasted):
+    estimate = replace(ESTIMATE, actuation_delay_s=Quantity(delay_s, 8e-6))
+    proposal = propose(estimate, load_profile("antenna_can"))
+    toml = tomllib.loads("\n".join(proposal.toml()))
+    assert toml["actuation"]["delay_s"]["value"] == pytest.approx(pasted)
+    assert not any("on_arrival" in note for note in proposal.notes)
+
+
+def test_a_drive_that_takes_its_torque_on_arrival_is_recognised():
+    estimate = replace(ESTIMATE, actuation_delay_s=Quantity(6.0e-4, 8e-6))
+    proposal = propose(estimate, load_profile("antenna_can"))
+    assert any('torque_delivery = "on_arrival"' in note for note in proposal.notes)
+    toml = tomllib.loads("\n".join(proposal.toml()))
+    assert toml["actuation"]["delay_s"]["value"] == pytest.approx(6.0e-4)
