@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rigd import __version__
 from rigd.crew import Crew
+from rigd.devices.registry import simulated_differently
 from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.events import Event, read_events
 from rigd.engine.jobs import ControlJob, RecorderJob
@@ -237,6 +238,9 @@ class _Session:
             **ready["ready"],
             **dict(order.notes),
         }
+        differences = simulated_differently(rig)
+        if differences:
+            metadata["simulated_differently"] = "; ".join(differences)
         if rig.acquisition is not None:
             metadata["acquisition_mode"] = rig.acquisition.mode
             metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)

@@ -22,7 +22,14 @@ from rigd.daemon import (
     what_is_kept,
     with_seed,
 )
-from rigd.devices.registry import Reality, UnknownDeviceError, check_selection, reality
+from rigd.devices.registry import (
+    Reality,
+    UnknownDeviceError,
+    check_selection,
+    objections,
+    reality,
+    simulated_differently,
+)
 from rigd.engine.board import Phase
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
@@ -112,6 +119,8 @@ def run_in_foreground(
             profile = prepare(profile)
         if moving in (Reality.SIMULATOR, Reality.LOCK_STEP):
             tell(f"No hardware: {profile.name} is simulated ({moving.value}).")
+            for difference in simulated_differently(profile.rig):
+                tell(f"Warning: the simulated rig has {difference}.")
         for number in range(repeat):
             with crew if number == 0 else Crew(live=live) as crew:
                 if excitation is None:
@@ -187,6 +196,9 @@ def _make_room(folder: Path, excitation: Excitation) -> None:
 def _load(name: str, *, fast: bool, seed: int | None) -> tuple[Profile, Reality]:
     profile = load_profile(name)
     check_selection(profile.rig.devices)
+    refusals = objections(profile.rig)
+    if refusals:
+        raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
     moving = reality(profile.rig)
     if fast and not moving.any_clock:
         raise RefusedError(

@@ -5,12 +5,10 @@ from collections.abc import Iterator
 from rigd.checks.rows import Row, Verdict, grade
 from rigd.devices.ati.stream import RECORD_BITS
 from rigd.devices.canbus.identifiers import check_identifiers
-from rigd.devices.canbus.load import BusLoad, bus_load
+from rigd.devices.canbus.load import MAX_LOAD, BusLoad, bus_load
 from rigd.devices.parameters import AtiSerial, RigParameters
 from rigd.profile import Profile
 
-MAX_LOAD = 0.9
-"""Of a bus or line, with the most stuffed bits: above, a frame may miss its period."""
 HIGH_LOAD = 0.7
 """Above, one more device does not fit, nor do repeated frames after a disturbance."""
 

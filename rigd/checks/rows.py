@@ -11,7 +11,7 @@ class Verdict(Enum):
     OK = "ok"
     WARNING = "warning"
     """A session can be run; somebody should know."""
-    FAIL = "FAIL"
+    FAIL = "failed"
     """No session may be run."""
     SKIPPED = "skipped"
     """Not looked at; what was found says why."""

@@ -1,20 +1,22 @@
 """The command line of the rig, put together: ``rigd``."""
 
 import io
+import os
 import signal
 import sys
 
 import typer
 
 from rigd.cli.check import check, reset
-from rigd.cli.exits import EXIT_INTERRUPTED
+from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
 from rigd.cli.run import run_app
 from rigd.cli.simulate import inject, simulate
 
 app = typer.Typer(
-    help="Run the rig: excite the antenna, record every sample, watch it live.",
+    help="Run the rig: excite the antenna, record every sample, watch it live.\n\n"
+    "Example: rigd check --profile sim, then rigd run chirp --profile sim --fast",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -41,3 +43,8 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
+    except OSError as error:
+        # Nobody reads what a command writes, or the disk behind it is full.
+        sys.stderr.write(f"Error: the output cannot be written ({error.strerror}).\n")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(EXIT_FAILED)

@@ -30,7 +30,10 @@ identify_app = typer.Typer(
 
 @identify_app.callback()
 def identify() -> None:
-    """Measure data of the rig that its profile has to state."""
+    """Measure data of the rig that its profile has to state.
+
+    Example: rigd identify motor --profile sim --fast
+    """
 
 
 @identify_app.command()

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from rigd.excitation import Excitation
 
 run_app = typer.Typer(
-    help="Run one or more sessions in the foreground; Ctrl-C stops safely.",
+    help="Run one or more sessions in the foreground; Ctrl-C stops safely.\n\n"
+    "Example: rigd run chirp --profile sim --fast",
     no_args_is_help=True,
     rich_markup_mode=None,
 )

@@ -83,6 +83,8 @@ def inject(
     simulator = registry.simulator()
     try:
         lines = simulator.inject(profile_named(profile).rig.name, fault or [])
+    except simulator.FaultError as error:
+        fail(str(error), EXIT_WRONG_USE)
     except simulator.DeviceError as error:
         fail(str(error), EXIT_FAILED)
     typer.echo("\n".join(lines))

@@ -30,6 +30,9 @@ class Drive(Protocol):
     angle_time_ns: int
     """When the last angle read was latched, as far as the host knows; ``time.monotonic_ns``."""
 
+    off_doubt: str
+    """Why the drive may still exert torque after `disable`, for the operator; empty if not."""
+
     def connect(self) -> None:
         """Open the line and verify identity and configuration; no torque.
 

@@ -124,12 +124,15 @@ class ServoDrive:
     """After how long without the drive's heartbeat the loop stops."""
     host_node_id: Annotated[int, Ge(1), Le(127)]
     """Of this computer's own heartbeat."""
-    abort_option: Annotated[int, Ge(0), Le(3)]
+    abort_option: Annotated[int, Ge(1), Le(3)]
     """Object 6007, what the drive does on a lost connection: 1 fault, 2 disable, 3 quick stop."""
     communication_error_option: Annotated[int, Ge(0), Le(2)]
     """Object 1029:1: 0 to pre-operational, 1 no change, 2 stopped."""
     enable_timeout_s: Annotated[float, Gt(0), Le(10)]
     """How long each step up to operation enabled may take."""
+    torque_tolerance_percent: Annotated[float, Ge(0), Le(100)] = 0.0
+    """Of the rated torque: by how much the drive's actual torque (6077) may differ from what it was
+    told for some ticks; 0 does not compare them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import cast
 
 from rigd.devices.contracts import Devices
 from rigd.devices.parameters import RigParameters, Selection
-from rigd.devices.simulator import find_simulator
+from rigd.devices.simulator import differences, find_simulator
 
 # Drive and sensor share a plant or a bus, so drivers are opened by the pair.
 _OPENERS = {
@@ -61,6 +61,30 @@ def reality(rig: RigParameters) -> Reality:
     if simulator is None:
         return Reality.HARDWARE
     return Reality.LOCK_STEP if simulator.lock_step else Reality.SIMULATOR
+
+
+def simulated_differently(rig: RigParameters) -> list[str]:
+    """Say in what the running simulated rig, if any stands in, differs from the profile's."""
+    simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
+    return [] if simulator is None else differences(rig, simulator)
+
+
+def objections(rig: RigParameters) -> list[str]:
+    """Say why the devices of a rig cannot share their bus, before anything is sent."""
+    if rig.can is None:
+        return []
+    from rigd.devices.canbus.identifiers import check_identifiers
+    from rigd.devices.canbus.load import MAX_LOAD, bus_load
+
+    found = check_identifiers(rig)
+    load = bus_load(rig).worst
+    if load > MAX_LOAD:
+        found.append(
+            f"The frames of a tick take up to {100 * load:.0f} % of the CAN bus at "
+            f"{rig.can.bitrate_bit_s} bit/s, more than {100 * MAX_LOAD:.0f} %; choose a higher "
+            "can.bitrate_bit_s or a lower rig.rate_hz."
+        )
+    return found
 
 
 def simulator() -> ModuleType:

@@ -8,8 +8,11 @@ import json
 import os
 import socket
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+
+from rigd.devices.parameters import RigParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +28,23 @@ class SimulatorAddress:
     """Pseudo-terminal of the serial sensor; empty where it has none."""
     lock_step: bool = False
     """It moves on by one period a SYNC instead of by the clock."""
+    rig: Mapping[str, object] = field(default_factory=dict)
+    """What it simulates: the rig's parameters by dotted key, as `described` gives them."""
+
+
+def described(rig: RigParameters) -> dict[str, object]:
+    """Return a rig's parameters by dotted key, as JSON has them."""
+    return json.loads(json.dumps(dict(_flat(asdict(rig), ""))))  # type: ignore[no-any-return]
+
+
+def differences(rig: RigParameters, simulator: SimulatorAddress) -> list[str]:
+    """Say in what the rig that is simulated differs from a profile's: one phrase a key."""
+    ours, theirs = described(rig), simulator.rig
+    return [
+        f"{key} = {_shown(theirs[key])} instead of {_shown(value)}"
+        for key, value in ours.items()
+        if key in theirs and theirs[key] != value
+    ]
 
 
 def runtime_folder() -> Path:
@@ -65,6 +85,19 @@ def find_simulator(rig_name: str) -> SimulatorAddress | None:
         except (OSError, TypeError, ValueError):
             return None
     return address
+
+
+def _flat(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+    for key, value in table.items():
+        dotted = prefix + key.rstrip("_")
+        if isinstance(value, dict):
+            yield from _flat(value, dotted + ".")
+        else:
+            yield dotted, value
+
+
+def _shown(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else json.dumps(value)
 
 
 def _address_file(rig_name: str) -> Path:

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from rigd.devices.canbus import CanLink
-from rigd.devices.canbus.identifiers import check_identifiers
 from rigd.devices.cia402.drive import Cia402Drive
 from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
 from rigd.devices.parameters import RigParameters
+from rigd.devices.registry import objections
 from rigd.devices.simulator import SimulatorAddress, find_simulator
 
 _LOCK_STEP_PATIENCE_US = 0.5e6
@@ -22,13 +22,14 @@ def open_wired_rig(rig: RigParameters) -> Devices:
     Raises
     ------
     DeviceError
-        If identifiers collide, or both the hardware and a simulated rig are there.
+        If identifiers collide, the bus would be too full, or the hardware and a simulated rig are
+        both there.
     """
     bus = rig.can
     assert bus is not None
-    collisions = check_identifiers(rig)
-    if collisions:
-        raise DeviceError("\n".join(collisions))
+    refusals = objections(rig)
+    if refusals:
+        raise DeviceError("\n".join(refusals))
     simulator = find_simulator(rig.name)
     if simulator is not None:
         _refuse_ambiguity(rig, simulator)

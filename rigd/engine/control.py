@@ -103,6 +103,9 @@ def conduct(
         channels.board[Word.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
+    doubt = devices.drive.off_doubt
+    if doubt:
+        outcome, reason = "fault", f"{reason} {doubt}".strip()
     if recorded and reason:
         # What happens after the last tick does not make the record any less complete.
         outcome, reason = "complete", f"After the record: {reason}"

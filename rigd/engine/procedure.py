@@ -138,8 +138,9 @@ class Procedure:
         self._start_angle_rad = self._cycle.angle_rad
         self._cycle.controller.reset(self._start_angle_rad)
         self._cycle.watch.reset(self._start_angle_rad)
-        for _ in range(round(_SETTLE_S * self._rate_hz)):
-            self._tick(self._start_angle_rad)
+        for number in range(round(_SETTLE_S * self._rate_hz)):
+            # Enabling, right before the first, takes its time.
+            self._tick(self._start_angle_rad, excused=number == 0)
 
     def wait_for_go(self) -> None:
         """Go on holding until the recorder is ready; virtual time stands still meanwhile.
@@ -252,9 +253,17 @@ class Procedure:
                 f"more than session.tare_drift_nm = {limit_nm:g} N·m.",
             )
 
-    def _tick(self, reference_rad: float) -> None:
-        """One tick outside the record; what is missed there is nobody's loss."""
-        self._cycle.watch.skip(self._metronome.wait())
+    def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
+        """One tick outside the record; what is missed there is nobody's loss, but has its limit."""
+        missed = self._metronome.wait()
+        self._cycle.watch.skip(missed)
+        if missed > self._profile.limits.missed_ticks_in_a_row and not excused:
+            raise SessionEnd(
+                "fault",
+                f"The loop stood still for {missed} ticks with the torque held, more than "
+                "limits.missed_ticks_in_a_row = "
+                f"{self._profile.limits.missed_ticks_in_a_row}; see what else this computer does.",
+            )
         self._check_stop()
         end = self._step(reference_rad)
         if end is not None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.identification.experiments import TOP_HZ, lay_out_passes, read_layout
+from rigd.identification.experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
 from rigd.identification.motor_estimate import EstimateError, Window
 from rigd.identification.motor_moments import Timing
 from rigd.session import Session, Status, read_session
@@ -71,6 +71,11 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         unusable += expected - len(usable)
     if first is None:
         raise EstimateError("No session file is given.")
+    if all(window.top_hz == TOP_HZ[SPEEDS] for window in windows):
+        raise EstimateError(
+            "Constant speeds alone do not tell inertia, delay and the torque's scale; give the "
+            f"session {MULTISINE} of the same rig, too."
+        )
     return Recording(windows, *first, unusable)
 
 

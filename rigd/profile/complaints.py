@@ -1,6 +1,7 @@
 """What is wrong with a profile, in sentences that name key, value, unit and remedy."""
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping
 from math import pi
 from typing import Any
@@ -36,6 +37,8 @@ _UNITS_OF_SIX = {
     "simulation.offset": "N, N, N, N·m, N·m, N·m",
 }
 
+_NAME = re.compile(r"[^\W_][\w .-]{0,63}")
+
 _FIRST_MODE_HZ = 0.1, 100.0
 """Of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
 
@@ -57,6 +60,11 @@ def bare_number(key: str, value: object) -> str:
 
 def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is wrong between values that are each in range."""
+    if not _NAME.fullmatch(values["name"]):
+        yield (
+            f"name = {_show(values['name'])} is not fit for file names; take letters, digits, "
+            "spaces and . _ - only, at most 64, and begin with a letter or digit."
+        )
     rated, peak = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
     if peak < rated:
         yield (

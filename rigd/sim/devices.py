@@ -93,6 +93,7 @@ class SimulatedDrive:
         self.read_angle = rig.read_angle
         self.angle_stale = False
         self.angle_time_ns = 0
+        self.off_doubt = ""
 
     def connect(self) -> None:
         """Nothing to connect to."""

@@ -55,7 +55,7 @@ def test_json_is_one_document(rigd, stand_ins):
         set(row) == {"group", "what", "found", "wanted", "verdict", "detail"}
         for row in document["rows"]
     )
-    assert {row["verdict"] for row in document["rows"]} <= {"ok", "warning", "FAIL", "skipped"}
+    assert {row["verdict"] for row in document["rows"]} <= {"ok", "warning", "failed", "skipped"}
 
 
 def test_a_dead_device_fails_with_its_message(rigd, stand_ins, silent):
@@ -83,7 +83,7 @@ def test_a_bus_that_cannot_be_right_is_left_alone(
     code, text, _ = rigd("check", "--profile", path, "--json")
     assert code == 1
     rows = json.loads(text)["rows"]
-    assert any(row["verdict"] == "FAIL" and word in row["found"] for row in rows)
+    assert any(row["verdict"] == "failed" and word in row["found"] for row in rows)
     assert rows[-1]["verdict"] == "skipped"
     assert stand_ins.calls == []
 
@@ -107,7 +107,7 @@ def test_hardware_that_is_not_there(rigd, can_profile, tmp_path):
     path = changed_profile(can_profile, tmp_path, 'channel = "can0"', 'channel = "nocan9"')
     code, text, _ = rigd("check", "--profile", path, "--json")
     assert code == 1
-    failed = [row for row in json.loads(text)["rows"] if row["verdict"] == "FAIL"]
+    failed = [row for row in json.loads(text)["rows"] if row["verdict"] == "failed"]
     assert [row["group"] for row in failed] == ["sensor", "drive"]
     assert all("nocan9" in row["found"] for row in failed)
 

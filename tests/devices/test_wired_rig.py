@@ -8,8 +8,8 @@ import pytest
 
 from rigd.devices import wired_rig
 from rigd.devices.contracts import DeviceError
-from rigd.devices.registry import Reality, open_devices, reality
-from rigd.devices.simulator import SimulatorAddress, announce
+from rigd.devices.registry import Reality, open_devices, reality, simulated_differently
+from rigd.devices.simulator import SimulatorAddress, announce, described
 from rigd.profile import load_profile
 
 
@@ -73,3 +73,24 @@ def test_a_serial_port_beside_a_simulated_one_is_refused(stand_in, tmp_path):
     port.touch()
     with pytest.raises(DeviceError, match=r"the serial port .*ttyUSB0 of the real one"):
         open_devices(rig)
+
+
+def test_a_bus_that_is_too_full_is_refused(rig, runtime_folder):
+    slow = replace(rig, can=replace(rig.can, bitrate_bit_s=500_000))
+    with pytest.raises(DeviceError, match=r"up to 120 % of the CAN bus at 500000 bit/s"):
+        open_devices(slow)
+
+
+def test_what_a_simulated_rig_has_otherwise_is_told(rig, stand_in):
+    assert simulated_differently(rig) == []
+    stand_in(rig.name, rig=described(rig))
+    assert simulated_differently(rig) == []
+    other = replace(
+        rig,
+        beam=replace(rig.beam, length_m=0.7),
+        acquisition=replace(rig.acquisition, mode="previous_tick"),
+    )
+    assert simulated_differently(other) == [
+        "beam.length_m = 0.98 instead of 0.7",
+        'acquisition.mode = "same_tick" instead of "previous_tick"',
+    ]

@@ -30,6 +30,7 @@ class WatchedDrive:
     stale_at: int | None = None
     reads: int = 0
     held_rad: float = 0.0
+    doubt: str = ""
     enabled: bool = False
     torque_nm: float = 0.0
     torques: list = field(default_factory=list)
@@ -41,6 +42,10 @@ class WatchedDrive:
     @property
     def angle_time_ns(self):
         return self.inner.angle_time_ns
+
+    @property
+    def off_doubt(self):
+        return self.doubt
 
     def connect(self):
         self.inner.connect()

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
-from rigd.engine.board import Stop, Word
+from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.clocks import VirtualClock
 from rigd.excitation import hold
 from rigd.session.format import Status, decode_samples
@@ -400,3 +400,33 @@ def test_the_drive_is_disabled_once_by_the_cycle_and_once_more_at_the_end(make_s
     session.run()
     session.assert_safe()
     assert len(calls) == 2
+
+
+def test_a_drive_that_may_still_be_on_is_told(make_session):
+    session = make_session()
+    session.drive.doubt = "Drive: it does not show that it is off."
+    finished = session.run().finished
+    assert finished["finished"] == "complete"  # the record is what it is
+    assert finished["reason"] == "After the record: Drive: it does not show that it is off."
+
+
+class StallOnTheWayBack(VirtualClock):
+    """Stands still for 60 periods, once, after the record."""
+
+    board = None
+
+    def wait_until(self, deadline_ns):
+        late_ns = super().wait_until(deadline_ns)
+        if self.board is not None and self.board[Word.PHASE] == Phase.RETURNING:
+            self.board = None
+            return late_ns + 60_000_000
+        return late_ns
+
+
+def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
+    clock = StallOnTheWayBack()
+    session = make_session(clock=clock)
+    clock.board = session.board
+    finished = session.run().finished
+    assert "stood still for 60 ticks" in finished["reason"]
+    session.assert_safe()

@@ -116,3 +116,9 @@ def test_a_section_that_nobody_reads_is_refused(refuse):
 def test_a_contradiction_with_the_protocol_is_told(refuse, name, old, new, complaint):
     lines = refuse(name, (old, new))
     assert any(re.match(complaint, line) for line in lines), lines
+
+
+@pytest.mark.parametrize("name", ["../../evil", "a/b", "a\\u0000b", "x" * 70, ".hidden", "-x"])
+def test_a_name_has_to_be_fit_for_files(refuse, name):
+    (line,) = refuse("antenna_can", ('name = "antenna_can"', f'name = "{name}"'))
+    assert "is not fit for file names" in line

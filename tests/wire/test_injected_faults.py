@@ -1,6 +1,7 @@
 """Every row of docs/faults.md: a fault on the wire, and how the session and the drive end."""
 
 import re
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ MESSAGES = {
     "bus cut": r"CAN bus .*(cut off|takes no more frames)",
     "loop's frames lost": r"10 ticks",
     "loop's heartbeat lost": r"Drive .*0x8130",
+    "torque commands lost": r"Drive .*exerts .* commanded, for 10 ticks",
     "serial line cut": r"Sensor ATI Digital F/T on /dev/pts",
     "stream silent": r"wrench.*10 ticks",
     "stream reports an error": r"Sensor ATI Digital F/T .*error",
@@ -58,6 +60,13 @@ def rows(heading):
     return [Row(c[0], c[1].strip("`"), c[2], int(c[3]), c[4]) for c in cells]
 
 
+def eventually(condition, within_s=3.0):
+    deadline = time.monotonic() + within_s
+    while not (met := condition()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return met
+
+
 def named(row):
     return row.name.replace(" ", "_")
 
@@ -82,6 +91,8 @@ def test_a_fault_ends_in_a_drive_without_torque(
     session = read_session(result.path)
     assert session.outcome["outcome"] == "fault"
     assert session.samples[-1]["status"] & Status.TORQUE_OFF
+    # A drive that nobody can reach any more goes off a little later, by itself.
+    assert eventually(lambda: drive_log(log).last_torque["enabled"] is False)
     simulator.terminate()
     assert simulator.wait(10.0) == 0
 

@@ -211,3 +211,11 @@ def test_without_the_loop_the_drive_goes_off_by_itself(
     # The last command of the loop came with a SYNC, the last heartbeat up to 10 ms before it.
     last_told = said.of("torque")[-2]
     assert end["t_s"] - last_told["t_s"] <= 0.3 + 2e-3
+
+
+def test_a_profile_that_cannot_share_its_bus_is_wrong_use(quiet_profile, run_chirp, runtime_folder):
+    done = run_chirp(
+        quiet_profile("antenna_can", ("base_id = { value = 0x68", "base_id = { value = 0x20"))
+    )
+    assert done.returncode == 2
+    assert "0x201" in done.stderr

@@ -1,6 +1,7 @@
 """The bus that several drivers share: opened by the first of them, closed by the last."""
 
 from rigd.devices.canbus.exchange import CanExchange
+from rigd.devices.canbus.lock import BusLock
 from rigd.devices.canbus.port import open_port
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
@@ -23,6 +24,8 @@ class CanLink:
         self._simulator = simulator
         self._exchange: CanExchange | None = None
         self._users = 0
+        simulated = "" if simulator is None else simulator.can_socket
+        self._lock = BusLock(simulated or settings.channel)
 
     @property
     def exchange(self) -> CanExchange:
@@ -43,10 +46,15 @@ class CanLink:
         Raises
         ------
         DeviceError
-            If that fails.
+            If that fails, or another program uses it.
         """
         if self._exchange is None:
-            self._exchange = CanExchange(open_port(self._settings, self._simulator))
+            self._lock.acquire()
+            try:
+                self._exchange = CanExchange(open_port(self._settings, self._simulator))
+            except BaseException:
+                self._lock.release()
+                raise
         self._users += 1
         return self._exchange
 
@@ -56,3 +64,4 @@ class CanLink:
         if self._users == 0 and self._exchange is not None:
             self._exchange.port.close()
             self._exchange = None
+            self._lock.release()

@@ -21,6 +21,10 @@ _STUFFED_BITS = 34
 """Of these, those from the start to the checksum, among which bits are stuffed."""
 
 
+MAX_LOAD = 0.9
+"""Of a bus or line, with the most stuffed bits: above, a frame may miss its period."""
+
+
 @dataclass(frozen=True, slots=True)
 class Traffic:
     """A frame that recurs."""

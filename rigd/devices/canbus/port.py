@@ -70,15 +70,20 @@ class SocketPort:
         Connected; made non-blocking.
     name
         Of the bus, for messages.
+    remedy
+        What to look at when it has gone.
     """
 
-    def __init__(self, link: socket.socket, name: str) -> None:
+    def __init__(
+        self, link: socket.socket, name: str, remedy: str = "look at cable and adapter"
+    ) -> None:
         link.setblocking(False)
         self._link = link
         self._send = link.send
         self._recv = link.recv
         self._fd = [link.fileno()]
         self.name = name
+        self._remedy = remedy
 
     def send(self, frame: bytes) -> None:
         """Send one frame of 16 bytes."""
@@ -96,7 +101,7 @@ class SocketPort:
         except OSError as error:
             raise DeviceError(self._why("cannot be read", error)) from None
         if len(raw) != FRAME_SIZE:
-            raise DeviceError(f"CAN bus {self.name}: it was cut off; look at cable and adapter.")
+            raise DeviceError(f"CAN bus {self.name}: it was cut off; {self._remedy}.")
         return raw
 
     def wait(self, timeout_s: float) -> None:
@@ -126,7 +131,7 @@ class SocketPort:
         remedy = (
             "no other device acknowledges: look at cable, termination, power and bit rate"
             if error.errno in (errno.ENOBUFS, errno.EAGAIN)
-            else "look at cable and adapter"
+            else self._remedy
         )
         return f"CAN bus {self.name}: it {what} ({error.strerror}); {remedy}."
 
@@ -205,7 +210,7 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
                 f"CAN bus {name}: the simulated rig does not answer ({error.strerror}); start "
                 "rigd simulate again."
             ) from None
-        return SocketPort(link, f"{name}, simulated")
+        return SocketPort(link, f"{name}, simulated", "see whether rigd simulate still runs")
     if settings.interface == "socketcan":
         return SocketPort(_open_socketcan(settings), name)
     import can

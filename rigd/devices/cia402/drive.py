@@ -8,6 +8,7 @@ that are all late by the same whole number of periods it cannot tell; that is wh
 from math import isnan
 
 from rigd.devices.canbus import CanExchange, CanLink
+from rigd.devices.cia402.following import TorqueFollowing
 from rigd.devices.cia402.frames import NodeFrames
 from rigd.devices.cia402.inbox import Inbox
 from rigd.devices.cia402.node import Node
@@ -71,6 +72,7 @@ class Cia402Drive:
         self._rad_per_count = rig.encoder.resolution_rad * settings.direction
         self._per_mille_per_nm = 1000 * settings.direction / rig.motor.rated_torque_nm
         self._limit = torque_limit_per_mille(rig)
+        self._following = TorqueFollowing(self._name, settings.torque_tolerance_percent)
         self._open = False
         self._subscribed: CanExchange | None = None
         self._node: Node | None = None
@@ -85,6 +87,7 @@ class Cia402Drive:
         self.angle_rad = 0.0
         self.angle_stale = False
         self.angle_time_ns = 0
+        self.off_doubt = ""
 
     def connect(self) -> None:
         """Open the bus, verify and configure the drive, start it, and take its angle as zero.
@@ -154,6 +157,7 @@ class Cia402Drive:
             self.disable()
             raise
         self._enabled = True
+        self._following.start()
         self._guard_mask = STATE_BITS | FOLLOWS_TARGET
         self._guard_value = ENABLED | FOLLOWS_TARGET
         node.resume()
@@ -235,6 +239,7 @@ class Cia402Drive:
                 raise DeviceError(f"{self._name}: the torque command is not a number.")
             per_mille = limit if per_mille > 0 else -limit
         sent = round(per_mille)
+        self._following.command(sent)
         send(self._frames.rpdo(ENABLE_OPERATION, sent))
         return sent / self._per_mille_per_nm
 
@@ -254,6 +259,14 @@ class Cia402Drive:
             return
         if switch_off(node):
             self._may_be_on = False
+            self.off_doubt = ""
+        else:
+            self.off_doubt = (
+                f"{self._name}: it does not show that it is off (statusword "
+                f"0x{self._inbox.statusword:04X}); see that it is, by its STO if need be. Without "
+                "the loop's heartbeat it has to switch itself off within "
+                f"cia402.heartbeat_timeout_s = {node.settings.heartbeat_timeout_s:g} s."
+            )
         node.resume()
 
     def reset_fault(self) -> str | None:
@@ -275,11 +288,14 @@ class Cia402Drive:
         return reset_fault(exchange.port, self._rig, self._name)
 
     def close(self) -> None:
-        """Disable, have the drive leave operational and expect no more heartbeats; release."""
+        """Disable, have the drive leave operational and expect no more heartbeats; release.
+
+        A drive that may still be on goes on watching for heartbeats, and misses them.
+        """
         self.disable()
         self._inbox.watching = False
         node, self._node = self._node, None
-        if node is not None:
+        if node is not None and not self._may_be_on:
             node.send_if_possible(self._frames.pre_operational)
             node.write(self._frames.forget_heartbeat, HEARTBEAT_CONSUMER, 1)
         if self._open:
@@ -318,6 +334,8 @@ class Cia402Drive:
         """Take the position if it is the reply to the last SYNC."""
         fresh = node.pairing.settle()
         self.angle_stale = not fresh
+        if self._enabled and fresh:
+            self._following.compare(self._inbox.torque)
         if fresh:
             position = self._inbox.position
             # The counter of 32 bits wraps around.

@@ -7,7 +7,13 @@ from struct import Struct
 from typing import Final
 
 from rigd.devices.canbus import FRAME_SIZE, pack_frame
-from rigd.devices.cia402.objects import CONTROLWORD, HEARTBEAT_CONSUMER, MODE_DISPLAY, SYNC_ID
+from rigd.devices.cia402.objects import (
+    CONTROLWORD,
+    HEARTBEAT_CONSUMER,
+    MODE_DISPLAY,
+    STATUSWORD,
+    SYNC_ID,
+)
 
 NMT_START: Final = 0x01
 NMT_STOP: Final = 0x02
@@ -57,8 +63,8 @@ class NodeFrames:
         SYNC without counter; heartbeat of this computer, operational.
     start, stop, pre_operational
         NMT commands.
-    disable_voltage, forget_heartbeat, ask_mode
-        SDO requests: 6040 = 0; 1016:1 = 0, no more heartbeat expected; read 6061.
+    disable_voltage, forget_heartbeat, ask_mode, ask_statusword
+        SDO requests: 6040 = 0; 1016:1 = 0, no more heartbeat expected; read 6061; read 6041.
     tpdo_id, rpdo_id, emergency_id, heartbeat_id, reply_id
         Identifiers of the drive's frames.
     """
@@ -80,6 +86,7 @@ class NodeFrames:
             request_id, _pack_sdo(_SDO_DOWNLOAD_4, HEARTBEAT_CONSUMER, 1, 0)
         )
         self.ask_mode = pack_frame(request_id, _pack_sdo(_SDO_UPLOAD, MODE_DISPLAY, 0, 0))
+        self.ask_statusword = pack_frame(request_id, _pack_sdo(_SDO_UPLOAD, STATUSWORD, 0, 0))
         self._rpdo_head = pack_frame(self.rpdo_id, bytes(4))[: FRAME_SIZE // 2]
 
     def rpdo(self, controlword: int, torque_per_mille: int) -> bytes:
@@ -102,9 +109,20 @@ def is_written(data: bytes, index: int, sub: int) -> bool:
 
 def read_mode(data: bytes) -> int | None:
     """Return the mode of operation in an SDO reply, or None if it is not one of 6061."""
+    value = _read(data, MODE_DISPLAY)
+    return None if value is None else int.from_bytes(value[:1], "little", signed=True)
+
+
+def read_statusword(data: bytes) -> int | None:
+    """Return the statusword in an SDO reply, or None if it is not one of 6041."""
+    value = _read(data, STATUSWORD)
+    return None if value is None else int.from_bytes(value[:2], "little")
+
+
+def _read(data: bytes, wanted: int) -> bytes | None:
     if len(data) != 8:
         return None
     command, index, sub, value = _unpack_sdo(data)
-    if (index, sub) != (MODE_DISPLAY, 0) or command & 0xE0 != _SDO_READ:
+    if (index, sub) != (wanted, 0) or command & 0xE0 != _SDO_READ:
         return None
-    return int.from_bytes(value[:1], "little", signed=True)
+    return bytes(value)

@@ -24,8 +24,8 @@ class Inbox:
 
     Attributes
     ----------
-    statusword, position
-        Of the last TPDO; position in counts.
+    statusword, position, torque
+        Of the last TPDO; position in counts, torque in 1/1000 of the rated one.
     replies : int
         TPDOs since somebody set this to zero, whatever was in them.
     legible : bool
@@ -59,6 +59,7 @@ class Inbox:
         "replies",
         "reply",
         "statusword",
+        "torque",
         "watching",
     )
 
@@ -71,6 +72,7 @@ class Inbox:
         """Forget everything but the number of malformed frames."""
         self.statusword = 0
         self.position = 0
+        self.torque = 0
         self.replies = 0
         self.legible = False
         self.nmt_state: int | None = None
@@ -84,7 +86,7 @@ class Inbox:
         """Take statusword and position."""
         self.replies += 1
         try:
-            self.statusword, self.position, _ = unpack_tpdo(data)
+            self.statusword, self.position, self.torque = unpack_tpdo(data)
             self.legible = True
         except LengthError:
             self.legible = False

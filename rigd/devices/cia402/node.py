@@ -5,10 +5,10 @@ from contextlib import suppress
 from math import ceil
 
 from rigd.devices.canbus import CanExchange
-from rigd.devices.cia402.frames import OPERATIONAL, NodeFrames, is_written
+from rigd.devices.cia402.frames import OPERATIONAL, NodeFrames, is_written, read_statusword
 from rigd.devices.cia402.inbox import Inbox
 from rigd.devices.cia402.pairing import ReplyPairing
-from rigd.devices.cia402.states import FAULT_BIT, state_of
+from rigd.devices.cia402.states import OFF, DriveState, state_of
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 
@@ -176,6 +176,19 @@ class Node:
         except (DeviceError, OSError):
             return False
 
+    def is_off(self) -> bool:
+        """Ask the drive for its statusword by SDO, and return whether it shows the drive off."""
+        inbox = self.inbox
+        inbox.reply = b""
+        with suppress(DeviceError, OSError):
+            self.exchange.send(self.frames.ask_statusword)
+            self.exchange.wait_until(
+                lambda: read_statusword(inbox.reply) is not None,
+                time.monotonic_ns() + _WRITTEN_NS,
+            )
+        statusword = read_statusword(inbox.reply)
+        return statusword is not None and state_of(statusword) in OFF
+
     def send_if_possible(self, frame: bytes) -> None:
         """Send a frame, or not."""
         with suppress(DeviceError, OSError):
@@ -190,7 +203,7 @@ class Node:
             With the reason.
         """
         inbox = self.inbox
-        in_fault = bool(inbox.statusword & FAULT_BIT)
+        in_fault = state_of(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
         if in_fault and not inbox.alarm:
             self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)
         if not (in_fault or inbox.alarm):

@@ -31,6 +31,9 @@ POSITION: Final = 0x6064
 TARGET_TORQUE: Final = 0x6071
 MAX_TORQUE: Final = 0x6072
 RATED_TORQUE: Final = 0x6076
+TORQUE_OFFSET: Final = 0x60B2
+TORQUE_LIMITS: Final = (0x60E0, 0x60E1)
+"""Largest torque forwards and backwards."""
 ACTUAL_TORQUE: Final = 0x6077
 INTERPOLATION_TIME: Final = 0x60C2
 """Sub 1: value; sub 2: power of ten of its unit in s."""

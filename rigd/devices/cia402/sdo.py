@@ -27,8 +27,8 @@ _EDS = Path(__file__).with_name("drive.eds")
 _SDO_TIMEOUT_S = 0.5
 _SDO_TRIES = 2
 _RECEIVER_POLL_S = 0.02
-_ABSENT = (0x0602_0000, 0x0609_0011)
-"""SDO abort codes: no such object, no such sub-index."""
+_ABSENT = (0x0602_0000, 0x0609_0011, 0x060A_0023)
+"""SDO abort codes: no such object, no such sub-index, nothing behind it."""
 
 
 class SdoRefusal(DeviceError):

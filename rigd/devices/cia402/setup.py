@@ -57,7 +57,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> dict[str, object]:
         _check_identity(identity, settings, name)
         _switch_off(sdo, rig, name)
         _check_torque(sdo, identity, rig, name)
-        sdo.configure(objects.MAX_TORQUE, 0, torque_limit_per_mille(rig))
+        _configure_torque(sdo, torque_limit_per_mille(rig))
         _configure_sync(sdo, period_us, interpolation)
         _configure_guards(sdo, settings)
         _configure_pdos(sdo, settings)
@@ -154,6 +154,16 @@ def _check_torque(
             f"shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every torque would be wrong "
             "by that ratio. Correct the profile or the drive."
         )
+
+
+def _configure_torque(sdo: SdoAccess, limit_per_mille: int) -> None:
+    """Have the drive exert what it is told: up to the limit, and nothing on top of it."""
+    sdo.configure(objects.MAX_TORQUE, 0, limit_per_mille)
+    others = {objects.TORQUE_OFFSET: 0, **dict.fromkeys(objects.TORQUE_LIMITS, limit_per_mille)}
+    for index, value in others.items():
+        found = sdo.read_if_there(index)
+        if found is not None and found != value:
+            sdo.configure(index, 0, value)
 
 
 def _switch_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:

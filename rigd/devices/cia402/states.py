@@ -45,6 +45,16 @@ _TABLE: Final = (
 )
 
 
+OFF: Final = (
+    DriveState.NOT_READY,
+    DriveState.SWITCH_ON_DISABLED,
+    DriveState.READY,
+    DriveState.SWITCHED_ON,
+    DriveState.FAULT,
+)
+"""States in which the motor exerts no torque."""
+
+
 def state_of(statusword: int) -> DriveState:
     """Return the state that a statusword tells."""
     for mask, value, state in _TABLE:

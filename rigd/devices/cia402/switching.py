@@ -12,6 +12,7 @@ from rigd.devices.cia402.states import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     FOLLOWS_TARGET,
+    OFF,
     SHUTDOWN,
     SWITCH_ON,
     DriveState,
@@ -24,14 +25,6 @@ _STEPS_UP = (
     (SWITCH_ON, DriveState.SWITCHED_ON),
     (ENABLE_OPERATION, DriveState.OPERATION_ENABLED),
 )
-_OFF = (
-    DriveState.NOT_READY,
-    DriveState.SWITCH_ON_DISABLED,
-    DriveState.READY,
-    DriveState.SWITCHED_ON,
-    DriveState.FAULT,
-)
-"""States in which the motor exerts no torque."""
 _SILENT_TURNS = 10
 _SILENT_TURNS_IN_LOCK_STEP = 3
 """SYNCs in a row without an answer after which stepping up gives up."""
@@ -81,11 +74,17 @@ def switch_off(node: Node) -> bool:
     Returns
     -------
     bool
-        Whether the drive has shown or confirmed it. If not, its node has been stopped, as far as
-        it takes frames at all.
+        Whether the drive has shown it in its statusword. If not, its node has been stopped, as far
+        as it takes frames at all.
     """
-    if _switch_off_by_pdo(node) or node.write(node.frames.disable_voltage, CONTROLWORD, 0):
+    if _switch_off_by_pdo(node):
         return True
+    # That the drive has taken the command by SDO does not say that it has followed it.
+    if node.write(node.frames.disable_voltage, CONTROLWORD, 0):
+        give_up_ns = time.monotonic_ns() + _SWITCH_OFF_NS
+        while time.monotonic_ns() < give_up_ns:
+            if node.is_off():
+                return True
     node.send_if_possible(node.frames.stop)
     return False
 
@@ -160,7 +159,11 @@ def _switch_off_by_pdo(node: Node) -> bool:
         while time.monotonic_ns() - started_ns <= _SWITCH_OFF_NS:
             # At SYNC the torque of the RPDO takes effect, and the statusword is read.
             node.exchange.send(idle)
-            if node.sync() and state_of(node.inbox.statusword) in _OFF:
+            answered = node.sync()
+            # The drive may take its time, for a ramp, and must not miss the loop meanwhile.
+            node.now_ns += node.period_ns
+            node.send_heartbeat()
+            if answered and state_of(node.inbox.statusword) in OFF:
                 return True
             node.await_grid(node.sync_ns)
     except (DeviceError, OSError):

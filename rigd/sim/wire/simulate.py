@@ -16,7 +16,7 @@ from typing import Any
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
-from rigd.devices.simulator import SimulatorAddress, announce, find_simulator, forget
+from rigd.devices.simulator import SimulatorAddress, announce, described, find_simulator, forget
 from rigd.sim.devices import SimulatedRig
 from rigd.sim.wire.control import ControlSocket, ask
 from rigd.sim.wire.faults import Fault, FaultError, parse_fault
@@ -99,6 +99,8 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     ------
     DeviceError
         If no simulated rig of that name runs, or it refuses.
+    FaultError
+        If a fault is not written as it should be; then none is injected.
     """
     address = find_simulator(rig_name)
     if address is None:
@@ -106,6 +108,8 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
             f"No simulated rig of the profile {rig_name} runs; start it with: rigd simulate "
             f"--profile {rig_name}"
         )
+    for spec in specs:
+        parse_fault(spec)  # all of them, before the first one happens
     if not specs:
         return [f"{name}: {value}" for name, value in ask(address, {"status": True}).items()]
     return [str(ask(address, {"inject": spec})["injected"]) for spec in specs]
@@ -145,6 +149,7 @@ class _Process:
             can_socket=can_socket,
             serial_port="" if self._line is None else self._line.port,
             lock_step=options.lock_step,
+            rig=described(rig),
         )
 
     def start(self) -> None:

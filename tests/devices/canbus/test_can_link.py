@@ -1,10 +1,12 @@
 """The bus that devices share: opened by the first, closed by the last."""
 
+import os
 import socket
 
 import pytest
 
 from rigd.devices.canbus import CanLink
+from rigd.devices.canbus.lock import BusLock
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.simulator import SimulatorAddress
@@ -82,3 +84,17 @@ def test_a_bus_that_does_not_open_counts_no_user():
     link.close()
     with pytest.raises(DeviceError, match="not open"):
         _ = link.exchange
+
+
+def test_a_bus_is_used_by_one_program_at_a_time(runtime_folder):
+    first, second = BusLock("can0"), BusLock("can0")
+    first.acquire()
+    with pytest.raises(DeviceError, match=rf"another rigd is using it \(process {os.getpid()}\)"):
+        second.acquire()
+    other = BusLock("can1")
+    other.acquire()
+    other.release()
+    first.release()
+    second.acquire()
+    second.release()
+    second.release()

@@ -192,8 +192,12 @@ def test_a_drive_that_takes_no_pdo_any_more_is_switched_off_by_sdo(make_drive, r
     scripted.seen.clear()
     drive.disable()
     assert scripted.state == "switch-on disabled"
-    assert scripted.frames(0x605) == [bytes.fromhex("2B40600000000000")]
+    assert scripted.frames(0x605) == [
+        bytes.fromhex("2B40600000000000"),  # off,
+        bytes.fromhex("4041600000000000"),  # and is it?
+    ]
     assert scripted.frames(0x000) == []
+    assert drive.off_doubt == ""
 
 
 def test_an_old_statusword_does_not_show_that_the_drive_is_off(make_drive, rig, scripted):
@@ -324,3 +328,36 @@ class TestByTheClock:
         scripted.drop = 10**9
         with pytest.raises(DeviceError, match="does not answer SYNC"):
             drive.connect()
+
+
+def test_a_drive_that_takes_the_command_and_stays_on_is_told_and_left_to_its_own_watch(
+    make_drive, rig, scripted
+):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
+    drive.connect()
+    drive.enable()
+    scripted.obeys = False
+    scripted.seen.clear()
+    drive.disable()
+    assert "does not show that it is off (statusword 0x1" in drive.off_doubt
+    assert scripted.has_got(0x000, bytes([2, 5]))  # NMT stop
+    drive.close()
+    written = [(index, sub) for index, sub, _ in scripted.writes]
+    assert (0x1016, 1) not in written[written.index((0x6060, 0)) :]
+
+
+def test_a_drive_that_went_off_leaves_no_doubt(make_drive, rig, scripted):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
+    drive.connect()
+    drive.enable()
+    drive.disable()
+    assert drive.off_doubt == ""
+
+
+def test_what_a_drive_adds_or_limits_by_itself_is_set_right(make_drive, rig, scripted):
+    scripted.objects |= {(0x60B2, 0): 40, (0x60E0, 0): 150, (0x60E1, 0): 1800}
+    make_drive(rig).connect()
+    changed = {index: value for index, _, value in scripted.writes}
+    assert changed[0x60B2] == 0
+    assert changed[0x60E0] == changed[0x6072]
+    assert (0x60E1 in changed) == (changed[0x6072] != 1800)
