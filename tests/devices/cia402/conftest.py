@@ -69,6 +69,7 @@ class ScriptedDrive(threading.Thread):
         self.error = None
         self.state = "switch-on disabled"
         self.nmt = 0x7F
+        self.stops = True
         self.position, self.torque = 1000, 0
         self.pending = None  # controlword and torque of an RPDO that waits for SYNC
         self.control = 0
@@ -175,7 +176,7 @@ class ScriptedDrive(threading.Thread):
     def _take(self, can_id, data):
         if can_id == 0 and data[1] in (0, NODE):
             self.nmt = {1: 5, 2: 4, 128: 0x7F}[data[0]]
-            if self.nmt == 4:
+            if self.nmt == 4 and self.stops:
                 self.state, self.torque = "switch-on disabled", 0
             self.heartbeat()
         elif can_id == 0x80:

@@ -336,7 +336,7 @@ def test_a_drive_that_takes_the_command_and_stays_on_is_told_and_left_to_its_own
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()
     drive.enable()
-    scripted.obeys = False
+    scripted.obeys = scripted.stops = False
     scripted.seen.clear()
     drive.disable()
     assert "does not show that it is off (statusword 0x1" in drive.off_doubt
