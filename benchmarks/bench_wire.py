@@ -5,9 +5,9 @@
 A simulated rig answers from another process. In blocks of 250 ticks at 1 kHz, in turn, our drivers
 and a bare loop of socket and struct do the same exchange with the same devices on the same sockets:
 SYNC, RPDO and TPDO with the drive, request and two replies (or seven records) with the sensor, and
-the values in N, N·m and rad. The replies are those of the tick before, so that no time is spent
-waiting for the other process. The first ticks of a block, which find the other one's replies, do
-not count.
+the values in N, N·m and rad. Between asking and taking the replies both sleep, so that no time is
+spent waiting for the other process: what is measured is the work before and after. The first ticks
+of a block, which find the other one's replies, do not count.
 """
 
 import os
@@ -36,7 +36,9 @@ from rigd.profile import load_profile
 
 BLOCKS, TICKS, SETTLING = 20, 250, 20
 PERIOD_NS = 1_000_000
-Exchange = Callable[[int], None]
+PAUSE_S = 600e-6
+Exchange = tuple[Callable[[int], None], Callable[[], None]]
+"""Asks, and takes what has come."""
 
 
 class OpenLink:
@@ -56,14 +58,16 @@ class OpenLink:
 def ours(drive: Cia402Drive, sensor: WrenchSensor) -> Exchange:
     """Return a tick as the cycle does it."""
 
-    def tick(due_ns: int) -> None:
+    def ask(due_ns: int) -> None:
         drive.latch(due_ns)
         sensor.request(due_ns)
+
+    def take() -> None:
         drive.read_angle()
         sensor.read_wrench()
         drive.command(0.0)
 
-    return tick
+    return ask, take
 
 
 class Bare:
@@ -89,9 +93,17 @@ class Bare:
         self.angle_rad = 0.0
         self.wrench: Wrench = (0.0,) * 6
 
-    def _drive(self) -> dict[bytes, bytes]:
+    def ask_drive(self, due_ns: int) -> None:  # noqa: ARG002
+        """Ask the drive; the sensor on the serial line is not asked."""
+        self.link.send(self.sync)
+
+    def ask_both(self, due_ns: int) -> None:  # noqa: ARG002
+        """Ask the drive and the sensor on the bus."""
+        self.link.send(self.sync)
+        self.link.send(self.request)
+
+    def _frames(self) -> dict[bytes, bytes]:
         link = self.link
-        link.send(self.sync)
         self.ticks += 1
         if self.ticks % 10 == 0:
             link.send(self.heartbeat)
@@ -104,10 +116,9 @@ class Bare:
             found[raw[:4]] = raw
         return found
 
-    def can(self, due_ns: int) -> None:  # noqa: ARG002
-        """Do a tick with the sensor on the bus."""
-        found = self._drive()
-        self.link.send(self.request)
+    def take_can(self) -> None:
+        """Take the replies of drive and sensor on the bus, and answer."""
+        found = self._frames()
         for key, raw in found.items():
             if key == b"\x81\x01\0\0":
                 self.angle_rad = self.tpdo(raw, 8)[1] * self.step
@@ -121,9 +132,9 @@ class Bare:
             )
         self.link.send(self.rpdo.pack(0x201, 4, 0x0F, 0))
 
-    def serial(self, due_ns: int) -> None:  # noqa: ARG002
-        """Do a tick with the sensor on the serial line, whose port is `self.port`."""
-        found = self._drive()
+    def take_serial(self) -> None:
+        """Take the drive's reply and the records on the line `self.port`, and answer."""
+        found = self._frames()
         raw = found.get(b"\x81\x01\0\0")
         if raw:
             self.angle_rad = self.tpdo(raw, 8)[1] * self.step
@@ -149,12 +160,16 @@ def alternate(exchanges: dict[str, Exchange]) -> dict[str, list[int]]:
     times: dict[str, list[int]] = {name: [] for name in exchanges}
     due_ns = time.monotonic_ns() + 2 * PERIOD_NS
     for _ in range(BLOCKS):
-        for name, tick in exchanges.items():
+        for name, (ask, take) in exchanges.items():
             for index in range(TICKS):
                 time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
                 start = time.perf_counter_ns()
-                tick(due_ns)
+                ask(due_ns)
                 spent = time.perf_counter_ns() - start
+                time.sleep(PAUSE_S)
+                start = time.perf_counter_ns()
+                take()
+                spent += time.perf_counter_ns() - start
                 if index >= SETTLING:
                     times[name].append(spent)
                 due_ns += PERIOD_NS
@@ -168,7 +183,6 @@ def compare(profile_name: str) -> None:
     profile = load_profile(profile_name)
     rig = replace(
         profile.rig,
-        acquisition=replace(profile.rig.acquisition, mode="previous_tick"),
         # A pause of this machine must not end the comparison.
         cia402=replace(profile.rig.cia402, heartbeat_timeout_s=5.0, drive_heartbeat_timeout_s=5.0),
     )
@@ -184,10 +198,10 @@ def compare(profile_name: str) -> None:
             drive.connect()
             sensor.connect()
             bare = Bare(link, sensor.calibration(), rig.encoder.resolution_rad)
-            exchange = bare.can
+            exchange: Exchange = bare.ask_both, bare.take_can
             if rig.ati_serial:
                 bare.port = os.open(address.serial_port, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
-                exchange = bare.serial
+                exchange = bare.ask_drive, bare.take_serial
             drive.enable()
             times = alternate({"rigd": ours(drive, sensor), "bare": exchange})
             report(profile_name, times)
