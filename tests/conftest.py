@@ -1,5 +1,6 @@
 """Settings that must stand before numpy is imported, and the simulated rig as a process."""
 
+import atexit
 import os
 import shutil
 import subprocess
@@ -14,6 +15,11 @@ import pytest
 os.environ.update(
     dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 )
+
+# No test meets a rig that somebody simulates on this computer, nor one of another worker.
+_RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
+os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
+atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 RIGD = Path(sys.executable).parent / "rigd"
 
