@@ -3,12 +3,10 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rigd.devices.ati.stream import RECORD_BITS
 from rigd.devices.parameters import AtiSerial
 from rigd.profile.settings import WIRING, fields_of
 
-_BITS_PER_BYTE = 11
-"""On the serial line: start, eight data, parity, stop."""
-_BYTES_PER_RECORD = 13
 _PER_MILLE_LIMIT = 32.767
 """Largest torque over rated torque that fits the 16 bits of object 6071."""
 _ROUNDING = 1e-9
@@ -94,7 +92,7 @@ def _serial(values: Mapping[str, Any]) -> Iterator[str]:
             'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
         )
     baud, stream_hz = values["ati_serial.baud"], values["ati_serial.stream_hz"]
-    most_hz = baud / (_BITS_PER_BYTE * _BYTES_PER_RECORD)
+    most_hz = baud / RECORD_BITS
     if stream_hz > most_hz:
         yield (
             f"ati_serial.stream_hz = {stream_hz:g} Hz does not fit ati_serial.baud = {baud}, which "
