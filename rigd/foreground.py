@@ -1,7 +1,6 @@
 """Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
 
 import contextlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,47 +9,29 @@ import typer
 
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
-from rigd.crew import Crew
-from rigd.daemon import (
-    Order,
-    SessionFailedError,
-    SessionProgress,
-    SessionResult,
-    choose_path,
-    run_session,
-    start_live,
-    what_is_kept,
-    with_seed,
-)
-from rigd.devices.registry import (
-    Reality,
-    UnknownDeviceError,
-    check_selection,
-    objections,
-    reality,
-    simulated_differently,
-)
+from rigd.devices.registry import Reality, UnknownDeviceError, simulated_differently
 from rigd.engine.board import Phase
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, ExcitationError
 from rigd.planning import Plan, RefusedError, plan_session
-from rigd.profile import Profile, ProfileError, load_profile
+from rigd.profile import Profile, ProfileError
+from rigd.supervisor.crew import Crew
+from rigd.supervisor.lock import RigBusyError, RigLock
+from rigd.supervisor.orders import Order, choose_path, load_rig, make_room, what_is_kept
+from rigd.supervisor.rig import Rig, RigError
+from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult
 
 _PHASES = {
     Phase.PREPARING: "preparing",
     Phase.SETTLING: "settling",
+    Phase.WAITING: "waiting for the beam to rest",
     Phase.TARING: "taring",
     Phase.READY: "ready",
     Phase.RUNNING: "recording",
     Phase.RETURNING: "returning",
     Phase.OFF: "drive off",
 }
-
-# Uncompressed, with the controller's terms and the index; a file never takes more.
-_BYTES_PER_TICK = 180
-_BYTES_SPARE = 1_000_000
-
 
 Tell = Callable[[str], None]
 
@@ -90,7 +71,7 @@ def run_in_foreground(
     build
         Makes the excitation for a rate in Hz.
     crew
-        The processes of the first session, started but not yet needed.
+        The processes, started but not yet needed; ended when this returns.
     stop
         The operator's.
     profile_name
@@ -98,7 +79,8 @@ def run_in_foreground(
     folder
         Where the files go; made if it does not exist.
     repeat, seed, notes, fast, live, force
-        As on the command line. Each session of a series has its own seed, counted up.
+        As on the command line. The sessions of a series follow each other on one connection: each
+        waits until the beam has come to rest.
     quiet_stdout
         Tell the operator on standard error, because standard output is for a document.
     prepare
@@ -112,40 +94,41 @@ def run_in_foreground(
     tell: Tell = partial(_tell, err=quiet_stdout)
     path: Path | None = None
     results: list[SessionResult] = []
-    excitation: Excitation | None = None
     try:
-        profile, moving = _load(profile_name, fast=fast, seed=seed)
-        if prepare is not None:
-            profile = prepare(profile)
-        if moving in (Reality.SIMULATOR, Reality.LOCK_STEP):
-            tell(f"No hardware: {profile.name} is simulated ({moving.value}).")
-            for difference in simulated_differently(profile.rig):
-                tell(f"Warning: the simulated rig has {difference}.")
-        for number in range(repeat):
-            with crew if number == 0 else Crew(live=live) as crew:
-                if excitation is None:
-                    excitation = build(profile.rig.rate_hz)
-                    plan = plan_session(profile, excitation, force=force)
-                    _tell_plan(tell, profile, excitation, plan)
+        with contextlib.ExitStack() as ending:
+            ending.enter_context(crew)
+            profile, moving = load_rig(profile_name, fast=fast, seed=seed)
+            if prepare is not None:
+                profile = prepare(profile)
+            if moving in (Reality.SIMULATOR, Reality.LOCK_STEP):
+                tell(f"No hardware: {profile.name} is simulated ({moving.value}).")
+                for difference in simulated_differently(profile.rig):
+                    tell(f"Warning: the simulated rig has {difference}.")
+            alone = not (fast and moving is Reality.SIMULATED)
+            ending.enter_context(RigLock(profile.name, "rigd run", alone=alone))
+            excitation = build(profile.rig.rate_hz)
+            plan = plan_session(profile, excitation, force=force)
+            _tell_plan(tell, profile, excitation, plan)
+            make_room(folder, excitation)
+            rig = Rig(profile, fast=fast, crew=crew)
+            if not stop.requested:
+                rig.connect()
+            for number in range(1, repeat + 1):
                 if stop.requested:
                     break
-                _lay_out(crew, profile.rig.rate_hz)
-                _make_room(folder, excitation)
-                path = choose_path(folder, excitation.kind, number + 1 if repeat > 1 else None)
-                order = Order(
-                    profile=_seeded(profile, number),
-                    excitation=excitation,
-                    path=path,
-                    fast=fast,
-                    notes=tuple((name, text) for name, text in notes.items() if text),
-                )
+                make_room(folder, excitation)
+                path = choose_path(folder, excitation.kind, number if repeat > 1 else None)
+                given = {name: text for name, text in notes.items() if text}
+                if repeat > 1:
+                    given["series"] = f"{number} of {repeat}"
+                order = Order(profile, excitation, path, tuple(given.items()))
                 if live:
-                    tell(start_live(crew, order))
+                    tell(rig.show(order))
                 with _ProgressView(excitation.reference_rad.size) as view:
-                    results.append(run_session(order, crew, stop, view.update))
-            _tell_result(tell, results[-1])
-            if not results[-1].went_well:
-                break
+                    results.append(rig.run(order, stop, view.update))
+                _tell_result(tell, results[-1])
+                if not results[-1].went_well:
+                    break
     except (
         ProfileError,
         UnknownDeviceError,
@@ -155,7 +138,9 @@ def run_in_foreground(
         RealisationError,
     ) as error:
         raise ForegroundError(str(error), wrong_use=True) from error
-    except SessionFailedError as error:
+    except RigBusyError as error:
+        raise ForegroundError(str(error), wrong_use=False) from error
+    except (SessionFailedError, RigError) as error:
         kept = "" if path is None else f" The drive is disabled. {what_is_kept(path)}"
         raise ForegroundError(f"{error}{kept}", wrong_use=False, results=results) from error
     return results
@@ -164,61 +149,6 @@ def run_in_foreground(
 def _tell(text: str, *, err: bool) -> None:
     with contextlib.suppress(OSError):  # the terminal is gone; the session is not
         typer.echo(text, err=err)
-
-
-def _lay_out(crew: Crew, rate_hz: float) -> None:
-    try:
-        crew.lay_out(rate_hz)
-    except OSError as error:
-        raise SessionFailedError(
-            f"There is not enough shared memory for the processes of a session "
-            f"({error.strerror}); free some in /dev/shm."
-        ) from error
-
-
-def _make_room(folder: Path, excitation: Excitation) -> None:
-    """Make the folder, and see that a session fits on its disk."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        raise RefusedError(
-            f"--output {folder}: cannot be made a folder ({error.strerror}); choose another."
-        ) from error
-    needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
-    if free < needed:
-        raise RefusedError(
-            f"--output {folder}: {free / 1e6:.1f} MB are free on its disk and the session may take "
-            f"{needed / 1e6:.1f} MB; make room or choose another folder."
-        )
-
-
-def _load(name: str, *, fast: bool, seed: int | None) -> tuple[Profile, Reality]:
-    profile = load_profile(name)
-    check_selection(profile.rig.devices)
-    refusals = objections(profile.rig)
-    if refusals:
-        raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
-    moving = reality(profile.rig)
-    if fast and not moving.any_clock:
-        raise RefusedError(
-            f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
-            "skipped; leave the option out."
-            + (" Or start rigd simulate with --lock-step." if moving is Reality.SIMULATOR else "")
-        )
-    if seed is not None:
-        if moving is not Reality.SIMULATED:
-            raise RefusedError(
-                f"--seed: the noise of {moving.value} of {profile.path} is not made here; leave "
-                "the option out."
-            )
-        profile = with_seed(profile, seed)
-    return profile, moving
-
-
-def _seeded(profile: Profile, number: int) -> Profile:
-    simulation = profile.rig.simulation
-    return profile if simulation is None else with_seed(profile, simulation.seed + number)
 
 
 def _tell_plan(tell: Tell, profile: Profile, excitation: Excitation, plan: Plan) -> None:

@@ -49,8 +49,8 @@ def reset(profile: ProfileName = "sim") -> None:
     """
     _end_as_by_ctrl_c()
     rig_profile = _openable_profile(profile)
-    from rigd.checks.reset import reset_drive
     from rigd.devices.contracts import DeviceError
+    from rigd.devices.resetting import reset_drive
 
     try:
         typer.echo(reset_drive(rig_profile.rig))

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rigd.cli.crew import start_crew
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed, profile_named
-from rigd.cli.start import start_crew
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,10 +102,10 @@ def _run_sessions(
     Returns the files of the two: the trial's controller is too slow for its passes to count.
     """
     stop, crew = start_crew(live=False)
-    from rigd.crew import Crew
     from rigd.engine.signals import ignore
     from rigd.foreground import ForegroundError, run_in_foreground
     from rigd.identification import experiments, tuning
+    from rigd.supervisor.crew import Crew
 
     def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
         prepared: list[Profile] = []

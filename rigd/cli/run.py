@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rigd.cli.crew import start_crew
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed
-from rigd.cli.start import start_crew
 
 if TYPE_CHECKING:
-    from rigd.daemon import SessionResult
     from rigd.excitation import Excitation
+    from rigd.supervisor.session import SessionResult
 
 run_app = typer.Typer(
     help="Run one or more sessions in the foreground; Ctrl-C stops safely.\n\n"

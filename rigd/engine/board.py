@@ -13,9 +13,10 @@ from rigd.engine.ring import reserve
 
 
 class Phase(IntEnum):
-    """Where the control process is in a session."""
+    """Where the control process is."""
 
     PREPARING = 0
+    """Connecting the devices."""
     SETTLING = 1
     """Drive enabled, the motor held where it stands."""
     TARING = 2
@@ -24,7 +25,9 @@ class Phase(IntEnum):
     RUNNING = 4
     RETURNING = 5
     OFF = 6
-    """Torque is zero and the drive is disabled."""
+    """Torque is zero and the drive is disabled: between sessions, and at the end."""
+    WAITING = 7
+    """Until the beam is at rest, before the tare."""
 
 
 class Stop(IntEnum):
@@ -41,15 +44,25 @@ class Word(IntEnum):
     # Written by the supervisor
     STOP = 0
     GO = 1
+    SUPERVISOR_BEAT = 2
+    """Beats count up several times a second: whoever does not beat hangs."""
     # Written by the control process
-    PHASE = 2
-    START_UTC_NS = 3
-    SCHEDULED = 4
-    MISSED = 5
-    LATE = 6
-    LOST = 7
+    PHASE = 3
+    START_UTC_NS = 4
+    SCHEDULED = 5
+    MISSED = 6
+    LATE = 7
+    LOST = 8
+    ANGLE_NRAD = 9
+    """The last readings, and the torque that stands, in 1e-9 rad and 1e-9 N·m."""
+    COUPLING_TORQUE_NNM = 10
+    TORQUE_COMMAND_NNM = 11
+    CONTROL_BEAT = 12
+    # Written by the recorder
+    RECORDER_BEAT = 13
     # Written by the live publisher
-    LIVE_DROPPED = 8
+    LIVE_DROPPED = 14
+    LIVE_BEAT = 15
 
 
 class Board:
@@ -75,6 +88,10 @@ class Board:
     def word(self, word: Word) -> "memoryview[int]":
         """Return a view of one word, the quickest way to it: ``view[0]``."""
         return self._words[word : word + 1]
+
+    def beat(self, word: Word) -> None:
+        """Show that the process that this word belongs to is at work."""
+        self._words[word] += 1
 
     def close(self) -> None:
         """Unmap the memory; the descriptor stays open for whoever else inherited it."""

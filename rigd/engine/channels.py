@@ -1,82 +1,77 @@
-"""The shared memory of one session: four rings and the board, made by the supervisor."""
+"""The shared memory of a rig's processes: a ring for each topic, and the board."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rigd.engine.board import Board, Stop, Word
-from rigd.engine.events import EVENT_SIZE
 from rigd.engine.ring import Ring, RingSpec
-from rigd.session.format import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
+from rigd.engine.topics import TOPICS
 
-BUFFERED_S = 16.0
-"""What the rings hold, so that no stall of a disk loses a sample."""
-CONTROL_DECIMATION = 10
-"""The controller's terms are logged every so many ticks."""
-_EVENTS = 256
+DESCRIPTORS = len(TOPICS) + 1
+"""Of shared memory, for :func:`create_channels`."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelSpecs:
     """What a child process needs to attach."""
 
-    samples: RingSpec
-    controls: RingSpec
-    timings: RingSpec
-    events: RingSpec
+    rings: tuple[RingSpec, ...]
+    """In the order of :data:`rigd.engine.topics.TOPICS`."""
     board_fd: int
 
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The rings and the board, attached."""
+    """The rings, in the order of :data:`rigd.engine.topics.TOPICS`, and the board."""
 
-    samples: Ring
+    events: Ring
     controls: Ring
     timings: Ring
-    events: Ring
+    samples: Ring
     board: Board
+
+    @property
+    def rings(self) -> tuple[Ring, ...]:
+        """All rings, in the order of the table."""
+        return (self.events, self.controls, self.timings, self.samples)
 
     @property
     def specs(self) -> ChannelSpecs:
         """What to hand to a child process."""
-        return ChannelSpecs(
-            self.samples.spec,
-            self.controls.spec,
-            self.timings.spec,
-            self.events.spec,
-            self.board.fd,
-        )
+        return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
 
     def ask_to_stop(self) -> None:
         """Ask the control process to stop, unless that was done before."""
         if self.board[Word.STOP] == Stop.NO:
             self.board[Word.STOP] = Stop.OPERATOR
 
+    def clear(self) -> None:
+        """Forget what the last session left; only while no recorder is at work."""
+        for ring in self.rings:
+            ring.discard()
+
     def close(self) -> None:
         """Unmap the memory; the descriptors stay open."""
-        for part in (self.samples, self.controls, self.timings, self.events, self.board):
-            part.close()
+        for ring in self.rings:
+            ring.close()
+        self.board.close()
 
 
 def create_channels(rate_hz: float, fds: Sequence[int]) -> Channels:
-    """Lay out the memory of one session at ``rate_hz`` in five descriptors of shared memory."""
-    samples, controls, timings, events, board = fds
-    ticks = int(rate_hz * BUFFERED_S)
-    return Channels(
-        samples=Ring.create(SAMPLE_SIZE, ticks, samples),
-        controls=Ring.create(CONTROL_SIZE, ticks // CONTROL_DECIMATION + 1, controls),
-        timings=Ring.create(TIMING_SIZE, ticks, timings),
-        events=Ring.create(EVENT_SIZE, _EVENTS, events),
-        board=Board.create(board),
-    )
+    """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory."""
+    *for_rings, for_board = fds
+    rings = [
+        Ring.create(topic.record_size, topic.capacity(rate_hz), fd)
+        for topic, fd in zip(TOPICS, for_rings, strict=True)
+    ]
+    return _together(rings, Board.create(for_board))
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
     """Attach in a child process to what the supervisor made."""
-    return Channels(
-        Ring(specs.samples),
-        Ring(specs.controls),
-        Ring(specs.timings),
-        Ring(specs.events),
-        Board(specs.board_fd),
-    )
+    return _together([Ring(spec) for spec in specs.rings], Board(specs.board_fd))
+
+
+def _together(rings: Sequence[Ring], board: Board) -> Channels:
+    events, controls, timings, samples = rings
+    return Channels(events, controls, timings, samples, board)

@@ -1,5 +1,11 @@
-"""The control process: it alone talks to the devices, and it never leaves the torque on."""
+"""The control process: it alone talks to the devices, and it never leaves the torque on.
 
+It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
+the supervisor orders, one after the other. A device that fails ends it: connecting anew is the
+operator's decision.
+"""
+
+from collections.abc import Callable
 from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
@@ -10,13 +16,20 @@ from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.clocks import Clock, RealClock, VirtualClock
 from rigd.engine.cycle import Cycle
 from rigd.engine.events import Event, write_event
-from rigd.engine.jobs import ControlJob
-from rigd.engine.procedure import Procedure, SessionEnd
-from rigd.engine.process import Parent
+from rigd.engine.jobs import ControlJob, SessionJob
+from rigd.engine.metronome import Metronome
+from rigd.engine.procedure import LOOK_EVERY, Procedure, SessionEnd, show
+from rigd.engine.process import Message, Parent
 from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
+from rigd.engine.rest import AXES, Rest, observe_rest
 from rigd.engine.signals import StopRequest
 from rigd.profile import Profile
 from rigd.safety import LimitWatch
+
+_SILENCE_S = 1.0
+"""For which a device may be silent between sessions."""
+_STANDSTILL_POLL_S = 0.05
+_ZERO_S = 0.2
 
 
 def main() -> None:
@@ -34,14 +47,14 @@ def main() -> None:
     try:
         devices = open_devices(job.profile.rig)
     except DeviceError as error:
-        parent.send(finished="fault", reason=str(error), counts={}, results={})
+        parent.send(ended=str(error))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    conduct(job, devices, clock, channels, parent, stop, obtained)
+    attend(job.profile, devices, clock, channels, parent, stop, obtained)
 
 
-def conduct(
-    job: ControlJob,
+def attend(
+    profile: Profile,
     devices: Devices,
     clock: Clock,
     channels: Channels,
@@ -49,12 +62,12 @@ def conduct(
     stop: StopRequest,
     obtained: dict[str, str],
 ) -> None:
-    """Run one session on `devices`, whatever happens, to a disabled drive and a final message.
+    """Own `devices` from connecting to closing, whatever happens, and say last why it ended.
 
     Parameters
     ----------
-    job
-        What to run.
+    profile
+        Of the rig.
     devices
         Not yet connected.
     clock, channels, parent, stop
@@ -62,63 +75,242 @@ def conduct(
     obtained
         The real-time settings that were granted, for the file.
     """
-    rig = job.profile.rig
-    cycle = Cycle(
-        devices,
-        rig.sensor.projection,
-        _controller(job.profile),
-        LimitWatch(job.profile.limits, rig.sensor.range, rig.rate_hz),
-    )
-    _warn_of_refusals(channels, obtained)
-    outcome, reason = "complete", ""
-    recorded = False
-    procedure: Procedure | None = None
+    failure = ""
     try:
         # The drive last: once it is operational it expects a SYNC every period.
         devices.sensor.connect()
         devices.drive.connect()
-        calibration = devices.sensor.calibration()
-        procedure = Procedure(job.profile, job.excitation, cycle, clock, channels, parent, stop)
-        tare = procedure.tare()
-        devices.drive.enable()
-        procedure.hold()
+        attendance = _Attendance(profile, devices, clock, channels, parent, stop, obtained)
         parent.send(
-            ready=tare,
-            calibration=calibration,
+            connected=True,
+            calibration=devices.sensor.calibration(),
             realtime=obtained,
             simulated=devices.simulated,
         )
-        procedure.wait_for_go()
-        procedure.record()
-        recorded = True
-        procedure.go_back()
-        cycle.torque_off()
-        procedure.check_tare()
-    except SessionEnd as end:
-        outcome, reason = end.outcome, end.reason
+        attendance.serve()
     except (DeviceError, OSError) as error:
-        outcome, reason = "fault", str(error)
+        failure = str(error)
     finally:
         devices.drive.disable()
         channels.board[Word.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    doubt = devices.drive.off_doubt
-    if doubt:
-        outcome, reason = "fault", f"{reason} {doubt}".strip()
-    if recorded and reason:
-        # What happens after the last tick does not make the record any less complete.
-        outcome, reason = "complete", f"After the record: {reason}"
-    counts = asdict(procedure.counts) if procedure is not None else {}
-    results = procedure.results if procedure is not None else {}
-    parent.send(finished=outcome, reason=reason, counts=counts, results=results)
+    parent.send(ended=f"{failure} {devices.drive.off_doubt}".strip())
 
 
-def _warn_of_refusals(channels: Channels, obtained: dict[str, str]) -> None:
-    refused = [f"{name} ({text})" for name, text in obtained.items() if text.startswith(REFUSED)]
-    if refused:
-        message = f"The system did not grant {', '.join(refused)}: more ticks will be late."
-        write_event(channels.events, Event(0, "warning", message))
+class _Attendance:
+    """Connected devices, and what is ordered of them."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        devices: Devices,
+        clock: Clock,
+        channels: Channels,
+        parent: Parent,
+        stop: StopRequest,
+        obtained: dict[str, str],
+    ) -> None:
+        self._profile = profile
+        self._devices = devices
+        self._clock = clock
+        self._metronome = Metronome(clock, profile.rig.rate_hz)
+        self._channels = channels
+        self._board = channels.board
+        self._parent = parent
+        self._stop = stop
+        self._obtained = obtained
+        self._zero_rad = 0.0
+        self._silent = 0
+        self._cycle = self._make_cycle(profile)
+
+    def serve(self) -> None:
+        """Do what the supervisor orders, until it is gone or a stop is asked for between sessions.
+
+        Raises
+        ------
+        DeviceError, OSError
+            If a device failed.
+        """
+        self._board[Word.PHASE] = Phase.OFF
+        while (message := self._await_order()) is not None:
+            if "session" in message:
+                self._run_session(message["session"])
+            elif "tare" in message:
+                self._answer(self._tare)
+            elif "zero" in message:
+                self._answer(self._zero)
+
+    def _await_order(self) -> Message | None:
+        """Observe with the torque off until there is something to do; None: nothing any more.
+
+        Virtual time stands still meanwhile.
+        """
+        while not self._stop.requested:
+            show(self._board, self._cycle)
+            try:
+                message = self._parent.poll(_STANDSTILL_POLL_S if self._clock.virtual else 0.0)
+            except EOFError:
+                return None
+            if message is not None:
+                return message
+            if not self._clock.virtual:
+                self._observe()
+        return None
+
+    def _observe(self) -> None:
+        """Read the devices for some ticks, the torque off."""
+        cycle, metronome = self._cycle, self._metronome
+        for _ in range(LOOK_EVERY):
+            metronome.wait()
+            cycle.observe(metronome.due_ns)
+            self._silent = self._silent + 1 if cycle.stale else 0
+        if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
+            raise DeviceError(
+                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; see whether the device "
+                "is on and connected."
+            )
+
+    def _run_session(self, job: SessionJob) -> None:
+        """Run one session to a disabled drive and a final message, whatever happens.
+
+        Raises
+        ------
+        DeviceError
+            If a device failed: the message has been sent all the same.
+        """
+        board, devices = self._board, self._devices
+        for word in (Word.START_UTC_NS, Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST):
+            board[word] = 0
+        self._warn_of_refusals()
+        cycle = self._cycle = self._make_cycle(job.profile)
+        procedure = Procedure(
+            job.profile,
+            job.excitation,
+            cycle,
+            self._clock,
+            self._metronome,
+            self._channels,
+            self._parent,
+            self._stop,
+        )
+        outcome, reason = "complete", ""
+        recorded = device_failed = False
+        try:
+            tare = procedure.tare()
+            devices.drive.enable()
+            procedure.hold()
+            self._parent.send(ready=tare)
+            procedure.wait_for_go()
+            procedure.record()
+            recorded = True
+            procedure.go_back()
+            cycle.torque_off()
+            procedure.check_tare()
+        except SessionEnd as end:
+            outcome, reason, device_failed = end.outcome, end.reason, end.device_failed
+        except (DeviceError, OSError) as error:
+            outcome, reason, device_failed = "fault", str(error), True
+        finally:
+            devices.drive.disable()
+            cycle.torque_off()
+            board[Word.PHASE] = Phase.OFF
+            show(board, cycle)
+        doubt = devices.drive.off_doubt
+        if doubt:
+            outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
+        failure = reason
+        if recorded and reason:
+            # What happens after the last tick does not make the record any less complete.
+            outcome, reason = "complete", f"After the record: {reason}"
+        self._parent.send(
+            finished=outcome,
+            reason=reason,
+            counts=asdict(procedure.counts),
+            results=procedure.results,
+            device_failed=device_failed,
+        )
+        if device_failed:
+            raise DeviceError(failure)
+
+    def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
+        """Do something at rest and tell what came out, or why it could not be done."""
+        try:
+            self._parent.send(done=measure())
+        except SessionEnd as end:
+            self._parent.send(refused=end.reason)
+
+    def _tare(self) -> dict[str, object]:
+        """Average the sensor; each session does so for itself, this is for the operator's eyes."""
+        rest = self._rest(self._profile.session.tare_s)
+        self._cycle.tare = rest.mean
+        return {
+            "mean": dict(zip(AXES, rest.mean, strict=True)),
+            "std": dict(zip(AXES, rest.spread, strict=True)),
+            "torque_std_nm": rest.torque_spread_nm,
+        }
+
+    def _zero(self) -> dict[str, object]:
+        """Make the angle where the motor stands the rig's zero, to which its limits are relative.
+
+        Raises
+        ------
+        SessionEnd
+            If the motor moves.
+        """
+        rest = self._rest(_ZERO_S)
+        limit_rad_s = self._profile.session.rest_velocity_rad_s
+        if rest.speed_rad_s > limit_rad_s:
+            raise SessionEnd(
+                "fault",
+                f"The motor moves by {rest.speed_rad_s:.2g} rad/s, more than "
+                f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it stands still.",
+            )
+        moved_rad = self._cycle.angle_rad
+        self._zero_rad += moved_rad
+        self._cycle.zero_rad = self._zero_rad
+        self._cycle.angle_rad = 0.0
+        show(self._board, self._cycle)
+        return {"moved_rad": moved_rad}
+
+    def _rest(self, duration_s: float) -> Rest:
+        rig = self._profile.rig
+        return observe_rest(
+            self._cycle,
+            self._metronome,
+            rate_hz=rig.rate_hz,
+            duration_s=duration_s,
+            projection=rig.sensor.projection,
+            check=self._check_reading,
+        )
+
+    def _check_reading(self) -> None:
+        if self._metronome.tick % LOOK_EVERY == 0:
+            show(self._board, self._cycle)
+        if self._stop.requested or not self._parent.alive():
+            raise SessionEnd("stopped", "The rig is being shut down.")
+        silent = self._cycle.check_stale()
+        if silent is not None:
+            raise SessionEnd("fault", str(silent))
+
+    def _make_cycle(self, profile: Profile) -> Cycle:
+        rig = profile.rig
+        cycle = Cycle(
+            self._devices,
+            rig.sensor.projection,
+            _controller(profile),
+            LimitWatch(profile.limits, rig.sensor.range, rig.rate_hz),
+        )
+        cycle.zero_rad = self._zero_rad
+        return cycle
+
+    def _warn_of_refusals(self) -> None:
+        refused = [
+            f"{name} ({text})" for name, text in self._obtained.items() if text.startswith(REFUSED)
+        ]
+        if refused:
+            message = f"The system did not grant {', '.join(refused)}: more ticks will be late."
+            write_event(self._channels.events, Event(0, "warning", message))
 
 
 def _controller(profile: Profile) -> PidController:

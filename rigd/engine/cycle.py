@@ -30,8 +30,11 @@ class Cycle:
     ----------
     devices
         As given.
+    zero_rad
+        The drive's own angle at the rig's zero.
     angle_rad, raw_wrench, wrench, coupling_torque_nm
-        The last readings; wrench and torque are tared, the raw wrench is not.
+        The last readings, the angle from the rig's zero; wrench and torque are tared, the raw
+        wrench is not.
     torque_command_nm
         The torque that stands, after the limits.
     flags
@@ -52,6 +55,7 @@ class Cycle:
         self.controller = controller
         self.watch = watch
         self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.zero_rad = 0.0
         self.angle_rad = 0.0
         self.raw_wrench: Wrench = self.tare
         self.wrench: Wrench = self.tare
@@ -66,7 +70,7 @@ class Cycle:
         drive, sensor = self._drive, self._sensor
         drive.latch(due_ns)
         sensor.request(due_ns)
-        self.angle_rad = drive.read_angle()
+        self.angle_rad = drive.read_angle() - self.zero_rad
         self.raw_wrench = fx, fy, fz, tx, ty, tz = sensor.read_wrench()
         bx, by, bz, ox, oy, oz = self.tare
         px, py, pz, qx, qy, qz = self._projection
@@ -110,6 +114,17 @@ class Cycle:
             flags |= _TORQUE_SATURATED
         self.flags = flags
         return None
+
+    @property
+    def stale(self) -> bool:
+        """Whether a reading of the last tick did not come."""
+        return bool(self.flags & _STALE)
+
+    @property
+    def what_is_stale(self) -> str:
+        """Name what did not come in the last tick."""
+        names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
+        return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
 
     def check_stale(self) -> Violation | None:
         """Say whether a device has been silent for too long, after the reading of a tick."""

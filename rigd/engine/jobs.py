@@ -1,4 +1,4 @@
-"""What the processes of a session are told at their start."""
+"""What the processes of a rig are told: at their start, and for each session."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +10,21 @@ from rigd.profile import Profile
 
 @dataclass(frozen=True, slots=True)
 class ControlJob:
-    """The session to run."""
+    """The rig to attend to."""
 
     profile: Profile
-    excitation: Excitation
     channels: ChannelSpecs
     fast: bool
-    """Run under the virtual clock."""
+    """Under the virtual clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionJob:
+    """The session to run on it."""
+
+    profile: Profile
+    """The rig's; its controller and limits may be others."""
+    excitation: Excitation
 
 
 @dataclass(frozen=True, slots=True)

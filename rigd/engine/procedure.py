@@ -5,39 +5,63 @@ through the same cycle and leaves its results in the metadata.
 """
 
 import time
+from math import isfinite
 
 import numpy as np
 
-from rigd.devices.contracts import DeviceError, Wrench
-from rigd.engine.board import Phase, Stop, Word
+from rigd.devices.contracts import DeviceError
+from rigd.engine.board import Board, Phase, Stop, Word
 from rigd.engine.channels import Channels
 from rigd.engine.clocks import Clock
 from rigd.engine.cycle import Cycle
 from rigd.engine.events import Event, Level, write_event
 from rigd.engine.metronome import Metronome
 from rigd.engine.process import Parent
+from rigd.engine.rest import Rest, observe_rest
 from rigd.engine.sample_log import SampleLog
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 
-_AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 _SETTLE_S = 0.5
-_LOOK_EVERY = 64
+LOOK_EVERY = 64
 """Ticks between two looks at whether everybody is still there and keeps up."""
 _GO_POLL_S = 0.0002
 _GO_PATIENCE_S = 10.0
+_SUPERVISOR_PATIENCE_S = 2.0
+"""Of time that this process has run itself: a computer that stands still is nobody's fault."""
 _SWINGING = 2.0
 """Spread of the torque after a session, over that before it, from which on the beam is swinging."""
 
 
-class SessionEnd(Exception):
-    """A session ends before its time; carries the outcome and the reason."""
+def show(board: Board, cycle: Cycle) -> None:
+    """Show on the board that the control process is at work, and what it reads."""
+    board.beat(Word.CONTROL_BEAT)
+    for word, value in (
+        (Word.ANGLE_NRAD, cycle.angle_rad),
+        (Word.COUPLING_TORQUE_NNM, cycle.coupling_torque_nm),
+        (Word.TORQUE_COMMAND_NNM, cycle.torque_command_nm),
+    ):
+        if isfinite(value):
+            board[word] = round(value * 1e9)
 
-    def __init__(self, outcome: str, reason: str) -> None:
+
+class SessionEnd(Exception):
+    """A session ends before its time; carries the outcome and the reason.
+
+    Attributes
+    ----------
+    outcome, reason
+        For the file and for the operator.
+    device_failed
+        A device did not do what it was asked: it must be connected anew.
+    """
+
+    def __init__(self, outcome: str, reason: str, *, device_failed: bool = False) -> None:
         super().__init__(reason)
         self.outcome = outcome
         self.reason = reason
+        self.device_failed = device_failed
 
 
 class Procedure:
@@ -47,7 +71,7 @@ class Procedure:
     ----------
     profile, excitation
         What the operator chose; the excitation's reference is relative to the angle at the start.
-    cycle, clock
+    cycle, clock, metronome
         What a tick does, and when.
     channels
         Where samples, the controller's terms and events go.
@@ -63,6 +87,7 @@ class Procedure:
         excitation: Excitation,
         cycle: Cycle,
         clock: Clock,
+        metronome: Metronome,
         channels: Channels,
         parent: Parent,
         stop: StopRequest,
@@ -76,13 +101,16 @@ class Procedure:
         self._parent = parent
         self._stop = stop
         self._rate_hz = profile.rig.rate_hz
-        self._metronome = Metronome(clock, self._rate_hz)
+        self._metronome = metronome
+        self._looks_unanswered = 0
+        self._supervisor_beat = -1
         late_ns = int(profile.realtime.late_us * 1000)
         self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
         # Made a list now: of a long session that takes many periods.
         self._relative_reference: list[float] = excitation.reference_rad.tolist()
         self._start_angle_rad = 0.0
         self._rest_spread_nm = 0.0
+        self._recording = False
         self.counts = self._log.counts
         self.results: dict[str, str] = {}
         """What the record's outcome has to tell beside the counts."""
@@ -98,20 +126,10 @@ class Procedure:
         Raises
         ------
         SessionEnd
-            If the motor moves, or stands outside the limits.
+            If the rig does not come to rest in time, or stands outside the limits.
         """
-        self._board[Word.PHASE] = Phase.TARING
-        settings = self._profile.session
-        wrenches, angles = self._rest(settings.tare_s)
-        speed_rad_s = float(np.ptp(angles)) / settings.tare_s
-        if speed_rad_s > settings.rest_velocity_rad_s:
-            raise SessionEnd(
-                "fault",
-                f"The motor is not at rest: it moves by {speed_rad_s:.2g} rad/s, more than "
-                f"session.rest_velocity_rad_s = {settings.rest_velocity_rad_s:g} rad/s. "
-                "Wait until it stands still and start again.",
-            )
-        self._start_angle_rad = float(np.mean(angles))
+        rest = self._wait_for_rest()
+        self._start_angle_rad = float(np.mean(rest.angles_rad))
         limit_rad = self._profile.limits.angle_rad
         if abs(self._start_angle_rad) > limit_rad:
             raise SessionEnd(
@@ -119,17 +137,45 @@ class Procedure:
                 f"The motor stands at {self._start_angle_rad:.4g} rad, outside "
                 f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
             )
-        mean = [float(value) for value in wrenches.mean(axis=0)]
-        spread = [float(value) for value in wrenches.std(axis=0, ddof=1)]
-        self._rest_spread_nm = float(
-            np.std(wrenches @ np.array(self._profile.rig.sensor.projection))
-        )
-        self._cycle.tare = (mean[0], mean[1], mean[2], mean[3], mean[4], mean[5])
-        return {"tare_s": repr(settings.tare_s), "start_angle_rad": repr(self._start_angle_rad)} | {
-            f"tare_{what}_{axis}": repr(value)
-            for what, values in (("mean", mean), ("std", spread))
-            for axis, value in zip(_AXES, values, strict=True)
-        }
+        self._rest_spread_nm = rest.torque_spread_nm
+        self._cycle.tare = rest.mean
+        return rest.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
+
+    def _wait_for_rest(self) -> Rest:
+        """Return the first stretch of readings in which neither the motor nor the beam moves."""
+        settings = self._profile.session
+        self._board[Word.PHASE] = Phase.TARING
+        patience_s = settings.rest_timeout_s
+        while True:
+            rest = self._rest(settings.tare_s)
+            moving = self._what_moves(rest)
+            if not moving:
+                return rest
+            patience_s -= rest.duration_s
+            if patience_s <= 0.0:
+                raise SessionEnd(
+                    "fault",
+                    f"{moving} It did not come to rest within session.rest_timeout_s = "
+                    f"{settings.rest_timeout_s:g} s; wait until it stands still and start again.",
+                )
+            if self._board[Word.PHASE] != Phase.WAITING:
+                self._board[Word.PHASE] = Phase.WAITING
+                self._say("info", f"Waiting until the rig is at rest. {moving}")
+
+    def _what_moves(self, rest: Rest) -> str:
+        settings = self._profile.session
+        if rest.speed_rad_s > settings.rest_velocity_rad_s:
+            return (
+                f"The motor is not at rest: it moves by {rest.speed_rad_s:.2g} rad/s, more than "
+                f"session.rest_velocity_rad_s = {settings.rest_velocity_rad_s:g} rad/s."
+            )
+        if rest.torque_spread_nm > settings.rest_torque_nm:
+            return (
+                f"The beam is not at rest: the coupling torque scatters by "
+                f"{rest.torque_spread_nm:.2g} N·m, more than session.rest_torque_nm = "
+                f"{settings.rest_torque_nm:g} N·m."
+            )
+        return ""
 
     def hold(self) -> None:
         """Hold the motor where it stands; the drive has just been enabled."""
@@ -158,6 +204,7 @@ class Procedure:
                     "fault", f"The supervisor did not start the record within {_GO_PATIENCE_S:g} s."
                 )
             if self._clock.virtual:
+                show(self._board, self._cycle)
                 self._check_stop()
                 time.sleep(_GO_POLL_S)
             else:
@@ -178,6 +225,7 @@ class Procedure:
         counts, virtual, signals = self.counts, self._clock.virtual, self._stop
         stop, scheduled = board.word(Word.STOP), board.word(Word.SCHEDULED)
         metronome.restart()
+        self._recording = True
         wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
         # Under the real clock tick 0 is still ahead, or up to one period behind.
         ahead_ns = 0 if virtual else metronome.start_ns - before_ns
@@ -199,9 +247,9 @@ class Procedure:
                     last = total - 1
                     break
             if end is None and (
-                stop[0] or counts.lost or signals.requested or tick % _LOOK_EVERY == 0
+                stop[0] or counts.lost or signals.requested or tick % LOOK_EVERY == 0
             ):
-                end = self._stop_reason()
+                end = self._look()
             if end is None:
                 end = self._step(start_rad + reference[tick])
             else:
@@ -235,15 +283,14 @@ class Procedure:
     def check_tare(self) -> None:
         """Average the sensor again, the drive disabled, to see how far its zero has moved."""
         self._rest(_SETTLE_S)
-        wrenches, _ = self._rest(self._profile.session.tare_s)
-        torque = wrenches @ np.array(self._profile.rig.sensor.projection)
-        if torque.std() > _SWINGING * self._rest_spread_nm:
+        rest = self._rest(self._profile.session.tare_s)
+        if rest.torque_spread_nm > _SWINGING * self._rest_spread_nm:
             self._say(
                 "info", "The beam still swings: the zero of the coupling torque was not checked."
             )
             return
         zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
-        drift_nm = float(torque.mean() - zero_nm)
+        drift_nm = float(rest.torques_nm.mean() - zero_nm)
         self.results["tare_drift_nm"] = repr(drift_nm)
         limit_nm = self._profile.session.tare_drift_nm
         if abs(drift_nm) > limit_nm:
@@ -275,7 +322,7 @@ class Procedure:
             violation = self._cycle.step(self._metronome.due_ns, reference_rad)
         except (DeviceError, OSError) as error:
             self._cycle.lose_readings()
-            return SessionEnd("fault", str(error))
+            return SessionEnd("fault", str(error), device_failed=True)
         return None if violation is None else SessionEnd("fault", str(violation))
 
     def _observe_switched_off(self) -> None:
@@ -286,21 +333,22 @@ class Procedure:
         except (DeviceError, OSError):
             self._cycle.lose_readings()
 
-    def _rest(self, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Read without torque; raw wrenches (n, 6) and angles (n,)."""
-        cycle, metronome = self._cycle, self._metronome
-        wrenches: list[Wrench] = []
-        angles: list[float] = []
-        for _ in range(round(duration_s * self._rate_hz)):
-            metronome.wait()
-            self._check_stop()
-            cycle.observe(metronome.due_ns)
-            silent = cycle.check_stale()
-            if silent is not None:
-                raise SessionEnd("fault", str(silent))
-            wrenches.append(cycle.raw_wrench)
-            angles.append(cycle.angle_rad)
-        return np.array(wrenches), np.array(angles)
+    def _rest(self, duration_s: float) -> Rest:
+        """Read without torque."""
+        return observe_rest(
+            self._cycle,
+            self._metronome,
+            rate_hz=self._rate_hz,
+            duration_s=duration_s,
+            projection=self._profile.rig.sensor.projection,
+            check=self._check_reading,
+        )
+
+    def _check_reading(self) -> None:
+        self._check_stop()
+        silent = self._cycle.check_stale()
+        if silent is not None:
+            raise SessionEnd("fault", str(silent))
 
     def _missed_too_many(self, missed: int, tick: int) -> SessionEnd | None:
         if not missed:
@@ -321,8 +369,26 @@ class Procedure:
             return SessionEnd("fault", "The supervising process ended during the session.")
         return None
 
+    def _look(self) -> SessionEnd | None:
+        """Show that this process is at work and what it reads; see whether the others are."""
+        show(self._board, self._cycle)
+        if not self._clock.virtual:
+            beat = self._board[Word.SUPERVISOR_BEAT]
+            self._looks_unanswered = (
+                self._looks_unanswered + 1 if beat == self._supervisor_beat else 0
+            )
+            self._supervisor_beat = beat
+            if self._looks_unanswered * LOOK_EVERY > _SUPERVISOR_PATIENCE_S * self._rate_hz:
+                return SessionEnd(
+                    "fault",
+                    "The supervising process has not moved for "
+                    f"{_SUPERVISOR_PATIENCE_S:g} s: nobody could have stopped the session.",
+                )
+        return self._stop_reason()
+
     def _check_stop(self) -> None:
-        end = self._stop_reason()
+        looking = self._metronome.tick % LOOK_EVERY == 0
+        end = self._look() if looking else self._stop_reason()
         if end is not None:
             self._cycle.torque_off()
             raise end
@@ -340,5 +406,6 @@ class Procedure:
             self.results["true_rate_hz"] = repr(intervals / (executed_ns * 1e-9))
 
     def _say(self, level: Level, message: str) -> None:
-        t_ns = self._clock.now_ns() - self._metronome.start_ns
+        # What comes before tick 0 has no time in the file yet.
+        t_ns = self._clock.now_ns() - self._metronome.start_ns if self._recording else 0
         write_event(self._channels.events, Event(t_ns, level, message))

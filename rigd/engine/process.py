@@ -1,8 +1,9 @@
-"""How a supervisor talks to the processes it starts: one job in, a few JSON lines each way.
+"""How a supervisor talks to the processes it starts: a few JSON lines each way.
 
-A child is ``python -m MODULE``. Its standard input brings one pickled job and then JSON lines; the
-end of standard input means that the supervisor is gone. Its standard output brings JSON lines,
-few and short, so that they fit into a pipe's buffer and no child ever waits for its supervisor.
+A child is ``python -m MODULE``. Its standard input brings its job and then messages, a JSON line
+each; a line that announces a pickled object is followed by its bytes. The end of standard input
+means that the supervisor is gone. Its standard output brings JSON lines, few and short, so that
+they fit into a pipe's buffer and no child ever waits for its supervisor.
 """
 
 import contextlib
@@ -10,7 +11,7 @@ import json
 import os
 import pickle
 import select
-import struct
+import signal
 import subprocess
 import sys
 import time
@@ -22,7 +23,6 @@ from rigd.engine.signals import held_back
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,
 and would disturb the loop."""
-_SIZE = struct.Struct("<Q")
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
 
@@ -68,12 +68,25 @@ class Child:
         ChildError
             If it does not take it.
         """
-        data = pickle.dumps(job)
-        self._write(_SIZE.pack(len(data)) + data)
+        self.send_object("job", job)
 
     def send(self, **message: object) -> None:
         """Send one message; a child that is gone is noticed when it is next listened to."""
         self._write(json.dumps(message).encode() + b"\n")
+
+    def send_object(self, name: str, value: object) -> None:
+        """Send a message ``{name: value}`` whose value is no JSON."""
+        self._write(packed_object(name, value))
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
 
     def poll(self, timeout_s: float) -> Message | None:
         """Return its next message, or None if none comes in time.
@@ -90,6 +103,10 @@ class Child:
             how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
             raise ChildError(f"The {self.name} process was {how}.") from None
 
+    def wake(self) -> None:
+        """Have it go on if somebody suspended it: it may have something to bring to an end."""
+        self._process.send_signal(signal.SIGCONT)
+
     def kill(self) -> None:
         """End it at once; the next :meth:`poll` tells."""
         self._process.kill()
@@ -99,6 +116,7 @@ class Child:
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it was gone already
                 self._process.stdin.close()
+        self.wake()
         for end in (self._process.terminate, self._process.kill):
             try:
                 self._process.wait(_SILENT_GRACE_S if self._falls_silent(grace_s) else 0.0)
@@ -142,6 +160,12 @@ class Child:
                 return  # poll() tells how it ended
 
 
+def packed_object(name: str, value: object) -> bytes:
+    """Return the bytes of a message ``{name: value}`` whose value is no JSON."""
+    data = pickle.dumps(value)
+    return json.dumps({"pickled": name, "size": len(data)}).encode() + b"\n" + data
+
+
 class LineReader:
     """JSON lines from a descriptor, without ever blocking longer than asked."""
 
@@ -149,8 +173,8 @@ class LineReader:
         self._fd = fd
         self._pending = b""
 
-    def next(self, timeout_s: float) -> Message | None:
-        """Return the next message, or None if none is complete in time.
+    def next(self, timeout_s: float | None) -> Message | None:
+        """Return the next message, or None if none is complete in time (None: wait for ever).
 
         Raises
         ------
@@ -168,6 +192,22 @@ class LineReader:
         message: Message = json.loads(line)
         return message
 
+    def exactly(self, size: int) -> bytes:
+        """Wait for the bytes that a message announced.
+
+        Raises
+        ------
+        EOFError
+            If the other end is gone before they are there.
+        """
+        while len(self._pending) < size:
+            data = os.read(self._fd, 1 << 20)
+            if not data:
+                raise EOFError
+            self._pending += data
+        data, self._pending = self._pending[:size], self._pending[size:]
+        return data
+
 
 class Parent:
     """The supervisor, as a child sees it; its process id is the child's only argument.
@@ -183,21 +223,25 @@ class Parent:
 
     def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
         """Wait for the job; ends the process quietly if the supervisor ends without one."""
-        (size,) = _SIZE.unpack(self._read(_SIZE.size))
-        return pickle.loads(self._read(size))
+        try:
+            message = self.poll(None)
+        except EOFError:
+            sys.exit(0)
+        assert message is not None
+        return message["job"]
 
-    def _read(self, size: int) -> bytes:
-        data = bytearray()
-        while len(data) < size:
-            part = os.read(self._fd, size - len(data))
-            if not part:
-                sys.exit(0)
-            data += part
-        return bytes(data)
+    def poll(self, timeout_s: float | None) -> Message | None:
+        """Return the next message, or None if none begins in time (None: wait for ever).
 
-    def poll(self, timeout_s: float) -> Message | None:
-        """Return the next message, or None; raises EOFError if the supervisor is gone."""
-        return self._lines.next(timeout_s)
+        Raises
+        ------
+        EOFError
+            If the supervisor is gone.
+        """
+        message = self._lines.next(timeout_s)
+        if message is not None and "pickled" in message:
+            return {message["pickled"]: pickle.loads(self._lines.exactly(message["size"]))}
+        return message
 
     def send(self, **message: object) -> None:
         """Send one short message; nobody may be left to hear it."""

@@ -7,15 +7,16 @@ stopped, and closes the file itself.
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rigd.engine import signals
 from rigd.engine.board import Phase, Word
 from rigd.engine.channels import Channels, attach_channels
-from rigd.engine.events import EVENT_SIZE, read_events
+from rigd.engine.events import read_events
 from rigd.engine.jobs import RecorderJob
 from rigd.engine.process import Message, Parent
+from rigd.engine.topics import CONTROL, EVENT, SAMPLE, TIMING, TOPICS, Topic
 from rigd.session import SessionError, SessionWriter
 from rigd.session.format import SAMPLE_SIZE
 
@@ -64,7 +65,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
             recorder.transfer()
             if not recorder.begun:
                 writer.discard()
-                parent.send(discarded=True)
+                parent.send(closed=None)
             else:
                 path, counts = recorder.close(message["close"])
                 parent.send(closed=str(path), counts=counts)
@@ -75,6 +76,17 @@ class _Recorder:
     def __init__(self, channels: Channels, writer: SessionWriter) -> None:
         self._channels = channels
         self._writer = writer
+        writers: dict[Topic, Callable[[bytes], None]] = {
+            EVENT: self._log,
+            CONTROL: writer.write_controls,
+            TIMING: writer.write_timings,
+            SAMPLE: self._write_samples,
+        }
+        self._ways = [
+            (ring, writers[topic])
+            for topic, ring in zip(TOPICS, channels.rings, strict=True)
+            if topic.logged
+        ]
         self._recorded = 0
         self.header: Message | None = None
         """What the file is to say of the session, as soon as the supervisor has told."""
@@ -90,24 +102,26 @@ class _Recorder:
 
     def transfer(self) -> bool:
         """Move what is there into the file; say whether there was anything."""
+        self._channels.board.beat(Word.RECORDER_BEAT)
         if not self.begun:
             if self.header is None or not self._channels.board[Word.START_UTC_NS]:
                 return False
             self._begin(self.header)
-        events = self._channels.events.take(16)
-        for event in read_events(events):
+        moved = False
+        for ring, write in self._ways:
+            block = ring.take(_BLOCK)
+            if block:
+                write(block)
+                moved = True
+        return moved
+
+    def _log(self, block: bytes) -> None:
+        for event in read_events(block):
             self._writer.log(event.t_ns, event.level, event.message)
-        controls = self._channels.controls.take(_BLOCK)
-        if controls:
-            self._writer.write_controls(controls)
-        timings = self._channels.timings.take(_BLOCK)
-        if timings:
-            self._writer.write_timings(timings)
-        samples = self._channels.samples.take(_BLOCK)
-        if samples:
-            self._writer.write_samples(samples)
-            self._recorded += len(samples) // SAMPLE_SIZE
-        return bool(samples or controls or timings or len(events) >= 16 * EVENT_SIZE)
+
+    def _write_samples(self, block: bytes) -> None:
+        self._writer.write_samples(block)
+        self._recorded += len(block) // SAMPLE_SIZE
 
     def close(self, outcome: Mapping[str, str]) -> tuple[Path, dict[str, int]]:
         while self.transfer():

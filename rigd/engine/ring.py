@@ -66,6 +66,11 @@ class Ring:
         """Records the consumer has released."""
         return self._counters[_READ]
 
+    @property
+    def waiting(self) -> int:
+        """Records that the consumer has yet to take."""
+        return self._counters[_WRITTEN] - self._counters[_READ]
+
     # Producer
 
     def slot(self) -> int:
@@ -89,6 +94,10 @@ class Ring:
         block = bytes(self.buffer[start : start + count * self.record_size])
         self._counters[_READ] = first + count
         return block
+
+    def discard(self) -> None:
+        """Release all records unseen; for a consumer that begins anew."""
+        self._counters[_READ] = self._counters[_WRITTEN]
 
     def close(self) -> None:
         """Unmap the memory; the descriptor stays open for whoever else inherited it."""

@@ -4,11 +4,12 @@ import time
 from dataclasses import dataclass
 
 from rigd.engine.board import Word
-from rigd.engine.channels import CONTROL_DECIMATION, Channels
+from rigd.engine.channels import Channels
 from rigd.engine.clocks import Clock
 from rigd.engine.cycle import Cycle
 from rigd.engine.metronome import Metronome
 from rigd.engine.ring import Ring
+from rigd.engine.topics import CONTROL
 from rigd.session.format import (
     Status,
     pack_control_into,
@@ -20,6 +21,7 @@ _AFTER_MISSED = int(Status.AFTER_MISSED)
 _AFTER_LOST = int(Status.AFTER_LOST)
 _LATE = int(Status.LATE)
 
+_TERMS_EVERY = CONTROL.every
 _ROOM_PATIENCE_S = 2.0
 _ROOM_POLL_S = 0.0002
 
@@ -127,7 +129,7 @@ class SampleLog:
         ring.publish()
         if self._timing_ring is not None:
             self._write_ages(self._timing_ring, tick, t_ns)
-        if tick % CONTROL_DECIMATION == 0:
+        if tick % _TERMS_EVERY == 0:
             self._write_terms(tick, t_ns)
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:

@@ -59,6 +59,7 @@ class _Publisher:
 
     def transfer(self) -> None:
         """Show what the ring has, a second of it at most; count what cannot be shown."""
+        self._board.beat(Word.LIVE_BEAT)
         block = self._observer.take(self._most)
         try:
             sent = not block or self._feed.offer(decode_samples(block))

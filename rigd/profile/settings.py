@@ -35,6 +35,8 @@ class SessionSettings:
     """Time at rest over which the sensor is averaged."""
     rest_velocity_rad_s: Annotated[float, Gt(0)]
     """Mean speed over the tare up to which the rig counts as resting."""
+    rest_torque_nm: Annotated[float, Gt(0)]
+    rest_timeout_s: Annotated[float, Gt(0)]
     tare_drift_nm: Annotated[float, Gt(0)]
     """Change of the coupling torque's zero over a session above which a warning is given."""
     return_s: Annotated[float, Gt(0), Le(60)]

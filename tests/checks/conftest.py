@@ -148,7 +148,7 @@ def stand_ins(monkeypatch):
     """Devices of which the checks believe that they are the profile's."""
     made = StandIns()
     monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
-    monkeypatch.setattr("rigd.checks.reset.open_devices", made.open)
+    monkeypatch.setattr("rigd.devices.resetting.open_devices", made.open)
     monkeypatch.setattr("rigd.checks.exchange.TICKS", 100)
     return made
 

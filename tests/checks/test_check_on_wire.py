@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 
 from rigd.checks.devices import inspect_devices
-from rigd.checks.reset import reset_drive
 from rigd.checks.rows import Verdict, overall
 from rigd.devices.contracts import DeviceError
+from rigd.devices.resetting import reset_drive
 from rigd.devices.simulator import find_simulator
 
 RUN = """

@@ -8,11 +8,11 @@ import pytest
 from rigd.devices.contracts import Devices
 from rigd.devices.registry import open_devices
 from rigd.engine.board import Phase, Word
-from rigd.engine.channels import create_channels
+from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.clocks import VirtualClock
-from rigd.engine.control import conduct
+from rigd.engine.control import attend
 from rigd.engine.events import read_events
-from rigd.engine.jobs import ControlJob
+from rigd.engine.jobs import SessionJob
 from rigd.engine.ring import shared_memory_fd
 from rigd.engine.signals import StopRequest
 from rigd.excitation import chirp
@@ -83,16 +83,30 @@ class WatchedDrive:
 
 
 class FakeParent:
-    """A supervisor that notes what it is told, and can die."""
+    """A supervisor that gives its orders, notes what it is told, and can die or hang."""
 
-    def __init__(self):
+    def __init__(self, board):
+        self.board = board
+        self.hangs = False
+        self.orders = []
         self.messages = []
         self.living = True
+
+    def poll(self, timeout_s):
+        if not self.orders:
+            raise EOFError
+        return self.orders.pop(0)
+
+    def said(self, what):
+        """The messages of a kind."""
+        return [message for message in self.messages if what in message]
 
     def send(self, **message):
         self.messages.append(message)
 
     def alive(self):
+        if not self.hangs:
+            self.board.beat(Word.SUPERVISOR_BEAT)
         return self.living
 
 
@@ -118,10 +132,10 @@ class Session:
             stop_hz=5.0,
         )
         self.channels = create_channels(
-            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(5)]
+            self.profile.rig.rate_hz, [shared_memory_fd() for _ in range(DESCRIPTORS)]
         )
         self.board = self.channels.board
-        self.parent = FakeParent()
+        self.parent = FakeParent(self.board)
         self.stop = StopRequest()
         self.obtained = {}
         devices = open_devices(self.profile.rig)
@@ -131,13 +145,25 @@ class Session:
         self.board[Word.GO] = 1
 
     def run(self):
-        job = ControlJob(self.profile, self.excitation, self.channels.specs, fast=True)
-        conduct(job, self.devices, self.clock, self.channels, self.parent, self.stop, self.obtained)
+        return self.obey({"session": SessionJob(self.profile, self.excitation)})
+
+    def obey(self, *orders):
+        """Attend to the rig from connecting to closing, with these orders in between."""
+        self.parent.orders = list(orders)
+        attend(
+            self.profile,
+            self.devices,
+            self.clock,
+            self.channels,
+            self.parent,
+            self.stop,
+            self.obtained,
+        )
         return self
 
     @property
     def finished(self):
-        return self.parent.messages[-1]
+        return self.parent.said("finished")[-1]
 
     @property
     def samples(self):

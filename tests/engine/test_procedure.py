@@ -42,7 +42,7 @@ def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(
 
 def test_the_tare_takes_the_offset_away(make_session):
     session = make_session().run()
-    ready = session.parent.messages[0]["ready"]
+    ready = session.parent.said("ready")[0]["ready"]
     offset = session.profile.rig.simulation.offset
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     for axis, expected in zip(axes, offset, strict=True):
@@ -377,7 +377,7 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
     session.run()
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
-    assert session.parent.messages[0]["realtime"] == session.obtained
+    assert session.parent.said("connected")[0]["realtime"] == session.obtained
 
 
 def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):
@@ -391,7 +391,7 @@ def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session
     assert session.finished["counts"]["scheduled"] == 0
 
 
-def test_the_drive_is_disabled_once_by_the_cycle_and_once_more_at_the_end(make_session):
+def test_the_drive_is_disabled_by_the_cycle_after_the_session_and_at_the_end(make_session):
     session = make_session()
     session.clock = StopAt(3_000_000_000, session.stop.request)
     calls = []
@@ -399,7 +399,7 @@ def test_the_drive_is_disabled_once_by_the_cycle_and_once_more_at_the_end(make_s
     session.drive.disable = lambda: (calls.append(1), disable())
     session.run()
     session.assert_safe()
-    assert len(calls) == 2
+    assert len(calls) == 3
 
 
 def test_a_drive_that_may_still_be_on_is_told(make_session):

@@ -4,9 +4,7 @@ import importlib.util
 import json
 import math
 import os
-import pickle
 import select
-import struct
 import subprocess
 import sys
 import threading
@@ -17,6 +15,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from rigd.engine.board import Board, Word
+from rigd.engine.process import packed_object
 from rigd.engine.ring import Ring, shared_memory_fd
 from rigd.live.job import LiveJob
 from rigd.session.format import SAMPLE_SIZE, pack_sample_into
@@ -132,8 +131,7 @@ class Publisher:
 
 
 def write_job(pipe, job: LiveJob) -> None:
-    data = pickle.dumps(job)
-    pipe.write(struct.pack("<Q", len(data)) + data)
+    pipe.write(packed_object("job", job))
     pipe.flush()
 
 

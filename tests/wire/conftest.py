@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from rigd.crew import Crew
-from rigd.daemon import Order, SessionResult, run_session
 from rigd.engine.signals import StopRequest
 from rigd.excitation import chirp
 from rigd.profile import load_profile
+from rigd.supervisor.orders import Order
+from rigd.supervisor.rig import Rig
+from rigd.supervisor.session import SessionResult
 
 HW_PROFILES = Path(__file__).parents[2] / "hw_profiles"
 
@@ -65,12 +66,13 @@ def run_order(tmp_path):
             profile=profile,
             excitation=excitation,
             path=tmp_path / f"{name}.mcap",
-            fast=fast,
-            notes=(),
         )
-        with Crew(live=False) as crew:
-            crew.lay_out(profile.rig.rate_hz)
-            return run_session(order, crew, StopRequest(), lambda *_: None)
+        rig = Rig(profile, fast=fast)
+        try:
+            rig.connect()
+            return rig.run(order, StopRequest(), lambda *_: None)
+        finally:
+            rig.disconnect()
 
     return run
 

@@ -1,17 +1,11 @@
 """One program at a time on a bus: a second one would reconfigure a drive that moves."""
 
-import fcntl
-import os
-from contextlib import suppress
-from pathlib import Path
-from typing import TextIO
-
 from rigd.devices.contracts import DeviceError
-from rigd.devices.simulator import runtime_folder
+from rigd.devices.held_file import HeldError, HeldFile
 
 
 class BusLock:
-    """Held from the opening of a bus to its closing; the kernel takes it off a process that dies.
+    """Held from the opening of a bus to its closing.
 
     Parameters
     ----------
@@ -21,7 +15,7 @@ class BusLock:
 
     def __init__(self, bus: str) -> None:
         self._bus = bus
-        self._file: TextIO | None = None
+        self._file = HeldFile(f"bus-{bus}")
 
     def acquire(self) -> None:
         """Take the bus.
@@ -31,37 +25,19 @@ class BusLock:
         DeviceError
             If another program has it; the message says which process.
         """
-        path = self._path()
         try:
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            file = path.open("a+", encoding="utf-8")
+            self._file.acquire("rigd")
+        except HeldError as holder:
+            raise DeviceError(
+                f"CAN bus {self._bus}: another rigd is using it ({holder}); wait for it, or stop "
+                "it."
+            ) from None
         except OSError as error:
             raise DeviceError(
-                f"CAN bus {self._bus}: it cannot be reserved in {path.parent} ({error.strerror}); "
-                "set XDG_RUNTIME_DIR to a folder that is yours."
+                f"CAN bus {self._bus}: it cannot be reserved in {self._file.path.parent} "
+                f"({error.strerror}); set XDG_RUNTIME_DIR to a folder that is yours."
             ) from None
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            holder = file.read().strip() or "unknown"
-            file.close()
-            raise DeviceError(
-                f"CAN bus {self._bus}: another rigd is using it (process {holder}); wait for it, "
-                "or stop it."
-            ) from None
-        file.truncate(0)
-        file.write(f"{os.getpid()}")
-        file.flush()
-        self._file = file
 
     def release(self) -> None:
         """Give the bus up; harmless when repeated."""
-        if self._file is not None:
-            with suppress(OSError):
-                self._file.close()
-            self._file = None
-
-    def _path(self) -> Path:
-        name = "".join(c if c.isalnum() else "-" for c in self._bus).strip("-")
-        return runtime_folder() / f"bus-{name}.lock"
+        self._file.release()

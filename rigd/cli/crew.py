@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 from rigd.cli.exits import EXIT_FAILED, fail
 
 if TYPE_CHECKING:
-    from rigd.crew import Crew
     from rigd.engine.signals import StopRequest
+    from rigd.supervisor.crew import Crew
 
 
 def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
@@ -15,9 +15,9 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.crew import Crew
     from rigd.engine.process import SINGLE_THREADED
     from rigd.engine.signals import StopRequest
+    from rigd.supervisor.crew import Crew
 
     stop = StopRequest()
     stop.catch()

@@ -1,0 +1,128 @@
+"""The processes of a rig, and the memory they share.
+
+This module is quick to import, so that the processes can be started before anything else: they
+import what they need while the supervisor reads the profile and plans.
+"""
+
+import os
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rigd.engine.process import Child
+from rigd.engine.processes import CONTROL, LIVE, PROCESSES, RECORDER, Process
+from rigd.engine.ring import shared_memory_fd
+
+if TYPE_CHECKING:
+    from rigd.engine.channels import Channels
+
+_DESCRIPTORS = 5
+
+
+class Crew:
+    """Control, recorder and, if wanted, live publisher of a rig.
+
+    Leaving the context ends them all, the one with the torque first.
+
+    Parameters
+    ----------
+    live
+        Start the live publisher too.
+
+    Attributes
+    ----------
+    live
+        As given.
+    """
+
+    def __init__(self, *, live: bool) -> None:
+        self.live = live
+        self._fds = [shared_memory_fd() for _ in range(_DESCRIPTORS)]
+        self._channels: Channels | None = None
+        self._used: set[Process] = set()
+        self._children: dict[Process, Child] = {}
+        for process in (CONTROL, RECORDER, LIVE) if live else (CONTROL, RECORDER):
+            self._start(process)
+
+    def __getitem__(self, process: Process) -> Child:
+        return self._children[process]
+
+    def __contains__(self, process: Process) -> bool:
+        return process in self._children
+
+    @property
+    def control(self) -> Child:
+        """The process that talks to the devices."""
+        return self._children[CONTROL]
+
+    @property
+    def recorder(self) -> Child:
+        """The process that writes the file."""
+        return self._children[RECORDER]
+
+    def fresh(self, process: Process) -> Child:
+        """Return a process that has had no job yet, in place of the one that has."""
+        if process in self._used:
+            self._children[process].stop(process.grace_s)
+            self._start(process)
+        self._used.add(process)
+        return self._children[process]
+
+    def replace(self, process: Process) -> Child:
+        """Kill a process and start another in its place."""
+        self._children[process].kill()
+        return self.fresh(process)
+
+    def has_job(self, process: Process) -> bool:
+        """Whether a process has had its job."""
+        return process in self._used
+
+    @property
+    def laid_out(self) -> bool:
+        """Whether the shared memory has its size."""
+        return self._channels is not None
+
+    @property
+    def channels(self) -> "Channels":
+        """The shared memory, laid out."""
+        assert self._channels is not None
+        return self._channels
+
+    def lay_out(self, rate_hz: float) -> None:
+        """Size the shared memory for sessions at ``rate_hz``.
+
+        Raises
+        ------
+        OSError
+            If there is not enough shared memory.
+        """
+        from rigd.engine.channels import create_channels
+
+        self._channels = create_channels(rate_hz, self._fds)
+
+    def _start(self, process: Process) -> None:
+        self._children[process] = Child(process.name, process.module, self._fds)
+        self._used.discard(process)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End all processes and give the memory back; harmless when repeated."""
+        if self._channels is not None:
+            self._channels.ask_to_stop()
+        for process in PROCESSES:
+            if process in self._children:
+                self._children.pop(process).stop(process.grace_s)
+        if self._channels is not None:
+            self._channels.close()
+            self._channels = None
+        while self._fds:
+            os.close(self._fds.pop())

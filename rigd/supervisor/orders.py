@@ -1,0 +1,119 @@
+"""From what the operator asks for to a session that can be run: rig, file, and room for it.
+
+Shared by sessions in the foreground and by the daemon.
+"""
+
+import shutil
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rigd.devices.registry import Reality, check_selection, objections, reality
+from rigd.excitation import Excitation
+from rigd.planning import RefusedError
+from rigd.profile import Profile, load_profile
+from rigd.session.writer import PART_SUFFIX
+
+# Uncompressed, with the controller's terms and the index; a file never takes more.
+_BYTES_PER_TICK = 180
+_BYTES_SPARE = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A session to run, already checked against the profile's limits."""
+
+    profile: Profile
+    excitation: Excitation
+    path: Path
+    notes: tuple[tuple[str, str], ...] = ()
+    """Operator, specimen, note, number in a series: metadata as given."""
+
+
+def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple[Profile, Reality]:
+    """Load a profile and see what would move.
+
+    Parameters
+    ----------
+    name
+        Of the profile, or its file.
+    fast
+        Not in real time.
+    seed
+        Of a simulated rig's noise; None leaves the profile's.
+
+    Raises
+    ------
+    ProfileError, UnknownDeviceError
+        If the profile cannot be used.
+    RefusedError
+        If its devices cannot share their bus, or an option does not go with what would move.
+    """
+    profile = load_profile(name)
+    check_selection(profile.rig.devices)
+    refusals = objections(profile.rig)
+    if refusals:
+        raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
+    moving = reality(profile.rig)
+    if fast and not moving.any_clock:
+        raise RefusedError(
+            f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
+            "skipped; leave the option out."
+            + (" Or start rigd simulate with --lock-step." if moving is Reality.SIMULATOR else "")
+        )
+    if seed is not None:
+        if moving is not Reality.SIMULATED:
+            raise RefusedError(
+                f"--seed: the noise of {moving.value} of {profile.path} is not made here; leave "
+                "the option out."
+            )
+        assert profile.rig.simulation is not None
+        simulation = replace(profile.rig.simulation, seed=seed)
+        profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
+    return profile, moving
+
+
+def make_room(folder: Path, excitation: Excitation) -> None:
+    """Make the folder, and see that a session fits on its disk.
+
+    Raises
+    ------
+    RefusedError
+        If the folder cannot be made, or the disk is too full.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise RefusedError(
+            f"--output {folder}: cannot be made a folder ({error.strerror}); choose another."
+        ) from error
+    needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
+    if free < needed:
+        raise RefusedError(
+            f"--output {folder}: {free / 1e6:.1f} MB are free on its disk and the session may take "
+            f"{needed / 1e6:.1f} MB; make room or choose another folder."
+        )
+
+
+def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
+    """Name a new session file: time, excitation, and its number in a series.
+
+    Nothing is created; the recorder refuses a name that is taken.
+    """
+    stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
+    if number is not None:
+        stem += f"-{number:02d}"
+    path, extra = folder / f"{stem}.mcap", 1
+    while path.exists() or path.with_name(path.name + PART_SUFFIX).exists():
+        extra += 1
+        path = folder / f"{stem}_{extra}.mcap"
+    return path
+
+
+def what_is_kept(path: Path) -> str:
+    """Say what there is of a session that failed, once its processes have ended."""
+    part = path.with_name(path.name + PART_SUFFIX)
+    if part.exists():
+        return f"What was recorded is in {part}; rigd recover {part} makes a clean file of it."
+    return f"Its file is {path}." if path.exists() else "There is no file of it."

@@ -1,0 +1,376 @@
+"""A rig as whoever runs sessions on it sees it: connect, run, tare, zero, status, disconnect."""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from rigd.devices.contracts import DeviceError
+from rigd.devices.resetting import reset_drive
+from rigd.engine.board import Phase, Stop, Word
+from rigd.engine.jobs import ControlJob
+from rigd.engine.process import ChildError, Message
+from rigd.engine.processes import CONTROL, PROCESSES, SUPERVISOR, Pulse
+from rigd.engine.signals import StopRequest
+from rigd.engine.topics import TOPICS
+from rigd.profile import Profile
+from rigd.supervisor.crew import Crew
+from rigd.supervisor.live_view import LiveView
+from rigd.supervisor.orders import Order
+from rigd.supervisor.session import Session, SessionResult, Watcher
+
+_POLL_S = 0.05
+_CONNECT_PATIENCE_S = 30.0
+_ANSWER_PATIENCE_S = 10.0
+"""Beyond the time that is measured."""
+
+
+class RigError(Exception):
+    """The rig cannot do what is asked, or is lost; the message is for the operator."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStatus:
+    """How one process of the table is."""
+
+    name: str
+    pid: int
+    state: str
+    """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
+    still_s: float
+    """For how long it has shown no sign of work, as far as somebody looked."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicStatus:
+    """What came of one topic of the table."""
+
+    name: str
+    written: int
+    rate_hz: float | None
+    """Since the last look; None where there was none."""
+    expected_hz: float | None
+    """While a session is recorded."""
+    waiting: int
+    """Records that the recorder has yet to take."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigStatus:
+    """A look at the board."""
+
+    phase: Phase
+    angle_rad: float
+    """From the rig's zero."""
+    coupling_torque_nm: float
+    torque_command_nm: float
+    tick: int
+    missed: int
+    late: int
+    lost: int
+    processes: tuple[ProcessStatus, ...]
+    topics: tuple[TopicStatus, ...]
+
+
+class Rig:
+    """The devices of one profile, in processes of their own.
+
+    All but :meth:`status` is called from one thread.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    fast
+        Under the virtual clock.
+    live
+        Show each session in a live view.
+    crew
+        Processes that have been started already, for the first connection.
+
+    Attributes
+    ----------
+    connected
+        The control process owns the devices.
+    zero_lost
+        The operator set a zero, and the connection that it belonged to is gone.
+    """
+
+    def __init__(
+        self, profile: Profile, *, fast: bool = False, live: bool = False, crew: Crew | None = None
+    ) -> None:
+        self._profile = profile
+        self._fast = fast
+        self._live = live
+        self._crew = crew
+        self._told: Message = {}
+        self._view: LiveView | None = None
+        self._zero_set = False
+        self._pulse = Pulse()
+        self._looking = threading.Lock()
+        self._pulses = {process: Pulse() for process in PROCESSES}
+        self._written: tuple[float, tuple[int, ...]] | None = None
+        self.connected = False
+        self.zero_lost = False
+
+    @property
+    def simulated(self) -> bool:
+        """Whether no motor moves; known once connected."""
+        return bool(self._told.get("simulated", False))
+
+    def connect(self, *, reset_fault: bool = False) -> None:
+        """Start the processes and connect the devices; the torque stays off.
+
+        Parameters
+        ----------
+        reset_fault
+            Reset a fault of the drive first: the operator's decision.
+
+        Raises
+        ------
+        RigError
+            If that fails; everything is closed again then.
+        """
+        if self.connected:
+            self.disconnect()
+        crew = self._crew = self._crew or Crew(live=self._live)
+        try:
+            if reset_fault:
+                reset_drive(self._profile.rig)
+            crew.lay_out(self._profile.rig.rate_hz)
+            crew.fresh(CONTROL).start(ControlJob(self._profile, crew.channels.specs, self._fast))
+            self._told = self._ask(_CONNECT_PATIENCE_S)
+        except OSError as error:
+            self.disconnect()
+            raise RigError(
+                "There is not enough shared memory for the processes of a session "
+                f"({error.strerror}); free some in /dev/shm."
+            ) from error
+        except (RigError, DeviceError, ChildError) as error:
+            self.disconnect()
+            raise RigError(str(error)) from None
+        self.connected = True
+        self.zero_lost |= self._zero_set
+        self._zero_set = False
+
+    def run(self, order: Order, stop: StopRequest, watcher: Watcher) -> SessionResult:
+        """Run one session.
+
+        Parameters
+        ----------
+        order
+            What to run.
+        stop
+            The operator's, which ends it.
+        watcher
+            See :data:`rigd.supervisor.session.Watcher`.
+
+        Raises
+        ------
+        RigError
+            If the rig is not connected, or its zero is lost.
+        SessionFailedError
+            If the file cannot be written, or the recorder died.
+        """
+        crew = self._require()
+        if self.zero_lost:
+            raise RigError(
+                "The zero of the angle was lost with the connection, and the limits with it; move "
+                "the motor to its middle and run rigd zero."
+            )
+        board = crew.channels.board
+        board[Word.STOP] = Stop.NO
+        board[Word.GO] = 0
+        board[Word.LIVE_DROPPED] = 0
+        crew.channels.clear()
+        view, self._view = self._view, None
+        session = Session(order, crew, self._told, view, watcher)
+        try:
+            return session.run(stop)
+        finally:
+            if session.device_failed:
+                self._await_end()
+
+    def show(self, order: Order) -> str:
+        """Start the live view of a session that is about to be run.
+
+        Returns
+        -------
+        str
+            Its address, or why there is none, for the operator.
+        """
+        crew = self._require()
+        crew.channels.clear()
+        self._view = LiveView(crew, order.path.stem, order.profile.rig.rate_hz)
+        return self._view.start()
+
+    def tare(self) -> dict[str, Any]:
+        """Average the sensor at rest.
+
+        Returns
+        -------
+        dict
+            ``mean`` and ``std``: a number an axis (N, N·m); ``torque_std_nm``.
+
+        Raises
+        ------
+        RigError
+            If it cannot be done.
+        """
+        return self._order("tare", self._profile.session.tare_s)
+
+    def zero(self) -> dict[str, Any]:
+        """Make the angle where the motor stands the zero to which the limits are relative.
+
+        Returns
+        -------
+        dict
+            ``moved_rad``: the angle that became 0.
+
+        Raises
+        ------
+        RigError
+            If the motor moves.
+        """
+        answer = self._order("zero", 0.0)
+        self._zero_set, self.zero_lost = True, False
+        return answer
+
+    def watch(self) -> None:
+        """See whether the control process is well; call it some times a second between sessions.
+
+        Raises
+        ------
+        RigError
+            If it reported a fault, died or hangs; everything is closed then.
+        """
+        crew = self._require()
+        try:
+            message = crew.control.poll(0.0)
+        except ChildError as error:
+            message = {"ended": str(error)}
+        board = crew.channels.board
+        board.beat(Word.SUPERVISOR_BEAT)
+        assert CONTROL.hung_after_s is not None
+        still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
+        if message is None and still_s > CONTROL.hung_after_s:
+            crew.control.kill()
+            message = {"ended": f"The control process has not moved for {still_s:.1f} s."}
+        if message is not None:
+            self.disconnect()
+            raise RigError(message.get("ended") or "The control process was asked to end.")
+
+    def status(self) -> RigStatus | None:
+        """Return a look at the board, from any thread; None while there is none."""
+        with self._looking:
+            crew = self._crew
+            return None if crew is None or not crew.laid_out else self._look(crew)
+
+    def _look(self, crew: Crew) -> RigStatus:
+        channels = crew.channels
+        board, rate_hz = channels.board, self._profile.rig.rate_hz
+        now_s = time.monotonic()
+        written = tuple(ring.written for ring in channels.rings)
+        before_s, before = self._written or (now_s, written)
+        self._written = now_s, written
+        passed_s = now_s - before_s
+        return RigStatus(
+            phase=Phase(board[Word.PHASE]),
+            angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
+            coupling_torque_nm=board[Word.COUPLING_TORQUE_NNM] * 1e-9,
+            torque_command_nm=board[Word.TORQUE_COMMAND_NNM] * 1e-9,
+            tick=board[Word.SCHEDULED],
+            missed=board[Word.MISSED],
+            late=board[Word.LATE],
+            lost=board[Word.LOST],
+            processes=tuple(self._process_statuses(crew)),
+            topics=tuple(
+                TopicStatus(
+                    topic.name,
+                    ring.written,
+                    (ring.written - first) / passed_s if passed_s > 0.0 else None,
+                    topic.expected_hz(rate_hz),
+                    ring.waiting,
+                )
+                for topic, ring, first in zip(TOPICS, channels.rings, before, strict=True)
+            ),
+        )
+
+    def disconnect(self) -> None:
+        """Disable the drive, close the devices, end the processes; harmless when repeated."""
+        with self._looking:
+            crew, self._crew = self._crew, None
+            self.connected = False
+            self._written = None
+        if crew is not None:
+            crew.end()
+
+    def _require(self) -> Crew:
+        if self._crew is None or not self.connected:
+            raise RigError("The rig is not connected.")
+        return self._crew
+
+    def _order(self, name: str, duration_s: float) -> dict[str, Any]:
+        """Have the control process measure something between sessions."""
+        crew = self._require()
+        try:
+            crew.control.send(**{name: True})
+            answer = self._ask(_ANSWER_PATIENCE_S + duration_s)
+        except (ChildError, RigError) as error:
+            self.disconnect()
+            raise RigError(str(error)) from None
+        if "refused" in answer:
+            raise RigError(answer["refused"])
+        measured: dict[str, Any] = answer["done"]
+        return measured
+
+    def _ask(self, patience_s: float) -> Message:
+        """Wait for what the control process answers.
+
+        Raises
+        ------
+        RigError
+            If it ends instead, or does not answer in time.
+        ChildError
+            If it died.
+        """
+        assert self._crew is not None
+        answer = self._crew.control.poll(patience_s)
+        if answer is None:
+            raise RigError(
+                f"The control process does not answer within {patience_s:g} s; see whether the "
+                "devices are on."
+            )
+        if "ended" in answer:
+            raise RigError(answer["ended"] or "It was stopped.")
+        return answer
+
+    def _await_end(self) -> None:
+        """Let a control process whose device failed close what can be closed."""
+        assert self._crew is not None
+        with contextlib.suppress(ChildError):
+            self._crew.control.poll(_ANSWER_PATIENCE_S)
+        self.disconnect()
+
+    def _process_statuses(self, crew: Crew) -> Iterator[ProcessStatus]:
+        board, now_s = crew.channels.board, time.monotonic()
+        for process in PROCESSES:
+            still_s = self._pulses[process].look(board[process.beat], now_s)
+            if process is SUPERVISOR:
+                yield ProcessStatus(process.name, os.getpid(), "at work", still_s)
+                continue
+            if process not in crew:
+                continue
+            child = crew[process]
+            if not child.running:
+                state = "ended"
+            elif not crew.has_job(process):
+                state = "waiting"
+            elif process.hung_after_s is not None and still_s > process.hung_after_s:
+                state = "hung"
+            else:
+                state = "at work"
+            yield ProcessStatus(process.name, child.pid, state, still_s)

@@ -1,0 +1,282 @@
+"""One session in the processes of a rig, watched from its start to its file.
+
+It moves nothing itself. It has the file opened before the drive is enabled, lets tick 0 happen when
+the recorder is ready, shows the progress, passes a stop on, sees that every process is at work, and
+has the file closed with the outcome.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigd.engine.board import Phase, Stop, Word
+from rigd.engine.events import Event, read_events
+from rigd.engine.jobs import RecorderJob, SessionJob
+from rigd.engine.process import ChildError, Message
+from rigd.engine.processes import CONTROL, RECORDER, Pulse
+from rigd.engine.ring import Observer
+from rigd.engine.signals import StopRequest
+from rigd.supervisor.crew import Crew
+from rigd.supervisor.header import file_header
+from rigd.supervisor.live_view import LiveView
+from rigd.supervisor.orders import Order
+
+_POLL_S = 0.05
+_PATIENCE_S = 5.0
+_SLOW_PATIENCE_S = 30.0
+"""For enabling a drive and for switching it off, which may take its time."""
+_TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
+
+
+class SessionFailedError(Exception):
+    """A session could not be run or ended; the message says why, in the operator's words."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionResult:
+    """How a session ended."""
+
+    path: Path | None
+    """None: it ended before tick 0, and there is no file."""
+    outcome: str
+    reason: str
+    scheduled: int
+    recorded: int
+    missed: int
+    late: int
+    lost: int
+    live_dropped: int = 0
+    """Samples that the live view did not get."""
+
+    @property
+    def went_well(self) -> bool:
+        """Whether nothing at all is to be said against it."""
+        return self.outcome == "complete" and not self.reason
+
+
+@dataclass(frozen=True, slots=True)
+class SessionProgress:
+    """Where a running session is."""
+
+    phase: Phase
+    tick: int
+    missed: int
+    late: int
+
+
+Watcher = Callable[[SessionProgress, list[Event]], None]
+
+
+class Session:
+    """One session; :meth:`run` may be called once.
+
+    Parameters
+    ----------
+    order
+        What to run.
+    crew
+        Whose control process is connected and idle.
+    connected
+        What that process told when it was.
+    live
+        The view to keep up, or None.
+    watcher
+        Called some twenty times a second with the progress and the events since the last call.
+
+    Attributes
+    ----------
+    device_failed
+        A device failed: the control process has let go of all.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        crew: Crew,
+        connected: Message,
+        live: LiveView | None,
+        watcher: Watcher,
+    ) -> None:
+        self._order = order
+        self._crew = crew
+        self._connected = connected
+        self._live = live
+        self._board = crew.channels.board
+        self._events = Observer(crew.channels.events)
+        self._watcher = watcher
+        self._pulse = Pulse()
+        self._recorder_lost: str | None = None
+        self._control_at_work = False
+        self.device_failed = False
+
+    def run(self, stop: StopRequest) -> SessionResult:
+        """Run it to its end.
+
+        Raises
+        ------
+        SessionFailedError
+            If the file cannot be opened or written, or the recorder died or hangs.
+        """
+        stop.on_request = self._stop
+        if stop.requested:
+            self._stop()
+        try:
+            return self._run()
+        except (ChildError, SessionFailedError) as error:
+            self._recorder_lost = self._recorder_lost or str(error)
+            if self._control_at_work:
+                self._board[Word.STOP] = Stop.NO_RECORDER
+                self._listen_to_control()
+            raise SessionFailedError(self._recorder_lost) from None
+        finally:
+            stop.on_request = _nothing
+
+    def _stop(self) -> None:
+        self._board[Word.STOP] = Stop.OPERATOR
+
+    def _run(self) -> SessionResult:
+        order, crew = self._order, self._crew
+        crew.fresh(RECORDER).start(RecorderJob(order.path, crew.channels.specs))
+        self._ask_recorder("opened")
+        self._control_at_work = True
+        crew.control.send_object("session", SessionJob(order.profile, order.excitation))
+        answer = self._listen_to_control()
+        if "ready" in answer:
+            crew.recorder.send(begin=file_header(order, self._connected, answer["ready"]))
+            self._ask_recorder("armed")
+            self._board[Word.GO] = 1
+            answer = self._listen_to_control()
+        if self._recorder_lost is not None:
+            raise SessionFailedError(self._recorder_lost)
+        return self._close(answer)
+
+    def _listen_to_control(self) -> Message:
+        """Wait for the control process's next message, watching everybody meanwhile."""
+        deadline, phase = 0.0, -1
+        while True:
+            try:
+                answer = self._crew.control.poll(_POLL_S)
+            except ChildError as error:
+                return self._control_died(str(error))
+            self._report()
+            now_s = time.monotonic()
+            torque = self._board[Word.PHASE] in _TORQUE_PHASES
+            if self._board[Word.STOP] == Stop.NO or self._board[Word.PHASE] != phase:
+                phase = self._board[Word.PHASE]
+                patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S
+                deadline = now_s + patience_s
+            elif answer is None and now_s > deadline:
+                return self._kill_control(f"did not stop within {patience_s:g} s")
+            assert CONTROL.hung_after_s is not None
+            hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
+            still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
+            if answer is None and still_s > hung_after_s:
+                return self._kill_control(f"has not moved for {hung_after_s:g} s")
+            if answer is not None:
+                return self._understood(answer)
+            if self._recorder_lost is None:
+                self._recorder_lost = self._recorder_trouble()
+                if self._recorder_lost is not None:
+                    self._board[Word.STOP] = Stop.NO_RECORDER
+
+    def _understood(self, answer: Message) -> Message:
+        if "ended" in answer:  # before the session began
+            return self._control_died(str(answer["ended"]))
+        if "finished" in answer:
+            self._control_at_work = False
+            self.device_failed |= answer["device_failed"]
+        return answer
+
+    def _kill_control(self, why: str) -> Message:
+        """End a control process that hangs: the drive's own watch is what switches off then."""
+        self._crew.control.kill()
+        return self._control_died(
+            f"The control process {why} and was killed: without its heartbeat the drive switches "
+            "itself off. See that it has."
+        )
+
+    def _control_died(self, reason: str) -> Message:
+        self._control_at_work = False
+        self.device_failed = True
+        return self._as_finished(reason)
+
+    def _as_finished(self, reason: str) -> Message:
+        """Say what the control process would have said, as far as the board tells."""
+        board = self._board
+        counts = {
+            "scheduled": board[Word.SCHEDULED],
+            "missed": board[Word.MISSED],
+            "late": board[Word.LATE],
+        }
+        return {"finished": "fault", "reason": reason, "counts": counts, "results": {}}
+
+    def _recorder_trouble(self) -> str | None:
+        try:
+            message = self._crew.recorder.poll(0.0)
+        except ChildError as error:
+            return str(error)
+        return None if message is None else str(message.get("error", message))
+
+    def _ask_recorder(self, expected: str, patience_s: float = _PATIENCE_S) -> Message:
+        """Wait for its answer, going on watching: the motor may be held meanwhile."""
+        deadline = time.monotonic() + patience_s
+        message = None
+        while message is None and time.monotonic() < deadline:
+            message = self._crew.recorder.poll(_POLL_S)
+            self._report()
+        if message is None:
+            raise SessionFailedError(
+                f"The recorder process does not answer within {patience_s:g} s."
+            )
+        if "error" in message:
+            raise SessionFailedError(message["error"])
+        if expected not in message:
+            raise SessionFailedError(f"The recorder process answers {message}.")
+        return message
+
+    def _report(self) -> None:
+        board = self._board
+        board.beat(Word.SUPERVISOR_BEAT)
+        events = read_events(self._events.take(16))
+        if self._live is not None:
+            events += self._live.attend()
+        self._watcher(
+            SessionProgress(
+                Phase(board[Word.PHASE]),
+                board[Word.SCHEDULED],
+                board[Word.MISSED],
+                board[Word.LATE],
+            ),
+            events,
+        )
+
+    def _close(self, finished: Message) -> SessionResult:
+        self._report()
+        counts = finished["counts"]
+        outcome = {
+            "outcome": finished["finished"],
+            "reason": finished["reason"],
+            **{name: str(count) for name, count in counts.items()},
+            **finished["results"],
+        }
+        self._crew.recorder.wake()
+        self._crew.recorder.send(close=outcome)
+        closed = self._ask_recorder("closed", 2 * _PATIENCE_S)
+        # What the recorder counted in the file has the last word.
+        counts = {"scheduled": 0, "missed": 0, "late": 0} | counts | closed.get("counts", {})
+        return SessionResult(
+            path=None if closed["closed"] is None else Path(closed["closed"]),
+            outcome=finished["finished"],
+            reason=finished["reason"],
+            scheduled=counts["scheduled"],
+            recorded=counts.get("recorded", 0),
+            missed=counts["missed"],
+            late=counts["late"],
+            lost=counts.get("lost", 0),
+            live_dropped=self._board[Word.LIVE_DROPPED],
+        )
+
+
+def _nothing() -> None:
+    """Answer a stop request that comes between two sessions: its being noted is enough."""

@@ -1,0 +1,192 @@
+"""The control process between and around sessions: orders, zero, rest, and devices that fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.devices.contracts import DeviceError
+from rigd.engine.board import Phase, Word
+from rigd.engine.clocks import VirtualClock
+from rigd.engine.jobs import SessionJob
+from rigd.excitation import hold, step
+from rigd.session.format import Status
+
+
+class FakeRealClock(VirtualClock):
+    """Never late, and yet not virtual: the idle loop observes."""
+
+    virtual = False
+
+
+def short(session, **options):
+    rate_hz = session.profile.rig.rate_hz
+    excitation = hold(rate_hz=rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+    return {"session": SessionJob(session.profile, options.get("excitation", excitation))}
+
+
+def test_sessions_follow_each_other_on_one_connection(make_session):
+    session = make_session()
+    connects = []
+    connect = session.drive.connect
+    session.drive.connect = lambda: (connects.append(1), connect())
+    session.obey(short(session), short(session))
+    first, second = session.parent.said("finished")
+    assert (first["finished"], second["finished"]) == ("complete", "complete")
+    assert first["counts"] == second["counts"] == {
+        "scheduled": 1200, "missed": 0, "late": 0, "lost": 0,
+    }  # fmt: skip
+    assert connects == [1]
+    assert session.samples["tick"].tolist() == [*range(1200), *range(1200)]
+    assert session.parent.said("ended") == [{"ended": ""}]
+    session.assert_safe()
+
+
+@pytest.mark.parametrize("clock", [VirtualClock, FakeRealClock])
+def test_the_zero_is_where_the_operator_says_and_stays_there(make_session, clock):
+    session = make_session(clock=clock())
+    session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 0.3
+    session.obey(short(session), {"zero": True}, short(session), short(session))
+    (zeroed,) = session.parent.said("done")
+    assert zeroed["done"]["moved_rad"] == pytest.approx(0.3, abs=3 * 7e-5)
+    starts = [float(m["ready"]["start_angle_rad"]) for m in session.parent.said("ready")]
+    assert starts == pytest.approx([0.3, 0.0, 0.0], abs=3 * 7e-5)
+    samples = session.samples
+    assert np.abs(samples["angle_rad"][-2400:]).max() < 1e-2
+
+
+def test_limits_are_relative_to_the_zero(make_session):
+    session = make_session()
+    limit_rad = session.profile.limits.angle_rad
+    session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 1.1 * limit_rad
+    session.obey(short(session), {"zero": True}, short(session))
+    refused, fine = session.parent.said("finished")
+    assert refused["finished"] == "fault"
+    assert "outside limits.angle_rad" in refused["reason"]
+    assert refused["device_failed"] is False
+    assert fine["finished"] == "complete"
+
+
+def test_no_zero_while_the_motor_moves(make_session):
+    session = make_session()
+    session.drive.fault_at = 1
+    session.drive.fault = lambda angle: angle + 1e-5 * session.drive.reads
+    session.obey({"zero": True})
+    (refused,) = session.parent.said("refused")
+    assert "rest_velocity_rad_s" in refused["refused"]
+    session.assert_safe()
+
+
+def test_a_tare_between_sessions_tells_what_the_sensor_reads(make_session):
+    session = make_session()
+    session.obey({"tare": True})
+    (tared,) = session.parent.said("done")
+    offset = session.profile.rig.simulation.offset
+    assert tared["done"]["mean"]["fz_n"] == pytest.approx(offset[2], abs=0.01)
+    assert tared["done"]["torque_std_nm"] < session.profile.session.rest_torque_nm
+    assert session.drive.torques == []
+
+
+def test_a_session_waits_until_the_beam_has_come_to_rest(make_session):
+    session = make_session()
+    rate_hz = session.profile.rig.rate_hz
+    kick = step(rate_hz=rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0)
+    session.obey(short(session, excitation=kick), short(session))
+    first, second = session.parent.said("finished")
+    assert (first["finished"], second["finished"]) == ("complete", "complete")
+    waits = [event.message for event in session.events if "Waiting until" in event.message]
+    assert len(waits) == 1
+    assert "The beam is not at rest" in waits[0]
+    tares = [float(m["ready"]["tare_std_tz_nm"]) for m in session.parent.said("ready")]
+    assert max(tares) <= session.profile.session.rest_torque_nm
+
+
+def test_it_does_not_wait_for_rest_for_ever(make_session):
+    session = make_session()
+    settings = replace(session.profile.session, rest_timeout_s=3.0)
+    session.profile = replace(session.profile, session=settings)
+    rate_hz = session.profile.rig.rate_hz
+    kick = step(rate_hz=rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0)
+    session.obey(short(session, excitation=kick), short(session))
+    refused = session.parent.said("finished")[1]
+    assert refused["finished"] == "fault"
+    assert "rest_timeout_s = 3 s" in refused["reason"]
+    assert refused["counts"]["scheduled"] == 0
+    session.assert_safe()
+
+
+def test_a_device_that_fails_between_sessions_ends_the_attendance(make_session):
+    def fail(angle_rad):
+        raise DeviceError("The drive is gone.")
+
+    session = make_session(clock=FakeRealClock())
+    session.drive.fault_at, session.drive.fault = 20, fail
+    polls = []
+    session.parent.poll = polls.append  # nobody orders anything
+    session.obey()
+    assert session.parent.said("ended") == [{"ended": "The drive is gone."}]
+    session.assert_safe()
+
+
+def test_a_sensor_that_is_silent_between_sessions_is_told(make_session):
+    session = make_session(clock=FakeRealClock())
+    session.drive.stale_at = 50
+    session.parent.poll = lambda timeout_s: None
+    session.obey()
+    (ended,) = session.parent.said("ended")
+    assert "A new angle has not come for 1 s" in ended["ended"]
+    session.assert_safe()
+
+
+def test_a_device_that_fails_in_a_session_ends_the_attendance_after_it(make_session):
+    def fail(angle_rad):
+        raise DeviceError("The drive is gone.")
+
+    session = make_session()
+    session.drive.fault_at, session.drive.fault = 2000, fail
+    session.obey(short(session), short(session))
+    (finished,) = session.parent.said("finished")
+    assert finished["finished"] == "fault"
+    assert finished["device_failed"] is True
+    assert session.parent.said("ended") == [{"ended": "The drive is gone."}]
+    session.assert_safe()
+
+
+def test_a_supervisor_that_hangs_ends_the_session(make_session):
+    session = make_session(clock=FakeRealClock())
+    looks = []
+
+    def alive():
+        looks.append(1)
+        if session.board[Word.PHASE] != Phase.RUNNING or session.board[Word.SCHEDULED] < 1000:
+            session.board.beat(Word.SUPERVISOR_BEAT)
+        return True
+
+    session.parent.alive = alive
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert "supervising process has not moved" in session.finished["reason"]
+    samples = session.samples
+    assert 2900 < len(samples) < 3300
+    assert samples["status"][-1] & Status.TORQUE_OFF
+    assert samples["torque_command_nm"][-1] == 0.0
+
+
+def test_the_board_shows_what_is_read_and_that_somebody_reads(make_session):
+    session = make_session(clock=FakeRealClock())
+    session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 0.25
+    beats = []
+    orders = [None] * 5
+
+    def poll(timeout_s):
+        beats.append(session.board[Word.CONTROL_BEAT])
+        if not orders:
+            raise EOFError
+        return orders.pop()
+
+    session.parent.poll = poll
+    session.obey()
+    assert beats == sorted(set(beats))
+    assert session.board[Word.ANGLE_NRAD] == pytest.approx(0.25e9, abs=3e5)
+    assert session.board[Word.TORQUE_COMMAND_NNM] == 0
