@@ -105,7 +105,8 @@ def run_in_foreground(
                 for difference in simulated_differently(profile.rig):
                     tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is Reality.SIMULATED)
-            ending.enter_context(RigLock(profile.name, "rigd run", alone=alone))
+            hardware = moving is Reality.HARDWARE
+            ending.enter_context(RigLock(profile.name, "rigd run", hardware=hardware, alone=alone))
             excitation = build(profile.rig.rate_hz)
             plan = plan_session(profile, excitation, force=force)
             _tell_plan(tell, profile, excitation, plan)

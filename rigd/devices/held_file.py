@@ -4,9 +4,11 @@ import fcntl
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import TextIO
 
 from rigd.devices.simulator import runtime_folder
+
+_COMMON = Path("/run/lock")
+_NAME_SIZE = 200
 
 
 class HeldError(Exception):
@@ -14,18 +16,22 @@ class HeldError(Exception):
 
 
 class HeldFile:
-    """A lock in the runtime folder, with its holder's name in it.
+    """A lock with its holder's name in it.
 
     Parameters
     ----------
     name
         What is locked; other characters than letters and digits count alike.
+    everybody
+        It is hardware, which all users of this computer share: the lock is in ``/run/lock`` where
+        there is one. Otherwise it is in the user's own runtime folder.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, everybody: bool) -> None:
         plain = "".join(c if c.isalnum() else "-" for c in name).strip("-")
-        self.path: Path = runtime_folder() / f"{plain}.lock"
-        self._file: TextIO | None = None
+        common = everybody and os.access(_COMMON, os.W_OK)
+        self.path = _COMMON / f"rigd-{plain}.lock" if common else runtime_folder() / f"{plain}.lock"
+        self._fd: int | None = None
 
     def acquire(self, holder: str, *, alone: bool = True) -> None:
         """Take it, or share it with others that do not want it alone.
@@ -38,22 +44,27 @@ class HeldFile:
             If the file cannot be made.
         """
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        file = self.path.open("a+", encoding="utf-8")
+        fd = self._open()
         try:
-            fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+            fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
         except OSError:
-            file.seek(0)
-            said = file.read().strip() or "unknown"
-            file.close()
+            said = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
+            os.close(fd)
             raise HeldError(said) from None
-        file.truncate(0)
-        file.write(f"{holder}, process {os.getpid()}")
-        file.flush()
-        self._file = file
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, f"{holder}, process {os.getpid()}".encode(), 0)
+        self._fd = fd
 
     def release(self) -> None:
         """Give it up; harmless when repeated."""
-        if self._file is not None:
-            with suppress(OSError):
-                self._file.close()
-            self._file = None
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+    def _open(self) -> int:
+        """Open it for reading and writing, whoever made it."""
+        with suppress(FileExistsError):
+            fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            os.fchmod(fd, 0o666)  # whatever the umask: the next holder may be another user
+            return fd
+        return os.open(self.path, os.O_RDWR | os.O_CLOEXEC)

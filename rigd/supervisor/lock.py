@@ -18,16 +18,18 @@ class RigLock:
         The profile's name.
     holder
         Which program this is, for whoever comes second.
+    hardware
+        The rig is none of a user's own: all users of this computer have to be asked.
     alone
         Refuse everybody else; otherwise only those who want to be alone: sessions on simulated rigs
         of their own, each in its own process and time, do not disturb each other.
     """
 
-    def __init__(self, rig: str, holder: str, *, alone: bool = True) -> None:
+    def __init__(self, rig: str, holder: str, *, hardware: bool, alone: bool = True) -> None:
         self._rig = rig
         self._holder = holder
         self._alone = alone
-        self._file = HeldFile(f"rig-{rig}")
+        self._file = HeldFile(f"rig-{rig}", everybody=hardware)
 
     def acquire(self) -> None:
         """Take the rig.

@@ -105,6 +105,7 @@ class Session:
         self._board = crew.channels.board
         self._events = Observer(crew.channels.events)
         self._watcher = watcher
+        self._virtual = connected["realtime"]["clock"] == "virtual"
         self._pulse = Pulse()
         self._recorder_lost: str | None = None
         self._control_at_work = False
@@ -161,7 +162,8 @@ class Session:
                 return self._control_died(str(error))
             self._report()
             now_s = time.monotonic()
-            torque = self._board[Word.PHASE] in _TORQUE_PHASES
+            # In lock-step with a simulated rig each tick may wait for replies that do not come.
+            torque = self._board[Word.PHASE] in _TORQUE_PHASES and not self._virtual
             if self._board[Word.STOP] == Stop.NO or self._board[Word.PHASE] != phase:
                 phase = self._board[Word.PHASE]
                 patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S

@@ -103,13 +103,19 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     assert abs(record.samples["angle_rad"][end + 2000] - sweep[-1]) < 1e-3
 
 
-def test_a_series_gives_a_file_each_with_a_seed_each(rigd, tmp_path):
-    done = rigd("run", "chirp", "--fast", "--json", "--repeat", "3", "--note", "a series", *SHORT)
-    sessions = json.loads(done.stdout)["sessions"]
-    records = [read_session(tmp_path / session["path"]) for session in sessions]
-    assert [record.metadata["simulation_seed"] for record in records] == ["1", "2", "3"]
-    assert {record.metadata["note"] for record in records} == {"a series"}
-    assert len({record.path for record in records}) == 3
+def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_path):
+    series = []
+    for _ in range(2):
+        done = rigd("run", "chirp", "--fast", "--json", "--repeat", "2", "--note", "twice", *SHORT)
+        sessions = json.loads(done.stdout)["sessions"]
+        series.append([read_session(tmp_path / session["path"]) for session in sessions])
+    for records in series:
+        assert [record.metadata["series"] for record in records] == ["1 of 2", "2 of 2"]
+        assert {record.metadata["note"] for record in records} == {"twice"}
+        assert {record.metadata["simulation_seed"] for record in records} == {"1"}
+        assert not np.array_equal(records[0].samples, records[1].samples)
+    for first, again in zip(*series, strict=True):
+        assert np.array_equal(first.samples, again.samples)
 
 
 def test_real_time_keeps_its_books(rigd, tmp_path):

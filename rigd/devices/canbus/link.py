@@ -25,7 +25,7 @@ class CanLink:
         self._exchange: CanExchange | None = None
         self._users = 0
         simulated = "" if simulator is None else simulator.can_socket
-        self._lock = BusLock(simulated or settings.channel)
+        self._lock = BusLock(simulated or settings.channel, simulated=bool(simulated))
 
     @property
     def exchange(self) -> CanExchange:

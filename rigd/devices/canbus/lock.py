@@ -11,11 +11,13 @@ class BusLock:
     ----------
     bus
         Where the bus is: a channel, or the socket of a simulated one.
+    simulated
+        It is a simulated one: other users have others.
     """
 
-    def __init__(self, bus: str) -> None:
+    def __init__(self, bus: str, *, simulated: bool) -> None:
         self._bus = bus
-        self._file = HeldFile(f"bus-{bus}")
+        self._file = HeldFile(f"bus-{bus}", everybody=not simulated)
 
     def acquire(self) -> None:
         """Take the bus.
