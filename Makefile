@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check bench fuzz clean
+.PHONY: demo test check bench fuzz chaos endurance clean
 
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
@@ -23,12 +23,22 @@ check: $(VENV)/ready
 bench: $(VENV)/ready
 	for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
 
-# The long run of what the tests do briefly: a million frames at each parser, some minutes.
+# The long run of what the tests do briefly: a million frames at each parser, and 1200 damaged
+# session files; some minutes.
 fuzz: $(VENV)/ready
 	$(BIN)/python tests/devices/cia402/fuzz_cia402.py 1000000
 	$(BIN)/python tests/devices/ati/fuzz_ati.py 1000000
 	$(BIN)/python tests/sim/wire/drive/fuzz_drive_node.py 1000000
 	$(BIN)/python tests/sim/wire/ati/fuzz_ati_nodes.py 1000000
+	$(BIN)/python tests/recovery/fuzz_recovery.py 200
+
+# The processes of a hundred sessions killed and suspended at random moments: a quarter of an hour.
+chaos: $(VENV)/ready
+	$(BIN)/python tests/chaos/kill_rig.py
+
+# Twelve hours of rig time under the virtual clock: ten minutes.
+endurance: $(VENV)/ready
+	$(BIN)/python tests/endurance/run_campaign.py
 
 $(VENV)/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "rigd needs Python 3.11 or newer; set PYTHON=/path/to/it")'

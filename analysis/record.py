@@ -194,7 +194,7 @@ def load_record(path: Path) -> Record:
         sweep_stale_torques=int(stale_torque[sweep].sum()),
     )
     flags = _flag_counts(status[sweep])
-    outcome = (session.outcome or {}).get("outcome", "unknown")
+    outcome = session.outcome or {}
     return Record(
         path=path,
         time_s=(first_tick + np.arange(length)) / rate_hz,
@@ -212,7 +212,7 @@ def load_record(path: Path) -> Record:
         flags=flags,
         warnings=_warnings(gaps, flags, cut, outcome, rate_hz, sweep),
         metadata=session.metadata,
-        outcome=outcome,
+        outcome=outcome.get("outcome", "unknown"),
     )
 
 
@@ -354,13 +354,27 @@ def _warnings(
     gaps: Gaps,
     flags: Mapping[str, int],
     cut: int,
-    outcome: str,
+    outcome: Mapping[str, str],
     rate_hz: float,
     sweep: slice,
 ) -> tuple[str, ...]:
     found = []
-    if outcome in ("stopped", "fault"):
-        found.append(f"The session's outcome is '{outcome}', not 'complete'.")
+    ending = outcome.get("outcome", "unknown")
+    if ending in ("stopped", "fault"):
+        reason = outcome.get("reason")
+        found.append(
+            f"The session's outcome is '{ending}', not 'complete'"
+            + (f": {reason}" if reason else ".")
+        )
+    elif "recovered_from" in outcome:
+        found.append(
+            f"The file was recovered from {outcome['recovered_from']}, without loss of samples."
+        )
+    if outcome.get("recovered_protected") == "false":
+        found.append(
+            "The file was recovered from one whose metadata no checksum covered: compare rate, "
+            "beam and segments with what is known of the session."
+        )
     if cut:
         recorded_s = (sweep.stop - sweep.start) / rate_hz
         found.append(

@@ -110,14 +110,14 @@ def run_in_foreground(
             excitation = build(profile.rig.rate_hz)
             plan = plan_session(profile, excitation, force=force)
             _tell_plan(tell, profile, excitation, plan)
-            make_room(folder, excitation)
+            make_room(folder, excitation, profile.limits)
             rig = Rig(profile, fast=fast, crew=crew)
             if not stop.requested:
                 rig.connect()
             for number in range(1, repeat + 1):
                 if stop.requested:
                     break
-                make_room(folder, excitation)
+                make_room(folder, excitation, profile.limits)
                 path = choose_path(folder, excitation.kind, number if repeat > 1 else None)
                 given = {name: text for name, text in notes.items() if text}
                 if repeat > 1:

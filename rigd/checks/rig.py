@@ -5,6 +5,7 @@ from rigd.checks.loop import loop_rows
 from rigd.checks.on_paper import profile_rows, wiring_rows
 from rigd.checks.rights import rights_rows
 from rigd.checks.rows import Row, Verdict
+from rigd.checks.travel import travel_rows
 from rigd.profile import Profile
 
 
@@ -15,7 +16,13 @@ def check_rig(profile: Profile) -> list[Row]:
     might obey what is not meant for them.
     """
     wiring = list(wiring_rows(profile.rig))
-    rows = [*profile_rows(profile), *wiring, *loop_rows(profile), *rights_rows(profile.realtime)]
+    rows = [
+        *profile_rows(profile),
+        *wiring,
+        *loop_rows(profile),
+        *travel_rows(profile),
+        *rights_rows(profile.realtime),
+    ]
     if any(row.verdict is Verdict.FAIL for row in wiring):
         why = "not connected: first the bus has to be right"
         return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]

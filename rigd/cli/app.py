@@ -11,6 +11,7 @@ from rigd.cli.check import check, reset
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
+from rigd.cli.recover import recover
 from rigd.cli.run import run_app
 from rigd.cli.simulate import inject, simulate
 
@@ -26,6 +27,7 @@ app = typer.Typer(
 app.command()(check)
 app.add_typer(run_app, name="run")
 app.command()(info)
+app.command()(recover)
 app.add_typer(identify_app, name="identify")
 app.command()(reset)
 app.command()(simulate)

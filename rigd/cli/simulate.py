@@ -71,6 +71,8 @@ def inject(
     reorder,from=...[,id=...][,frames=3]      each comes after the next one
     freeze,device=drive|sensor[,for=0.5]      it neither hears nor says anything
     emcy,code=0x8130[,register=1]             the drive reports an emergency
+    sto[,for=0.5]                             the drive's wired stop is dropped
+    busoff[,for=0.5]                          the host's CAN controller is off the bus
     saturate,gauge=0..5[,for=0.5]             a strain gauge is at the end of its range
     status,bits=0x0080[,for=0.5]              the sensor reports errors
     jump,counts=-500                          the encoder slips

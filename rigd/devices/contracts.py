@@ -22,6 +22,22 @@ class DeviceError(Exception):
     """A device did not do what it was asked: the message names device, expectation and reply."""
 
 
+def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
+    """Return the error of a drive whose wired stop (STO) was dropped while it was enabled.
+
+    Parameters
+    ----------
+    device
+        Name of the drive.
+    shown
+        How it shows it, as the rest of a sentence.
+    """
+    return DeviceError(
+        f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, see "
+        "that nobody is within reach of the beam, release it, then reset the rig."
+    )
+
+
 class Drive(Protocol):
     """A torque-controlled drive with a position encoder, at the output shaft of its gear."""
 

@@ -3,6 +3,7 @@
 The ranges (``Gt``, ``Ge``, …) are enforced where a profile is loaded (:mod:`rigd.profile`).
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -22,7 +23,12 @@ class Motor:
     viscous_nm_s_per_rad: NonNegative
     coulomb_nm: NonNegative
     rated_torque_nm: Positive
+    """What 1000 thousandths of torque are to the drive (its object 6076)."""
     peak_torque_nm: Positive
+    continuous_torque_nm: Positive = math.inf
+    """Root of the mean square that the motor bears for ever, without getting too hot."""
+    thermal_time_constant_s: Positive = 10.0
+    """Over which that mean is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +139,12 @@ class ServoDrive:
     torque_tolerance_percent: Annotated[float, Ge(0), Le(100)] = 0.0
     """Of the rated torque: by how much the drive's actual torque (6077) may differ from what it was
     told for some ticks; 0 does not compare them."""
+    max_speed_rad_s: NonNegative = 0.0
+    """At the output shaft: above it the drive by itself exerts no torque that makes it faster
+    (object 6080, in motor turns a minute); 0 leaves what the drive has."""
+    sto_error_code: Annotated[int, Ge(0), Le(0xFFFF)] = 0
+    """Of the emergency message by which this drive says that its STO was dropped; 0: it only shows
+    it in its statusword."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,9 +60,11 @@ class Word(IntEnum):
     CONTROL_BEAT = 12
     # Written by the recorder
     RECORDER_BEAT = 13
+    DISK_FREE_MB = 14
+    """Of the disk that the session goes to, in 10⁶ bytes, at least 1; 0: not known yet."""
     # Written by the live publisher
-    LIVE_DROPPED = 14
-    LIVE_BEAT = 15
+    LIVE_DROPPED = 15
+    LIVE_BEAT = 16
 
 
 class Board:

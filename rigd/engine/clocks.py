@@ -5,7 +5,11 @@ is the same code under either.
 """
 
 import time
+from collections.abc import Callable
 from typing import Protocol
+
+SUSPENDED_S = 0.01
+"""More than this of :meth:`SuspendWatch.suspended_s` is a suspend; no suspend is so short."""
 
 
 class Clock(Protocol):
@@ -25,6 +29,8 @@ class RealClock:
 
     Deadlines are absolute: the remainder is computed anew for each sleep, so that neither the
     work of a tick nor a late wake-up adds up (a loop that sleeps "period minus work" drifts).
+    ``time.sleep`` itself waits for an absolute time; calling the kernel's ``clock_nanosleep`` for
+    the deadline wakes up no earlier (measured in alternation: medians of 24–31 µs either way).
 
     Parameters
     ----------
@@ -70,3 +76,41 @@ class VirtualClock:
         """Move to the deadline at once."""
         self._now_ns = deadline_ns
         return 0
+
+
+class SuspendWatch:
+    """Notices that the computer was suspended, which the monotonic clock does not show.
+
+    It stands still meanwhile, so no tick seems missed, while the rig went on without a loop. The
+    clock since boot goes on.
+
+    Parameters
+    ----------
+    monotonic_ns, boot_ns
+        The clocks, for tests.
+    """
+
+    def __init__(
+        self,
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+        boot_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self._monotonic_ns = monotonic_ns
+        self._boot_ns = boot_ns or _clock_since_boot()
+        # Of the two readings the order counts: what comes between them never looks like a suspend.
+        before_ns = self._monotonic_ns()
+        self._ahead_ns = self._boot_ns() - before_ns
+
+    def suspended_s(self) -> float:
+        """Return for how long the computer was suspended since this watch began.
+
+        A fraction of a microsecond's work, for the loop.
+        """
+        ahead_ns = self._boot_ns() - self._monotonic_ns()
+        return max(0, ahead_ns - self._ahead_ns) * 1e-9
+
+
+def _clock_since_boot() -> Callable[[], int]:
+    if not hasattr(time, "CLOCK_BOOTTIME"):
+        return time.monotonic_ns
+    return lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME)

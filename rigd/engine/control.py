@@ -18,13 +18,14 @@ from rigd.engine.cycle import Cycle
 from rigd.engine.events import Event, write_event
 from rigd.engine.jobs import ControlJob, SessionJob
 from rigd.engine.metronome import Metronome
-from rigd.engine.procedure import LOOK_EVERY, Procedure, SessionEnd, show
+from rigd.engine.procedure import Procedure, SessionEnd, show
 from rigd.engine.process import Message, Parent
 from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine.rest import AXES, Rest, observe_rest
 from rigd.engine.signals import StopRequest
+from rigd.engine.watch import make_watch
 from rigd.profile import Profile
-from rigd.safety import LimitWatch
+from rigd.safety import LOOK_EVERY
 
 _SILENCE_S = 1.0
 """For which a device may be silent between sessions."""
@@ -122,6 +123,7 @@ class _Attendance:
         self._obtained = obtained
         self._zero_rad = 0.0
         self._silent = 0
+        self._watch = make_watch(profile)
         self._cycle = self._make_cycle(profile)
 
     def serve(self) -> None:
@@ -244,6 +246,7 @@ class _Attendance:
         """Average the sensor; each session does so for itself, this is for the operator's eyes."""
         rest = self._rest(self._profile.session.tare_s)
         self._cycle.tare = rest.mean
+        self._watch.tared_nm = float(rest.torques_nm.mean())
         return {
             "mean": dict(zip(AXES, rest.mean, strict=True)),
             "std": dict(zip(AXES, rest.spread, strict=True)),
@@ -299,7 +302,7 @@ class _Attendance:
             self._devices,
             rig.sensor.projection,
             _controller(profile),
-            LimitWatch(profile.limits, rig.sensor.range, rig.rate_hz),
+            self._watch,
         )
         cycle.zero_rad = self._zero_rad
         return cycle

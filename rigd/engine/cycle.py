@@ -1,5 +1,7 @@
 """One tick: read the devices, check the limits, control, command."""
 
+from math import inf
+
 from rigd.control import PidController
 from rigd.devices.contracts import Devices, Wrench
 from rigd.safety import LimitWatch, Violation
@@ -7,8 +9,8 @@ from rigd.session.format import Status
 
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
-_STALE = _ANGLE_STALE | _WRENCH_STALE
 _WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
+_UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
 _TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
 _LIMIT_WARNING = int(Status.LIMIT_WARNING)
 _TORQUE_OFF = int(Status.TORQUE_OFF)
@@ -62,8 +64,9 @@ class Cycle:
         self.coupling_torque_nm = 0.0
         self.torque_command_nm = 0.0
         self.flags = _TORQUE_OFF
-        self._were_stale = False
+        self._were_unusable = False
         self._commanding = False
+        self._torque_squares_nm2 = 0.0
 
     def observe(self, due_ns: int) -> None:
         """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
@@ -108,17 +111,23 @@ class Cycle:
             flags |= _LIMIT_WARNING
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
+        if controller.saturated:  # which a torque that is not a number is as well
+            violation = watch.check_torque(controller.unlimited_torque_nm)
+            if violation is not None:
+                self.torque_off()
+                self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
+                return violation
+            flags |= _TORQUE_SATURATED | _LIMIT_WARNING
         self._commanding = True
-        self.torque_command_nm = self._drive.command(torque_nm)
-        if controller.saturated:
-            flags |= _TORQUE_SATURATED
+        sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
+        self._torque_squares_nm2 += sent_nm * sent_nm
         self.flags = flags
         return None
 
     @property
     def stale(self) -> bool:
         """Whether a reading of the last tick did not come."""
-        return bool(self.flags & _STALE)
+        return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
 
     @property
     def what_is_stale(self) -> str:
@@ -127,12 +136,41 @@ class Cycle:
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
 
     def check_stale(self) -> Violation | None:
-        """Say whether a device has been silent for too long, after the reading of a tick."""
+        """Say whether a device has given nothing usable for too long, after a tick's reading."""
         flags = self.flags
-        if not (flags & _STALE or self._were_stale):
+        if not (flags & _UNUSABLE or self._were_unusable):
             return None
-        self._were_stale = bool(flags & _STALE)
-        return self.watch.check_stale(bool(flags & _ANGLE_STALE), bool(flags & _WRENCH_STALE))
+        self._were_unusable = bool(flags & _UNUSABLE)
+        return self.watch.check_stale(
+            bool(flags & _ANGLE_STALE),
+            bool(flags & _WRENCH_STALE),
+            bool(flags & _WRENCH_SATURATED),
+        )
+
+    def look(
+        self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
+    ) -> Violation | None:
+        """Check what changes slowly, every `LOOK_EVERY` ticks.
+
+        Parameters
+        ----------
+        due_ns
+            When the present tick was due.
+        recorder_lag_s
+            By how much the recorder is behind the loop.
+        disk_free_mb
+            Of the disk that the session goes to.
+
+        Returns
+        -------
+        Violation or None
+            Where a limit is violated, the torque is off.
+        """
+        squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
+        violation = self.watch.look(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
+        if violation is not None:
+            self.torque_off()
+        return violation
 
     def torque_off(self) -> None:
         """Zero the torque and disable the drive, once: a real one takes its time."""

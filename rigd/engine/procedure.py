@@ -5,7 +5,7 @@ through the same cycle and leaves its results in the metadata.
 """
 
 import time
-from math import isfinite
+from math import inf, isfinite
 
 import numpy as np
 
@@ -22,10 +22,9 @@ from rigd.engine.sample_log import SampleLog
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation
 from rigd.profile import Profile
+from rigd.safety import LOOK_EVERY
 
 _SETTLE_S = 0.5
-LOOK_EVERY = 64
-"""Ticks between two looks at whether everybody is still there and keeps up."""
 _GO_POLL_S = 0.0002
 _GO_PATIENCE_S = 10.0
 _SUPERVISOR_PATIENCE_S = 2.0
@@ -138,8 +137,20 @@ class Procedure:
                 f"limits.angle_rad = {limit_rad:g} rad; turn it back and start again.",
             )
         self._rest_spread_nm = rest.torque_spread_nm
+        self._compare_with_tare_before(float(rest.torques_nm.mean()))
         self._cycle.tare = rest.mean
         return rest.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
+
+    def _compare_with_tare_before(self, zero_nm: float) -> None:
+        watch = self._cycle.watch
+        if watch.tared_nm is not None:
+            violation = watch.check_tare(zero_nm - watch.tared_nm)
+            self._say_what_is_near()
+            if violation is not None:
+                raise SessionEnd(
+                    "fault", f"{violation} If all is well, rigd tare makes it the zero."
+                )
+        watch.tared_nm = zero_nm
 
     def _wait_for_rest(self) -> Rest:
         """Return the first stretch of readings in which neither the motor nor the beam moves."""
@@ -292,13 +303,10 @@ class Procedure:
         zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
         drift_nm = float(rest.torques_nm.mean() - zero_nm)
         self.results["tare_drift_nm"] = repr(drift_nm)
-        limit_nm = self._profile.session.tare_drift_nm
-        if abs(drift_nm) > limit_nm:
-            self._say(
-                "warning",
-                f"The zero of the coupling torque moved by {drift_nm:.2g} N·m during the session, "
-                f"more than session.tare_drift_nm = {limit_nm:g} N·m.",
-            )
+        violation = self._cycle.watch.check_tare(drift_nm)
+        self._say_what_is_near()
+        if violation is not None:
+            raise SessionEnd("fault", str(violation))
 
     def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
         """One tick outside the record; what is missed there is nobody's loss, but has its limit."""
@@ -372,6 +380,15 @@ class Procedure:
     def _look(self) -> SessionEnd | None:
         """Show that this process is at work and what it reads; see whether the others are."""
         show(self._board, self._cycle)
+        violation = self._cycle.look(
+            self._metronome.due_ns,
+            # Under the virtual clock the loop waits for the recorder.
+            0.0 if self._clock.virtual else self._channels.samples.waiting / self._rate_hz,
+            self._board[Word.DISK_FREE_MB] or inf,
+        )
+        self._say_what_is_near()
+        if violation is not None:
+            return SessionEnd("fault", str(violation))
         if not self._clock.virtual:
             beat = self._board[Word.SUPERVISOR_BEAT]
             self._looks_unanswered = (
@@ -404,6 +421,10 @@ class Procedure:
         intervals = self.counts.scheduled - self.counts.missed - 1
         if executed_ns > 0:
             self.results["true_rate_hz"] = repr(intervals / (executed_ns * 1e-9))
+
+    def _say_what_is_near(self) -> None:
+        for notice in self._cycle.watch.take_notices():
+            self._say("warning", notice)
 
     def _say(self, level: Level, message: str) -> None:
         # What comes before tick 0 has no time in the file yet.

@@ -3,13 +3,22 @@
 import ctypes
 import gc
 import os
+import resource
+import struct
 from collections.abc import Callable
+from pathlib import Path
 
 REFUSED = "refused: "
 """How the report on a setting begins that was not granted."""
+WAKE_UP_US = 2
+"""Idle states that take longer to leave are kept away. Halting is quicker than that; with 0 an idle
+core would poll, and a rig that waits for its operator would heat the room."""
 
-_MCL_CURRENT_AND_FUTURE = 3
+_MCL_CURRENT = 1
+_MCL_FUTURE = 2
 _PR_SET_TIMERSLACK = 29
+_ISOLATED = "sys/devices/system/cpu/isolated"
+_IDLE_STATES = "dev/cpu_dma_latency"
 
 
 def collect_no_garbage() -> str:
@@ -20,7 +29,7 @@ def collect_no_garbage() -> str:
     return "off"
 
 
-def obtain(*, priority: int, cpu: int) -> dict[str, str]:
+def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]:
     """Ask the system for what a 1 kHz loop wants, and report what it granted.
 
     Parameters
@@ -28,7 +37,10 @@ def obtain(*, priority: int, cpu: int) -> dict[str, str]:
     priority
         Of SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
     cpu
-        The one core to run on; -1 for the last one this process may use.
+        The one core to run on; -1 for the last isolated one, or where none is isolated the last one
+        this process may use.
+    root
+        Of the file system.
 
     Returns
     -------
@@ -40,11 +52,41 @@ def obtain(*, priority: int, cpu: int) -> dict[str, str]:
         "memory": lambda: _lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
-        "cpu": lambda: _pin(cpu),
+        "cpu": lambda: _pin(cpu, root),
+        "idle_states": lambda: _keep_awake(root),
     }
     if priority > 0:
         wanted["scheduling"] = lambda: _schedule(priority)
     return {name: _attempt(setting) for name, setting in wanted.items()}
+
+
+def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
+    """Return the cores that the kernel was told to leave alone (``isolcpus``)."""
+    try:
+        return cores_of((root / _ISOLATED).read_text())
+    except (OSError, ValueError):
+        return frozenset()
+
+
+def cores_of(text: str) -> frozenset[int]:
+    """Return the cores of a list as the kernel writes it: ``0-2,5``.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    cores: set[int] = set()
+    for part in filter(None, text.strip().split(",")):
+        first, _, last = part.partition("-")
+        cores.update(range(int(first), int(last or first) + 1))
+    return frozenset(cores)
+
+
+def page_faults() -> int:
+    """Return how often this process has waited for a page of memory so far."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_minflt + usage.ru_majflt
 
 
 def _attempt(setting: Callable[[], str]) -> str:
@@ -55,8 +97,13 @@ def _attempt(setting: Callable[[], str]) -> str:
 
 
 def _lock_memory(libc: ctypes.CDLL) -> str:
-    _call(libc.mlockall(_MCL_CURRENT_AND_FUTURE))
-    return "locked"
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
+        _call(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
+        return "locked"
+    # What is allocated beyond the limit would not be slow then, but fail in mid-session.
+    _call(libc.mlockall(_MCL_CURRENT))
+    return f"locked, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
@@ -64,11 +111,29 @@ def _set_timer_slack(libc: ctypes.CDLL) -> str:
     return "1 ns"
 
 
-def _pin(cpu: int) -> str:
-    if cpu < 0:
-        cpu = max(os.sched_getaffinity(0))
+def _pin(cpu: int, root: Path) -> str:
+    if cpu >= 0:
+        os.sched_setaffinity(0, {cpu})
+        return str(cpu)
+    isolated = isolated_cores(root)
+    if isolated:
+        # They are not among those that a process may use until it asks for one by its number.
+        try:
+            os.sched_setaffinity(0, {max(isolated)})
+        except OSError:
+            pass
+        else:
+            return f"{max(isolated)}, isolated"
+    cpu = max(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpu})
     return str(cpu)
+
+
+def _keep_awake(root: Path) -> str:
+    fd = os.open(root / _IDLE_STATES, os.O_WRONLY | os.O_CLOEXEC)
+    # It holds as long as the descriptor is open, which is as long as this process lives.
+    os.write(fd, struct.pack("=i", WAKE_UP_US))
+    return f"left within {WAKE_UP_US} µs"
 
 
 def _schedule(priority: int) -> str:

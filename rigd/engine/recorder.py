@@ -6,12 +6,15 @@ stopped, and closes the file itself.
 """
 
 import contextlib
+import shlex
+import shutil
 import time
 from collections.abc import Callable, Mapping
+from math import ceil
 from pathlib import Path
 
 from rigd.engine import signals
-from rigd.engine.board import Phase, Word
+from rigd.engine.board import Board, Phase, Word
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.events import read_events
 from rigd.engine.jobs import RecorderJob
@@ -23,6 +26,7 @@ from rigd.session.format import SAMPLE_SIZE
 _BLOCK = 250
 _IDLE_S = 0.005
 _ORPHAN_PATIENCE_S = 3.0
+_DISK_LOOK_S = 1.0
 
 
 def main() -> None:
@@ -36,21 +40,39 @@ def main() -> None:
     except SessionError as error:
         parent.send(error=str(error))
         raise SystemExit(1) from None
+    _show_free_space(channels.board, job.path.parent)
     parent.send(opened=str(job.path))
     try:
-        _record(parent, channels, writer)
+        _record(parent, channels, writer, job.path.parent)
     except SessionError as error:
-        # Disk full, device gone: what reached the disk stays there under its .part name.
-        with contextlib.suppress(SessionError):
-            writer.abandon()
-        parent.send(error=str(error))
+        parent.send(error=f"{error}{_abandoned(writer)}")
         raise SystemExit(1) from None
 
 
-def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
+def _abandoned(writer: SessionWriter) -> str:
+    """End a recording that cannot go on; say where its contents are if not under their name."""
+    try:
+        kept = writer.abandon()
+    except SessionError:
+        return ""  # disk full, device gone: what reached the disk stays there
+    if kept == writer.part:
+        return ""
+    if kept is None:
+        return " What was recorded could not be saved elsewhere."
+    return (
+        f" What was recorded is now {kept}; rigd recover {shlex.quote(str(kept))} makes "
+        "a session file of it."
+    )
+
+
+def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: Path) -> None:
     recorder = _Recorder(channels, writer)
+    looked_s = time.monotonic()
     while True:
         moved = recorder.transfer()
+        if time.monotonic() - looked_s > _DISK_LOOK_S:
+            looked_s = time.monotonic()
+            _show_free_space(channels.board, folder)
         try:
             message = parent.poll(0.0 if moved else _IDLE_S)
         except EOFError:
@@ -70,6 +92,12 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter) -> None:
                 path, counts = recorder.close(message["close"])
                 parent.send(closed=str(path), counts=counts)
             return
+
+
+def _show_free_space(board: Board, folder: Path) -> None:
+    """Let the loop know; a folder that has gone is told by the next write."""
+    with contextlib.suppress(OSError):
+        board[Word.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
 
 
 class _Recorder:

@@ -21,9 +21,11 @@ _UNITS = {
     "_percent": "%",
     "_counts": "counts",
     "_bit_s": "bit/s",
+    "_rad_s2": "rad/s²",
     "_rad_s": "rad/s",
     "_rad": "rad",
     "_nm": "N·m",
+    "_mb": "MB",
     "_hz": "Hz",
     "_us": "µs",
     "_m": "m",
@@ -70,6 +72,30 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"motor.peak_torque_nm = {peak:g} N·m is below motor.rated_torque_nm = {rated:g} N·m; "
             "the peak is at least the rated torque."
+        )
+    continuous = values["motor.continuous_torque_nm"]
+    if peak >= rated and continuous > peak:
+        yield (
+            f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
+            f"{peak:g} N·m; what a motor bears for ever is at most its peak."
+        )
+    asked = values["limits.torque_command_nm"]
+    if asked < peak:
+        yield (
+            f"limits.torque_command_nm = {asked:g} N·m is below motor.peak_torque_nm = {peak:g} "
+            "N·m, where commands are cut; what the controller may ask for has to be more."
+        )
+    angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
+    if stop <= angle:
+        yield (
+            f"limits.stop_angle_rad = {stop:g} rad is not above limits.angle_rad = {angle:g} rad; "
+            "the shaft could not come to rest before it is stopped by force."
+        )
+    warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
+    if drift < warning:
+        yield (
+            f"limits.tare_drift_nm = {drift:g} N·m, which ends a session, is below "
+            f"session.tare_drift_nm = {warning:g} N·m, which warns; it has to be the greater one."
         )
     first_mode_hz = float(
         undamped_frequencies_rad_s(

@@ -36,7 +36,10 @@ class SessionSettings:
     rest_velocity_rad_s: Annotated[float, Gt(0)]
     """Mean speed over the tare up to which the rig counts as resting."""
     rest_torque_nm: Annotated[float, Gt(0)]
-    rest_timeout_s: Annotated[float, Gt(0)]
+    """Standard deviation of the coupling torque over the tare up to which the beam counts as
+    resting; more than the sensor's noise alone."""
+    rest_timeout_s: Annotated[float, Ge(0), Le(3600)]
+    """How long a session waits for rest before it refuses to start."""
     tare_drift_nm: Annotated[float, Gt(0)]
     """Change of the coupling torque's zero over a session above which a warning is given."""
     return_s: Annotated[float, Gt(0), Le(60)]

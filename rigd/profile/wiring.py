@@ -67,6 +67,13 @@ def _drive(values: Mapping[str, Any]) -> Iterator[str]:
             f"cia402.host_node_id = {values['cia402.host_node_id']} is the drive's own "
             "cia402.node_id; choose another."
         )
+    speed, limit = values["cia402.max_speed_rad_s"], values["limits.velocity_rad_s"]
+    if 0 < speed < limit:
+        yield (
+            f"cia402.max_speed_rad_s = {speed:g} rad/s is below limits.velocity_rad_s = {limit:g} "
+            "rad/s; the drive would hold back torques that a session may ask for. Choose a quarter "
+            "more than the limit, or 0 to leave what the drive has."
+        )
     ratio = values["motor.peak_torque_nm"] / values["motor.rated_torque_nm"]
     if ratio > _PER_MILLE_LIMIT:
         yield (

@@ -1,4 +1,4 @@
-"""Session files: format, writer, reader.
+"""Session files: format, writer, reader, recovery.
 
 The names below are imported on first use, so that the control process, which needs the message
 layout only (:mod:`rigd.session.format`), does not pay for the container.
@@ -12,12 +12,14 @@ if TYPE_CHECKING:
     from rigd.session.format import SAMPLE_DTYPE, SAMPLE_SIZE, Status
     from rigd.session.info import SessionInfo, describe
     from rigd.session.reader import Event, Session, read_controls, read_session, read_timings
+    from rigd.session.recovery import Recovery, recover
     from rigd.session.writer import SessionWriter
 
 __all__ = [
     "SAMPLE_DTYPE",
     "SAMPLE_SIZE",
     "Event",
+    "Recovery",
     "Session",
     "SessionError",
     "SessionExistsError",
@@ -28,6 +30,7 @@ __all__ = [
     "read_controls",
     "read_session",
     "read_timings",
+    "recover",
 ]
 
 _HOMES = {
@@ -35,6 +38,7 @@ _HOMES = {
     "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "Status"),
     "info": ("SessionInfo", "describe"),
     "reader": ("Event", "Session", "read_controls", "read_session", "read_timings"),
+    "recovery": ("Recovery", "recover"),
     "writer": ("SessionWriter",),
 }
 

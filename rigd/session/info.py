@@ -11,6 +11,8 @@ from rigd.session.errors import SessionError
 from rigd.session.format import Status
 from rigd.session.reader import Event, Session, read_session
 
+_RECOVERED = "recovered_"
+
 
 @dataclass(frozen=True, slots=True)
 class SessionInfo:
@@ -70,6 +72,7 @@ class SessionInfo:
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
             ("started", self.start_utc),
             ("outcome", "unknown" if self.outcome is None else _outcome(self.outcome)),
+            *(("recovered", f"{k}: {v}") for k, v in _recovery(self.outcome or {}).items()),
             (
                 "samples",
                 f"{self.samples} at {self.rate_hz:g} Hz, {self.duration_s:.3f} s, "
@@ -143,8 +146,18 @@ def _iso(utc_ns: int) -> str:
 
 def _outcome(outcome: dict[str, str]) -> str:
     first = outcome.get("outcome", "unknown")
-    others = ", ".join(f"{k} {v}" for k, v in outcome.items() if k != "outcome" and v)
+    told_apart = ("outcome", *(_RECOVERED + key for key in _recovery(outcome)))
+    others = ", ".join(f"{k} {v}" for k, v in outcome.items() if k not in told_apart and v)
     return f"{first} ({others})" if others else first
+
+
+def _recovery(outcome: dict[str, str]) -> dict[str, str]:
+    """Return what the outcome says of a recovery, without the common part of the keys."""
+    return {
+        key.removeprefix(_RECOVERED): value
+        for key, value in outcome.items()
+        if key.startswith(_RECOVERED)
+    }
 
 
 def _one_line(text: str) -> str:

@@ -38,8 +38,11 @@ _RUN_KEY: Final = np.dtype(
     {"names": ["head", "tail"], "formats": ["<u8", "<u8"], "offsets": [0, 3], "itemsize": 11}
 )
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
+_CHANNEL_ID: Final = struct.Struct("<H")
 _FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
+_BARE_MESSAGES: Final = 250
+"""Messages outside of chunks that are kept together."""
 _FIRST_STRETCH: Final = 256
 _BLOCK_BYTES: Final = 1 << 18
 
@@ -84,6 +87,18 @@ class McapContents:
     """Wanted topic → its messages in the order of the file."""
     message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
     """Channel → how many messages were read, wanted or not."""
+    chunks: list[list[Run]] = field(default_factory=list)
+    """Messages of all topics as they stood together in chunks, if that was asked for."""
+    declared_in_chunks: set[int] = field(default_factory=set)
+    """Channels that were declared where a checksum covers them and their schemas."""
+    skipped: list[str] = field(default_factory=list)
+    """Damaged records that were skipped: sentences' predicates, as `damage`."""
+    stated_counts: dict[int, int] = field(default_factory=dict)
+    """Channel → how many messages the file had, by its statistics; empty if they are not sound."""
+    sound_bytes: int = 0
+    """How far the file was read: up to the end of a record."""
+    verified: bool = False
+    """Whether a checksum over the whole data section was there, and right."""
     complete: bool = False
     """Whether the file has its end."""
     damage: str | None = None
@@ -95,13 +110,23 @@ class McapContents:
         return sum(self.message_counts[channel] for channel in channels)
 
 
-def read_mcap(data: memoryview, topics: Collection[str]) -> McapContents:
+def read_mcap(
+    data: memoryview,
+    topics: Collection[str],
+    *,
+    salvage: bool = False,
+    on_progress: Callable[[float], None] | None = None,
+) -> McapContents:
     """Read an MCAP file as far as it is sound.
 
     Parameters
     ----------
     data : the file
     topics : of which the messages are wanted
+    salvage
+        Get as much as there is: keep `McapContents.chunks`, skip damaged records outside of
+        chunks, which no message depends on, and look for the statistics of a damaged file.
+    on_progress : called now and then with the share of the file that is done
 
     Returns
     -------
@@ -114,15 +139,18 @@ def read_mcap(data: memoryview, topics: Collection[str]) -> McapContents:
     """
     if bytes(data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
-    reader = _Reader(data, topics)
-    reader.contents.complete = _has_end(data)
+    reader = _Reader(data, topics, salvage=salvage)
+    contents = reader.contents
+    contents.complete = _has_end(data)
     try:
-        reader.read()
+        reader.read(on_progress)
     except _DamageError as error:
-        reader.contents.damage = str(error)
+        contents.damage = str(error)
+        if salvage and contents.complete:
+            contents.stated_counts = _stated_counts(data)
     except MemoryError:
-        reader.contents.damage = "does not fit into the memory of this machine"
-    return reader.contents
+        contents.damage = "does not fit into the memory of this machine"
+    return contents
 
 
 class _DamageError(Exception):
@@ -154,33 +182,55 @@ def _record_at(data: memoryview, position: int, where: str) -> tuple[int, int, i
 class _Reader:
     """One pass over a file."""
 
-    def __init__(self, data: memoryview, topics: Collection[str]) -> None:
-        self.contents = McapContents()
+    def __init__(self, data: memoryview, topics: Collection[str], *, salvage: bool) -> None:
+        self.contents = McapContents(sound_bytes=len(MAGIC))
+        self._salvage = salvage
         self._data = data
         self._topics = topics
         self._wanted: dict[int, str | None] = {}  # channel → its topic if wanted
         self._uncompressed = 0
         self._zstd = zstandard.ZstdDecompressor()
 
-    def read(self) -> None:
-        data = self._data
+    def read(self, on_progress: Callable[[float], None] | None) -> None:
+        data, contents = self._data, self.contents
         end = len(MAGIC)
         while end < len(data):
             start = end
             opcode, content, end = _record_at(data, start, "")
             if opcode == Opcode.CHUNK:
                 self._read_chunk(data[content:end], start)
+                if on_progress is not None:
+                    on_progress(end / len(data))
             elif opcode == Opcode.MESSAGE:
-                self._take_run(data[start:end], 1, len(data), f" at byte {start}")
+                self._read_bare_message(data[start:end], start)
             elif opcode == Opcode.DATA_END:
                 self._check_data_end(data[content:end], start)
+                contents.sound_bytes = end
                 self._check_summary(end)
+                contents.sound_bytes = len(data)
                 return
             elif opcode == Opcode.FOOTER:
                 break
             else:
-                self._read_other(opcode, data[content:end], f" at byte {start}")
+                try:
+                    self._read_other(opcode, data[content:end], f" at byte {start}")
+                except _DamageError as error:
+                    if not self._salvage:
+                        raise
+                    contents.skipped.append(str(error))
+            contents.sound_bytes = end
         raise _DamageError("has no end of its data section")
+
+    def _read_bare_message(self, record: memoryview, start: int) -> None:
+        where = f" at byte {start}"
+        if self._salvage:
+            channel = MESSAGE_HEAD.unpack_from(record)[2] if len(record) >= MESSAGE_HEAD.size else 0
+            if channel in self.contents.declared_in_chunks:
+                # Its writer uses chunks: this is another record, with a damaged opcode.
+                raise _DamageError(f"has a message outside of a chunk{where}")
+            if not self.contents.chunks or len(self.contents.chunks[-1]) >= _BARE_MESSAGES:
+                self.contents.chunks.append([])
+        self._take_run(record, 1, len(self._data), where)
 
     def _read_other(self, opcode: int, content: memoryview, where: str) -> None:
         """Take a record that is neither chunk nor message; skip what is not needed."""
@@ -220,6 +270,8 @@ class _Reader:
         records = memoryview(self._decompressed(bytes(name), packed, size, where))
         if crc not in (0, zlib.crc32(records)):
             raise _DamageError(f"has a wrong checksum{where}")
+        if self._salvage:
+            self.contents.chunks.append([])
         self._read_chunk_records(records, where)
 
     def _decompressed(self, compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
@@ -257,6 +309,9 @@ class _Reader:
                 self._take_run(records[start:end], count, len(records), where)
             else:
                 self._read_other(opcode, records[content:end], where)
+                if opcode == Opcode.CHANNEL:
+                    (channel,) = _CHANNEL_ID.unpack_from(records, content)
+                    self.contents.declared_in_chunks.add(channel)
 
     def _take_run(self, run: memoryview, count: int, total: int, where: str) -> None:
         """Take `count` message records of equal length and channel out of `total` bytes."""
@@ -267,6 +322,8 @@ class _Reader:
         if channel not in self._wanted:
             raise _DamageError(f"has a message of an undeclared channel {channel}{where}")
         self.contents.message_counts[channel] += count
+        if self._salvage:
+            self.contents.chunks[-1].append(Run(channel, size, [run]))
         topic = self._wanted[channel]
         if topic is None:
             return
@@ -282,6 +339,7 @@ class _Reader:
         (crc,) = struct.unpack_from("<I", content)
         if crc not in (0, zlib.crc32(self._data[:start])):
             raise _DamageError("has a wrong checksum over its data section")
+        self.contents.verified = crc != 0
 
     def _check_summary(self, start: int) -> None:
         """Compare the summary, if there is one, with what was found."""
@@ -306,6 +364,26 @@ class _Reader:
                 counts = statistics.channel_message_counts
                 if any(found[channel] != count for channel, count in counts.items()):
                     raise _DamageError("has not the messages that its statistics count")
+
+
+def _stated_counts(data: memoryview) -> dict[int, int]:
+    """Return the statistics' message counts, if the summary has a checksum that is right."""
+    footer = len(data) - len(MAGIC) - _FOOTER.size
+    *_, start, _, crc = _FOOTER.unpack_from(data, footer)
+    if not len(MAGIC) <= start <= footer:
+        return {}
+    if crc == 0 or crc != zlib.crc32(data[start : footer + _FOOTER.size - 4]):
+        return {}
+    end = start
+    try:
+        while end < footer:
+            opcode, content, end = _record_at(data[:footer], end, "")
+            if opcode == Opcode.STATISTICS:
+                statistics = _parsed(Statistics.read, data[content:end], "")
+                return dict(statistics.channel_message_counts)
+    except _DamageError:
+        pass
+    return {}
 
 
 def _prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:

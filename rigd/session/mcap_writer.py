@@ -7,7 +7,7 @@ serialised by the records of the ``mcap`` package. Format: https://mcap.dev/spec
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import BinaryIO, Final
 
 import lz4.frame
@@ -42,6 +42,7 @@ RECORD_HEAD_SIZE: Final = 9
 
 MESSAGE_HEAD: Final = struct.Struct("<BQ HIQQ")
 """Opcode, length, channel, sequence, log time, publish time: what precedes a message's data."""
+LOG_TIME_OFFSET: Final = RECORD_HEAD_SIZE + 2 + 4
 
 INDEX_DTYPE: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 """One entry of a message index: where in the uncompressed chunk a message's record begins."""
@@ -89,18 +90,12 @@ class McapWriter:
         self._position += len(data)
         return position
 
-    def add_channel(self, topic: str, schema_name: str, schema_data: bytes) -> int:
-        """Declare a protobuf channel with a schema of its own; return the channel's id."""
-        number = len(self._channels) + 1
-        schema = Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data)
-        channel = Channel(
-            id=number, topic=topic, message_encoding="protobuf", schema_id=number, metadata={}
-        )
-        self._schemas.append(schema)
-        self._channels.append(channel)
-        self._message_counts[number] = 0
-        self._write(_serialised(schema) + _serialised(channel))
-        return number
+    def declare(self, schemas: Iterable[Schema], channels: Iterable[Channel]) -> None:
+        """Declare all channels, in a chunk of their own: there a checksum covers them at once."""
+        self._schemas = list(schemas)
+        self._channels = list(channels)
+        self._message_counts = {channel.id: 0 for channel in self._channels}
+        self.add_chunk(b"".join(map(_serialised, [*self._schemas, *self._channels])), {})
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a metadata record."""
@@ -133,11 +128,11 @@ class McapWriter:
 
         Parameters
         ----------
-        records : message records one behind the other
+        records : one behind the other
         indexes : channel id → array (n > 0,) of `INDEX_DTYPE`, in the order of the messages
         """
-        start = min(int(index["log_time"].min()) for index in indexes.values())
-        end = max(int(index["log_time"].max()) for index in indexes.values())
+        start = min((int(index["log_time"].min()) for index in indexes.values()), default=0)
+        end = max((int(index["log_time"].max()) for index in indexes.values()), default=0)
         compressed = lz4.frame.compress(records)
         name = COMPRESSION.encode()
         head = _CHUNK_HEAD.pack(
@@ -167,8 +162,9 @@ class McapWriter:
             index_length += _INDEX_HEAD.size + len(entries)
             self._message_counts[channel] += len(index)
         position = self._write(b"".join(parts))
-        self._start_time = start if self._start_time is None else min(start, self._start_time)
-        self._end_time = max(end, self._end_time)
+        if indexes:
+            self._start_time = start if self._start_time is None else min(start, self._start_time)
+            self._end_time = max(end, self._end_time)
         self._chunk_indexes.append(
             ChunkIndex(
                 message_start_time=start,

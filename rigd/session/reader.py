@@ -1,6 +1,7 @@
 """Reader of session files: the whole file to arrays, or an error that says what is wrong."""
 
 import mmap
+import shlex
 import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
+from rigd.session.durable import is_being_written
 from rigd.session.errors import SessionError
 from rigd.session.format import (
     CONTROL_DTYPE,
@@ -183,23 +185,22 @@ def read_session(path: Path) -> Session:
         version, or no session.
     """
     contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC))
-    metadata = _merged(contents, "session") or {}
+    metadata = merged_metadata(contents, "session") or {}
     version = metadata.get("format_version", FORMAT_VERSION)
     if version != FORMAT_VERSION:
         raise SessionError(
             f"{path} is of session format version {_quoted(version)}, and this program reads "
             f"version {FORMAT_VERSION}. Use a newer version of it."
         )
-    samples = _decode_topic(path, contents, _SAMPLES)
-    _check_ticks(path, samples)
+    samples = load_samples(path, contents)
     start_utc_ns = _start_utc_ns(path, metadata, contents, samples)
     return Session(
         path=path,
         samples=samples,
         start_utc_ns=start_utc_ns,
         metadata=metadata,
-        segments=_segments(path, _merged(contents, "segments") or {}),
-        outcome=_merged(contents, "outcome"),
+        segments=_segments(path, merged_metadata(contents, "segments") or {}),
+        outcome=merged_metadata(contents, "outcome"),
         events=_events(path, contents, start_utc_ns),
         attachments={attachment.name: attachment.data for attachment in contents.attachments},
     )
@@ -242,21 +243,7 @@ def _quoted(text: str) -> str:
 
 def _load(path: Path, topics: Sequence[str]) -> McapContents:
     """Read the container of a session file that must be complete and sound."""
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
-        if status.st_size == 0:
-            raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
-        with path.open("rb") as file:
-            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        contents = read_mcap(memoryview(mapped), topics)
-    except OSError as error:
-        raise SessionError(
-            f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
-        ) from None
-    except McapError as error:
-        raise SessionError(f"{path} {error}. Give a session file (*.mcap).") from None
+    contents = load_contents(path, topics)
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:
@@ -267,21 +254,74 @@ def _load(path: Path, topics: Sequence[str]) -> McapContents:
     return contents
 
 
+def load_contents(
+    path: Path,
+    topics: Sequence[str],
+    *,
+    salvage: bool = False,
+    on_progress: Callable[[float], None] | None = None,
+) -> McapContents:
+    """Read the container of a file as far as it is sound.
+
+    Parameters
+    ----------
+    path : the file
+    topics, salvage, on_progress : as `rigd.session.mcap_reader.read_mcap` takes them
+
+    Raises
+    ------
+    SessionError
+        If the file is missing, empty or not an MCAP file.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
+        if status.st_size == 0:
+            raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
+        with path.open("rb") as file:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        return read_mcap(memoryview(mapped), topics, salvage=salvage, on_progress=on_progress)
+    except OSError as error:
+        raise SessionError(
+            f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
+        ) from None
+    except McapError as error:
+        raise SessionError(f"{path} {error}. Give a session file (*.mcap).") from None
+
+
+def load_samples(path: Path, contents: McapContents) -> npt.NDArray[np.void]:
+    """Decode the samples of a file that was read with their topic.
+
+    Raises
+    ------
+    SessionError
+        If they are not what the format asks for.
+    """
+    samples = _decode_topic(path, contents, _SAMPLES)
+    _check_ticks(path, samples)
+    return samples
+
+
 def _damage_message(path: Path, contents: McapContents) -> str:
+    remedy = f"`rigd recover {shlex.quote(str(path))}`"
     if contents.complete:
         return (
             f"{path} is damaged: it {contents.damage}. Copy it again from where it was recorded, "
-            "or record the session again."
+            f"or save what is intact with {remedy}."
+        )
+    if is_being_written(path):
+        return (
+            f"{path} is incomplete, because it is still being recorded. Wait for the end of the "
+            "session, or stop it."
         )
     return (
         f"{path} is incomplete: it {contents.damage}; {contents.count(SAMPLE_TOPIC)} complete "
-        "samples are readable before that. If it is still being recorded, wait for the end; if "
-        "not, save them with a tool that recovers MCAP files (`mcap recover`, https://mcap.dev) "
-        "or record the session again."
+        f"samples are readable before that. Save them with {remedy}."
     )
 
 
-def _merged(contents: McapContents, name: str) -> dict[str, str] | None:
+def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:
     """Return the metadata of one name, later records over earlier ones; None without any."""
     records = [record.metadata for record in contents.metadata if record.name == name]
     return {key: value for record in records for key, value in record.items()} if records else None

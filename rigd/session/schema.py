@@ -4,6 +4,7 @@ An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` th
 and everything it refers to.
 """
 
+from collections.abc import Mapping
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Final
 
@@ -138,6 +139,27 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     except (DecodeError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"schema {schema_name!r} is not a usable protobuf schema") from error
     return message_factory.GetMessageClass(descriptor)
+
+
+def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
+    """Return both records as the metadata of the sample channel, where a checksum covers them.
+
+    The format has no checksum of a metadata record, and that of the whole file comes at its end.
+    """
+    return {
+        **{f"session.{key}": value for key, value in session.items()},
+        **{f"segments.{key}": value for key, value in segments.items()},
+    }
+
+
+def unprotected_metadata(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Undo `protected_metadata`: return ``session`` and ``segments``; empty without them."""
+    found: dict[str, dict[str, str]] = {}
+    for key, value in channel.items():
+        record, dot, name = key.partition(".")
+        if dot and record in ("session", "segments"):
+            found.setdefault(record, {})[name] = value
+    return found
 
 
 def event_class() -> "type[Message]":

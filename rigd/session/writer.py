@@ -1,7 +1,6 @@
 """Recorder's side of a session file: blocks of packed messages in, a durable MCAP file out."""
 
 import contextlib
-import errno
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,8 +10,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
 
 import rigd
+from rigd.session.durable import copy_new, fsync_directory, mark_as_written, rename_new
 from rigd.session.errors import SessionError, SessionExistsError
 from rigd.session.format import (
     CONTROL_SIZE,
@@ -36,13 +37,15 @@ from rigd.session.schema import (
     TIMING_SCHEMA,
     TIMING_TOPIC,
     event_class,
+    protected_metadata,
     schema_data,
 )
 
 PART_SUFFIX: Final = ".part"
 
 CHUNK_SAMPLES: Final = 250
-"""Samples to a chunk: what a killed recorder loses at most."""
+CHUNK_S: Final = 0.25
+"""Samples to a chunk, and time to a chunk: what a killed recorder loses at most is the lesser."""
 SYNC_INTERVAL_S: Final = 1.0
 """Wall time between two syncs to the disk: what a dead host loses on top."""
 
@@ -55,6 +58,14 @@ _MESSAGE_HEAD_FIELDS: Final = [
     ("publish_time", "<u8"),
 ]
 """`MESSAGE_HEAD` as numpy has it."""
+
+_CHANNELS: Final = {
+    SAMPLE_TOPIC: (1, SAMPLE_SCHEMA),
+    CONTROL_TOPIC: (2, CONTROL_SCHEMA),
+    TIMING_TOPIC: (3, TIMING_SCHEMA),
+    EVENT_TOPIC: (4, EVENT_SCHEMA),
+}
+"""Topic → the channel's number in the file and the name of its schema."""
 
 _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
 _URGENT: Final = ("error", "fatal")
@@ -98,27 +109,32 @@ def _event_records(
     return records, index
 
 
-def _fsync_directory(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+def _chunk_samples(metadata: Mapping[str, str]) -> int:
+    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
+    except (ValueError, OverflowError):
+        return CHUNK_SAMPLES
+    return min(max(in_time, 1), CHUNK_SAMPLES)
 
 
-def _rename_new(source: Path, target: Path) -> None:
-    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
-    try:
-        os.link(source, target)
-    except OSError as error:
-        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
-            raise
-        # A file system without hard links (FAT, some network shares): reserve the name, which
-        # fails if anybody has it, and replace the empty file that then is our own.
-        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-        source.replace(target)
-    else:
-        source.unlink()
+def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
+    """Make the channels of a session; that of the samples repeats what the file says of them."""
+    schemas, channels = [], []
+    for topic, (number, schema_name) in _CHANNELS.items():
+        schemas.append(
+            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
+        )
+        channels.append(
+            Channel(
+                id=number,
+                topic=topic,
+                message_encoding="protobuf",
+                schema_id=number,
+                metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
+            )
+        )
+    return schemas, channels
 
 
 class SessionWriter:
@@ -145,6 +161,7 @@ class SessionWriter:
         self._samples = bytearray()
         self._controls = bytearray()
         self._timings = bytearray()
+        self._chunk_samples = CHUNK_SAMPLES
         self._events: list[tuple[int, bytes]] = []  # log_time, message
         self._event_count = 0
         self._start_utc_ns = 0
@@ -154,13 +171,14 @@ class SessionWriter:
         self._failed = False
         with self._explained():
             try:
-                descriptor = os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+                descriptor = os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
             except FileExistsError:
                 raise SessionExistsError(
                     f"{self.part} exists: another session is being recorded to it or was cut off. "
                     "Choose another name or move that file away; nothing is overwritten."
                 ) from None
             self._stream = os.fdopen(descriptor, "wb")
+            mark_as_written(descriptor)
             # Only now, so that a writer that finishes in between is seen.
             if os.path.lexists(path):
                 self._stream.close()
@@ -200,42 +218,29 @@ class SessionWriter:
         if self._mcap is not None:
             raise RuntimeError("begin() was called twice")
         self._start_utc_ns = start_utc_ns
+        self._chunk_samples = _chunk_samples(metadata)
         with self._explained():
             mcap = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
-            mcap.add_metadata(
-                "session",
-                {
-                    **metadata,
-                    "format_version": FORMAT_VERSION,
-                    "start_utc_ns": str(start_utc_ns),
-                },
-            )
-            mcap.add_metadata(
-                "segments", {name: f"{first},{end}" for name, (first, end) in segments.items()}
-            )
+            session = {
+                **metadata,
+                "format_version": FORMAT_VERSION,
+                "start_utc_ns": str(start_utc_ns),
+            }
+            ticks = {name: f"{first},{end}" for name, (first, end) in segments.items()}
+            mcap.add_metadata("session", session)
+            mcap.add_metadata("segments", ticks)
             for name, data in attachments.items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
                 mcap.add_attachment(name, media_type, data, start_utc_ns)
-            self._sample_channel = mcap.add_channel(
-                SAMPLE_TOPIC, SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA)
-            )
-            self._control_channel = mcap.add_channel(
-                CONTROL_TOPIC, CONTROL_SCHEMA, schema_data(CONTROL_SCHEMA)
-            )
-            self._timing_channel = mcap.add_channel(
-                TIMING_TOPIC, TIMING_SCHEMA, schema_data(TIMING_SCHEMA)
-            )
-            self._event_channel = mcap.add_channel(
-                EVENT_TOPIC, EVENT_SCHEMA, schema_data(EVENT_SCHEMA)
-            )
+            mcap.declare(*_session_channels(protected_metadata(session, ticks)))
             self._mcap = mcap
             self._sync()
-            _fsync_directory(self.part.parent)
+            fsync_directory(self.part.parent)
 
     def write_samples(self, block: Buffer) -> None:
         """Take n × ``SAMPLE_SIZE`` bytes of packed samples (n may be 0)."""
         arrived = self._checked(block, SAMPLE_SIZE)
-        chunk_size = CHUNK_SAMPLES * SAMPLE_SIZE
+        chunk_size = self._chunk_samples * SAMPLE_SIZE
         with self._explained():
             while arrived:
                 taken = chunk_size - len(self._samples)
@@ -306,30 +311,47 @@ class SessionWriter:
             mcap.add_metadata("outcome", outcome)
             mcap.finish()
             self._sync()
+            self._check_place()
             self._stream.close()
             try:
-                _rename_new(self.part, self.path)
+                rename_new(self.part, self.path)
             except FileExistsError:
                 raise SessionExistsError(
                     f"{self.path} has appeared while the session was recorded and is not "
                     f"overwritten; the complete session is {self.part}, to be renamed."
                 ) from None
-            _fsync_directory(self.path.parent)
+            fsync_directory(self.path.parent)
         return self.path
 
-    def abandon(self) -> None:
-        """Write what has arrived and leave the ``.part`` as it is, without an end."""
+    def abandon(self) -> Path | None:
+        """Write what has arrived and leave the ``.part`` as it is, without an end.
+
+        If it was removed, its contents, which live as long as it is open, are saved to the
+        nearest folder above that takes them.
+
+        Returns
+        -------
+        Where the contents are; None if they could not be saved.
+
+        Raises
+        ------
+        SessionError
+            If what has arrived could not be written; what was written before is kept.
+        """
         if self._stream.closed:
-            return
+            return self.part
         try:
             if not self._failed:
                 with self._explained():
                     if self._mcap is not None:
                         self._write_chunk(everything=True)
-                    self._sync()
+                    self._stream.flush()
+                    os.fsync(self._stream.fileno())
         finally:
+            kept = self._kept()
             with contextlib.suppress(OSError):  # the failure to write was reported already
                 self._stream.close()
+        return kept
 
     def discard(self) -> None:
         """Remove the ``.part`` of a session that was never begun."""
@@ -337,7 +359,37 @@ class SessionWriter:
             raise RuntimeError("a session that was begun is kept")
         self._stream.close()
         with self._explained():
-            self.part.unlink()
+            self.part.unlink(missing_ok=True)
+
+    def _check_place(self) -> None:
+        """Notice that the file has gone from under its name; writing to it would still succeed."""
+        if not self._is_in_place():
+            raise SessionError(
+                f"{self.part} was removed or moved while it was recorded. Leave the folder of a "
+                "running session alone."
+            )
+
+    def _is_in_place(self) -> bool:
+        try:
+            return os.path.samestat(self.part.stat(), os.fstat(self._stream.fileno()))
+        except OSError:
+            return False
+
+    def _kept(self) -> Path | None:
+        """Return where the contents are, saving them to another place if they have none."""
+        descriptor = self._stream.fileno()
+        if self._is_in_place():
+            return self.part
+        if os.fstat(descriptor).st_nlink:
+            with contextlib.suppress(OSError):
+                return Path(f"/proc/self/fd/{descriptor}").readlink()
+            return None
+        for folder in self.part.absolute().parents:
+            with contextlib.suppress(OSError):  # not there, not writable, full, name taken
+                copy = folder / self.part.name
+                copy_new(descriptor, copy)
+                return copy
+        return None
 
     def _begun(self) -> McapWriter:
         if self._mcap is None:
@@ -373,19 +425,21 @@ class SessionWriter:
         parts: list[bytes] = []
         indexes: dict[int, npt.NDArray[np.void]] = {}
         offset = 0
-        for channel, wire in (
-            (self._sample_channel, samples),
-            (self._control_channel, controls),
-            (self._timing_channel, timings),
+        for topic, wire in (
+            (SAMPLE_TOPIC, samples),
+            (CONTROL_TOPIC, controls),
+            (TIMING_TOPIC, timings),
         ):
             if len(wire):
+                channel, _ = _CHANNELS[topic]
                 records = _fixed_records(wire, channel, self._start_utc_ns)
                 parts.append(records.tobytes())
                 indexes[channel] = _fixed_index(records, offset)
                 offset += records.nbytes
         if self._events:
-            events, indexes[self._event_channel] = _event_records(
-                self._events, self._event_channel, self._event_count, offset
+            channel, _ = _CHANNELS[EVENT_TOPIC]
+            events, indexes[channel] = _event_records(
+                self._events, channel, self._event_count, offset
             )
             parts.append(events)
             self._event_count += len(self._events)
@@ -401,6 +455,7 @@ class SessionWriter:
     def _sync_when_due(self) -> None:
         if self._dirty and time.monotonic() - self._synced_at >= SYNC_INTERVAL_S:
             self._sync()
+            self._check_place()
 
     def _sync(self) -> None:
         self._stream.flush()

@@ -12,10 +12,11 @@ from operator import mul
 
 import numpy as np
 
-from rigd.devices.contracts import DeviceError, Devices, Wrench
+from rigd.devices.contracts import DeviceError, Devices, Wrench, wired_stop_dropped
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim.plant import SimulatedPlant
 
+_NAME = "Simulated drive"
 _NOISE_BLOCK = 4096
 
 
@@ -90,6 +91,7 @@ class SimulatedDrive:
         self._plant = rig.plant
         self._period_ns = 1e9 / rate_hz
         self._due_ns: int | None = None
+        self._sto_dropped = False
         self.read_angle = rig.read_angle
         self.angle_stale = False
         self.angle_time_ns = 0
@@ -100,6 +102,8 @@ class SimulatedDrive:
 
     def enable(self) -> None:
         """Let commands through."""
+        if self._sto_dropped:
+            raise wired_stop_dropped(_NAME)
         self._plant.enable()
 
     def latch(self, due_ns: int) -> None:
@@ -116,6 +120,22 @@ class SimulatedDrive:
     def disable(self) -> None:
         """Zero the torque, and let no command through."""
         self._plant.disable()
+        self.read_angle = self._rig.read_angle
+
+    @property
+    def sto_dropped(self) -> bool:
+        """Whether the wired stop is pressed; it may be set, and takes the torque away at once."""
+        return self._sto_dropped
+
+    @sto_dropped.setter
+    def sto_dropped(self, dropped: bool) -> None:
+        self._sto_dropped = dropped
+        if dropped and self._plant.enabled:
+            self._plant.disable()
+            self.read_angle = self._refuse
+
+    def _refuse(self) -> float:
+        raise wired_stop_dropped(_NAME)
 
     def close(self) -> None:
         """Disable."""

@@ -3,6 +3,7 @@
 Shared by sessions in the foreground and by the daemon.
 """
 
+import shlex
 import shutil
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -12,10 +13,11 @@ from rigd.devices.registry import Reality, check_selection, objections, reality
 from rigd.excitation import Excitation
 from rigd.planning import RefusedError
 from rigd.profile import Profile, load_profile
+from rigd.safety import Limits
 from rigd.session.writer import PART_SUFFIX
 
-# Uncompressed, with the controller's terms and the index; a file never takes more.
-_BYTES_PER_TICK = 180
+# Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.
+_BYTES_PER_TICK = 260
 _BYTES_SPARE = 1_000_000
 
 
@@ -73,8 +75,8 @@ def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple
     return profile, moving
 
 
-def make_room(folder: Path, excitation: Excitation) -> None:
-    """Make the folder, and see that a session fits on its disk.
+def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
+    """Make the folder, and see that a session fits on its disk and leaves room there.
 
     Raises
     ------
@@ -89,10 +91,11 @@ def make_room(folder: Path, excitation: Excitation) -> None:
             f"--output {folder}: cannot be made a folder ({error.strerror}); choose another."
         ) from error
     needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
-    if free < needed:
+    if free - needed < limits.disk_free_mb * 1e6:
         raise RefusedError(
-            f"--output {folder}: {free / 1e6:.1f} MB are free on its disk and the session may take "
-            f"{needed / 1e6:.1f} MB; make room or choose another folder."
+            f"--output {folder}: {free / 1e6:.1f} MB are free on its disk, of which the session "
+            f"may take {needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB "
+            "have to be left; make room or choose another folder."
         )
 
 
@@ -115,5 +118,8 @@ def what_is_kept(path: Path) -> str:
     """Say what there is of a session that failed, once its processes have ended."""
     part = path.with_name(path.name + PART_SUFFIX)
     if part.exists():
-        return f"What was recorded is in {part}; rigd recover {part} makes a clean file of it."
-    return f"Its file is {path}." if path.exists() else "There is no file of it."
+        return (
+            f"What was recorded is in {part}; rigd recover {shlex.quote(str(part))} makes a clean "
+            "file of it."
+        )
+    return f"Its file is {path}." if path.exists() else f"There is no {path.name} in {path.parent}."

@@ -247,6 +247,46 @@ def test_a_peak_below_the_rated_torque_is_refused(refuse):
     assert "motor.peak_torque_nm = 0.4 N·m is below motor.rated_torque_nm = 0.5 N·m" in line
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        (
+            "continuous_torque_nm = { value = 0.9",
+            "continuous_torque_nm = { value = 1.0",
+            "motor.continuous_torque_nm = 1 N·m is above motor.peak_torque_nm = 0.9 N·m",
+        ),
+        (
+            "torque_command_nm = { value = 60.0",
+            "torque_command_nm = { value = 0.8",
+            "limits.torque_command_nm = 0.8 N·m is below motor.peak_torque_nm = 0.9 N·m",
+        ),
+        (
+            "stop_angle_rad = { value = 3.14",
+            "stop_angle_rad = { value = 1.5",
+            "limits.stop_angle_rad = 1.5 rad is not above limits.angle_rad = 1.57 rad",
+        ),
+        (
+            "tare_drift_nm = { value = 1.0e-2",
+            "tare_drift_nm = { value = 1.0e-3",
+            "limits.tare_drift_nm = 0.001 N·m, which ends a session, is below",
+        ),
+        (
+            "acceleration_rad_s2 = { value = 2000.0",
+            "acceleration_rad_s2 = { value = 0.0",
+            "limits.acceleration_rad_s2 = 0 rad/s² must be more than 0",
+        ),
+        (
+            "disk_free_mb = { value = 50.0",
+            "disk_free_mb = { value = -1.0",
+            "limits.disk_free_mb = -1 MB must be more than 0",
+        ),
+    ],
+)
+def test_limits_that_contradict_each_other_are_refused(refuse, old, new, complaint):
+    [line] = refuse((old, new))
+    assert line.startswith(complaint)
+
+
 def test_a_pole_too_slow_for_the_motor_is_refused(refuse):
     [line] = refuse(("pole_rad_s = { value = 80.0", "pole_rad_s = { value = 2.0"))
     assert line.startswith("control.pole_rad_s = 2 rad/s is too slow")

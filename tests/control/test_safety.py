@@ -11,12 +11,19 @@ from rigd.safety import Limits, LimitWatch
 
 LIMITS = Limits(
     angle_rad=1.0,
+    stop_angle_rad=2.0,
     velocity_rad_s=10.0,
+    acceleration_rad_s2=1e6,  # jumps have tests of their own
     tracking_error_rad=0.1,
+    torque_command_nm=5.0,
     sensor_range_percent=90.0,
+    saturated_ticks_in_a_row=10,
     stale_ticks_in_a_row=3,
     missed_ticks_in_a_row=50,
     missed_percent=2.0,
+    tare_drift_nm=0.01,
+    recorder_lag_s=8.0,
+    disk_free_mb=50.0,
 )
 RANGE = (20.0, 20.0, 60.0, 1.0, 1.0, 1.0)
 REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -99,7 +106,10 @@ def test_missed_ticks_in_a_row(watch):
     assert watch.check_missed(50, 50, 60) is None
     violation = watch.check_missed(51, 51, 61)
     assert violation is not None
-    assert str(violation) == "The run of missed ticks of 51 ticks exceeds its limit of 50 ticks."
+    assert str(violation) == (
+        "The run of missed ticks of 51 ticks exceeds its limit of 50 ticks "
+        "(limits.missed_ticks_in_a_row). See what else this computer does."
+    )
 
 
 def test_percentage_of_missed_ticks_bears_an_early_burst(watch):

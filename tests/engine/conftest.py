@@ -111,8 +111,10 @@ class FakeParent:
 
 
 def strict(profile):
-    """The limits on missed ticks that a rig would have."""
-    limits = replace(profile.limits, missed_ticks_in_a_row=50, missed_percent=2.0)
+    """The limits on missed ticks that a rig would have; the recorder may lag until it loses."""
+    limits = replace(
+        profile.limits, missed_ticks_in_a_row=50, missed_percent=2.0, recorder_lag_s=100.0
+    )
     return replace(profile, limits=limits)
 
 

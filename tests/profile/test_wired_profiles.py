@@ -75,6 +75,8 @@ def test_a_section_that_nobody_reads_is_refused(refuse):
 @pytest.mark.parametrize(
     ("name", "old", "new", "complaint"),
     [
+        ("antenna_can", "max_speed_rad_s = { value = 5.0", "max_speed_rad_s = { value = 3.0",
+         r"cia402.max_speed_rad_s = 3 rad/s is below limits.velocity_rad_s = 4 rad/s; .*"),
         ("antenna_can", 'mode = "same_tick"', 'mode = "next_tick"', r'acquisition.mode = "next_t'
          r'ick" must be "same_tick" or "previous_tick"\.'),
         ("antenna_can", 'mode = "same_tick"', 'mode = "previous_tick"',

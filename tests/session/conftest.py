@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.exceptions import EndOfFile
-from mcap.records import Chunk
+from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
@@ -118,15 +118,17 @@ def fixed_messages(samples):
 
 
 def chunks_of(path):
-    """Records of each complete chunk of a file that may be cut off, by the plain mcap reader."""
+    """Messages of each complete chunk of a file that may be cut off, by the plain mcap reader.
+
+    Chunks without messages, which declare channels, are left out.
+    """
     chunks = []
     with path.open("rb") as stream, contextlib.suppress(EndOfFile, struct.error):
-        chunks.extend(
-            breakup_chunk(record, validate_crc=True)
-            for record in StreamReader(stream, emit_chunks=True).records
-            if isinstance(record, Chunk)
-        )
-    return chunks
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                records = breakup_chunk(record, validate_crc=True)
+                chunks.append([message for message in records if isinstance(message, Message)])
+    return [chunk for chunk in chunks if chunk]
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
     counts = {summary.channels[i].topic: n for i, n in
               summary.statistics.channel_message_counts.items()}  # fmt: skip
     assert counts == {"/rig/sample": 1111, "/rig/control": 112, "/rig/timing": 0, "/rig/event": 2}
-    assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 5
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) == 6  # 1 of channels
     assert summary.statistics.message_start_time == kit.START_UTC_NS - 5_000_000
     assert summary.statistics.message_end_time == kit.START_UTC_NS + 1_110_000_000
     assert metadata["session"] == kit.METADATA | {
@@ -176,6 +176,16 @@ def test_the_file_is_synced_about_once_a_second(kit, tmp_path, monkeypatch):
     assert len(waited) >= 3
     assert max(waited) < 1.3
     assert min(waited) >= 1.0
+
+
+def test_a_file_that_grows_says_so_as_long_as_its_writer_lives(kit, tmp_path):
+    writer = kit.begin(tmp_path / "a.mcap")
+    writer.write_samples(kit.packed(kit.make_samples(250)))
+    with pytest.raises(SessionError, match=r"because it is still being recorded\. Wait"):
+        read_session(writer.part)
+    writer.abandon()
+    with pytest.raises(SessionError, match=r"250 complete samples .* with `rigd recover "):
+        read_session(writer.part)
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.mcap.part"])

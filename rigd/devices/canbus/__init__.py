@@ -6,11 +6,12 @@ CAN sockets it is one of those; the bus of ``rigd simulate`` is a Unix socket th
 """
 
 from rigd.devices.canbus.exchange import CanExchange
-from rigd.devices.canbus.frame import FRAME_SIZE, pack_frame, unpack_frame
+from rigd.devices.canbus.frame import BUS_OFF_FRAME, FRAME_SIZE, pack_frame, unpack_frame
 from rigd.devices.canbus.link import CanLink
 from rigd.devices.canbus.port import CanPort, open_port
 
 __all__ = [
+    "BUS_OFF_FRAME",
     "FRAME_SIZE",
     "CanExchange",
     "CanLink",

@@ -3,14 +3,13 @@
 import time
 from collections.abc import Callable
 
-from rigd.devices.canbus.frame import ERROR_FLAG, ERROR_MASK, read_head
+from rigd.devices.canbus.frame import BUS_OFF, ERROR_FLAG, ERROR_MASK, read_head
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.contracts import DeviceError
 
 Handler = Callable[[bytes], None]
 
 # linux/can/error.h: class in the identifier, state of the controller in data[1].
-_BUS_OFF = 0x40
 _CONTROLLER = 0x04
 _CONTROLLER_STATE = 1
 _PASSIVE = 0x30
@@ -100,7 +99,7 @@ class CanExchange:
 
     def _note_error(self, kind: int, data: bytes) -> None:
         self.error_frames += 1
-        if kind & _BUS_OFF:
+        if kind & BUS_OFF:
             self._bus_off = (
                 f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
                 "many errors; look at cable, termination and bit rate, then bring it up again."

@@ -15,7 +15,12 @@ REMOTE_FLAG = 0x4000_0000
 ERROR_MASK = 0x1FFF_FFFF
 SFF_MASK = 0x7FF
 
+BUS_OFF = 0x40
+"""Class of an error frame: the controller has switched itself off after too many errors."""
+
 _FRAME = Struct("=IB3x8s")
+BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
+"""What the kernel reports then."""
 read_head = Struct("=IB").unpack_from
 """Identifier with flags, and length, from raw frame."""
 

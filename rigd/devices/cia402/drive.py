@@ -26,7 +26,7 @@ from rigd.devices.cia402.states import (
 )
 from rigd.devices.cia402.switching import step_up, switch_off
 from rigd.devices.cia402.values import torque_limit_per_mille
-from rigd.devices.contracts import DeviceError
+from rigd.devices.contracts import DeviceError, wired_stop_dropped
 from rigd.devices.parameters import RigParameters
 
 _HALF_TURN = 1 << 31
@@ -66,7 +66,7 @@ class Cia402Drive:
         self._name = f"Drive (CANopen node {settings.node_id})"
         self._frames = NodeFrames(settings.node_id, settings.host_node_id)
         self._idle = self._frames.rpdo(DISABLE_VOLTAGE, 0)
-        self._inbox = Inbox(self._name)
+        self._inbox = Inbox(self._name, settings.sto_error_code)
         self._same_tick = rig.acquisition.mode == "same_tick"
         self._silence_ns = round(settings.drive_heartbeat_timeout_s * 1e9)
         self._rad_per_count = rig.encoder.resolution_rad * settings.direction
@@ -349,11 +349,17 @@ class Cia402Drive:
         node.refuse_alarm()
         statusword = self._inbox.statusword
         if statusword & self._guard_mask & STATE_BITS != self._guard_value & STATE_BITS:
-            raise DeviceError(
-                f'{self._name}: it has left "{DriveState.OPERATION_ENABLED.value}" for '
-                f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}) by itself; look '
-                "at STO, supply and its own diagnosis."
+            node.await_alarm()
+            node.refuse_alarm()
+            state = state_of(statusword)
+            left = (
+                f'it has left "{DriveState.OPERATION_ENABLED.value}" for "{state.value}" '
+                f"(statusword 0x{statusword:04X}) by itself"
             )
+            if state is DriveState.SWITCH_ON_DISABLED:
+                # Nothing but the power stage's supply takes a drive there without a command.
+                raise wired_stop_dropped(self._name, f", or the motor's supply failed: {left}")
+            raise DeviceError(f"{self._name}: {left}; look at STO, supply and its own diagnosis.")
         if statusword & self._guard_mask != self._guard_value:
             raise DeviceError(
                 f"{self._name}: it ignores the target torque: bit 12 of its statusword "

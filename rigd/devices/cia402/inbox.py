@@ -10,6 +10,7 @@ from rigd.devices.cia402.frames import (
     read_emergency,
     unpack_tpdo,
 )
+from rigd.devices.contracts import wired_stop_dropped
 
 _TOGGLE_BIT = 0x80
 
@@ -21,6 +22,8 @@ class Inbox:
     ----------
     name
         Of the drive, for messages.
+    sto_error_code
+        Of the emergency message that says that its STO was dropped; 0 if it has none.
 
     Attributes
     ----------
@@ -59,12 +62,14 @@ class Inbox:
         "replies",
         "reply",
         "statusword",
+        "sto_error_code",
         "torque",
         "watching",
     )
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, sto_error_code: int = 0) -> None:
         self.name = name
+        self.sto_error_code = sto_error_code
         self.malformed = 0
         self.clear()
 
@@ -102,7 +107,12 @@ class Inbox:
         if code >> 8 == 0:
             return
         self.emergency = True
-        if not self.alarm:
+        if self.alarm:
+            return
+        if code == self.sto_error_code:
+            shown = f" (emergency message, error code 0x{code:04X})"
+            self.alarm = str(wired_stop_dropped(self.name, shown))
+        else:
             own = f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else ""
             self.alarm = f"{self.name}: emergency message: {describe_error(code)}{own}."
 

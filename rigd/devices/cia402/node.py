@@ -194,6 +194,12 @@ class Node:
         with suppress(DeviceError, OSError):
             self.exchange.send(frame)
 
+    def await_alarm(self) -> None:
+        """Give a drive that has left operation a little time to say why."""
+        inbox = self.inbox
+        if not inbox.alarm:
+            self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)
+
     def refuse_alarm(self) -> None:
         """Refuse to go on with a drive that has reported something, or is in fault.
 
@@ -204,8 +210,8 @@ class Node:
         """
         inbox = self.inbox
         in_fault = state_of(inbox.statusword) in (DriveState.FAULT, DriveState.FAULT_REACTION)
-        if in_fault and not inbox.alarm:
-            self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)
+        if in_fault:
+            self.await_alarm()
         if not (in_fault or inbox.alarm):
             return
         reason = inbox.alarm or (

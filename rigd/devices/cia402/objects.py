@@ -35,6 +35,8 @@ TORQUE_OFFSET: Final = 0x60B2
 TORQUE_LIMITS: Final = (0x60E0, 0x60E1)
 """Largest torque forwards and backwards."""
 ACTUAL_TORQUE: Final = 0x6077
+MAX_SPEED_RPM: Final = 0x6080
+"""Of the motor."""
 INTERPOLATION_TIME: Final = 0x60C2
 """Sub 1: value; sub 2: power of ten of its unit in s."""
 SUPPORTED_MODES: Final = 0x6502

@@ -15,7 +15,12 @@ from rigd.devices.cia402.states import (
     DriveState,
     state_of,
 )
-from rigd.devices.cia402.values import interpolation_time, sync_period_us, torque_limit_per_mille
+from rigd.devices.cia402.values import (
+    interpolation_time,
+    max_speed_rpm,
+    sync_period_us,
+    torque_limit_per_mille,
+)
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters, ServoDrive
 
@@ -58,6 +63,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> dict[str, object]:
         _switch_off(sdo, rig, name)
         _check_torque(sdo, identity, rig, name)
         _configure_torque(sdo, torque_limit_per_mille(rig))
+        _configure_speed(sdo, settings, name)
         _configure_sync(sdo, period_us, interpolation)
         _configure_guards(sdo, settings)
         _configure_pdos(sdo, settings)
@@ -164,6 +170,18 @@ def _configure_torque(sdo: SdoAccess, limit_per_mille: int) -> None:
         found = sdo.read_if_there(index)
         if found is not None and found != value:
             sdo.configure(index, 0, value)
+
+
+def _configure_speed(sdo: SdoAccess, settings: ServoDrive, name: str) -> None:
+    """Have the drive not make the shaft ever faster, should nobody take a torque back."""
+    if settings.max_speed_rad_s == 0:
+        return
+    if sdo.read_if_there(objects.MAX_SPEED_RPM) is None:
+        raise DeviceError(
+            f"{name}: it has no limit of its own for the speed (object 6080); set "
+            "cia402.max_speed_rad_s = 0, and see what rigd check then says of the worst travel."
+        )
+    sdo.configure(objects.MAX_SPEED_RPM, 0, max_speed_rpm(settings))
 
 
 def _switch_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:

@@ -41,9 +41,9 @@ _PDO_TOO_LONG = 0x8220
 _SYNC_LENGTH = 0x8240
 _RPDO_TIMEOUT = 0x8250
 _SYNC_LOST = 0x8700
-_COMMUNICATION = 0x10  # bit of the error register
+_GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of the error register
 
-_VOLTAGE_AND_REMOTE = 0x0210
+_VOLTAGE_AND_REMOTE, _REMOTE = 0x0210, 0x0200
 _WARNING, _STANDING, _INTERNAL_LIMIT, _FOLLOWS = 0x0080, 0x0400, 0x0800, 0x1000
 _HALT = 0x0100
 _OPERATE = 0x8F, 0x0F
@@ -93,6 +93,10 @@ class DriveNode:
         It receives and sends nothing, as if its plug were out; its own watchdogs go on.
     angle_offset_counts : int
         Added to the position: an encoder that jumped.
+    sto_dropped : bool
+        The wired stop is pressed: it takes the torque away at once, and keeps the drive off for as
+        long as it lasts. The drive goes to fault with the profile's ``sto_error_code``, or where
+        there is none to switch on disabled.
 
     Raises
     ------
@@ -128,6 +132,8 @@ class DriveNode:
             )
         self.frozen = False
         self.angle_offset_counts = 0
+        self._sto_dropped = False
+        self._sto_error_code = rig.cia402.sto_error_code
         self._simulated = simulated
         self._plant = simulated.plant
         self._advance = advance
@@ -184,7 +190,7 @@ class DriveNode:
             own.quick_stop_option,
             own.fault_option,
             entered=self._entered,
-            may_switch_on=self._is_guarded,
+            may_switch_on=lambda: self._is_guarded() and not self._sto_dropped,
             may_enable=lambda: self._nmt is Nmt.OPERATIONAL and self._is_guarded(),
             may_reset=self._may_reset,
         )
@@ -227,6 +233,22 @@ class DriveNode:
     def emergency(self, code: int, register: int, vendor: bytes) -> None:
         """Have the drive fail with an error code, bits of the error register, vendor's bytes."""
         self._fail(code, register, vendor)
+
+    @property
+    def sto_dropped(self) -> bool:
+        """Whether the wired stop is pressed."""
+        return self._sto_dropped
+
+    @sto_dropped.setter
+    def sto_dropped(self, dropped: bool) -> None:
+        self._sto_dropped = dropped
+        self._log("sto", dropped=dropped)
+        if not dropped:
+            return
+        if self._sto_error_code:
+            self._fail(self._sto_error_code, _GENERIC)
+        else:
+            self._machine.disable_voltage()
 
     # NMT ---------------------------------------------------------------------------------------
 
@@ -435,7 +457,7 @@ class DriveNode:
         return not (self._own.abort_option.value and any(watch.lost for watch in self._watches))
 
     def _may_reset(self) -> bool:
-        allowed = self._is_guarded()
+        allowed = self._is_guarded() and not self._sto_dropped
         self._log("fault reset", accepted=allowed)
         return allowed
 
@@ -523,7 +545,7 @@ class DriveNode:
 
     def _statusword(self) -> int:
         state = self._machine.state
-        word = state.bits | _VOLTAGE_AND_REMOTE
+        word = state.bits | (_REMOTE if self._sto_dropped else _VOLTAGE_AND_REMOTE)
         if state is State.OPERATION_ENABLED:
             if self._following:
                 word |= _FOLLOWS

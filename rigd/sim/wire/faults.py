@@ -77,6 +77,8 @@ KINDS: dict[str, dict[str, _Key]] = {
     "reorder": _SENDER,
     "freeze": {"device": _DEVICE, "for": _FOR},
     "emcy": {"code": _whole(0, 0xFFFF, needed=True), "register": _whole(0, 0xFF, default=1)},
+    "sto": {"for": _FOR},
+    "busoff": {"for": _FOR},
     "saturate": {"gauge": _whole(0, 5, needed=True), "for": _FOR},
     "status": {"bits": _whole(0, 0xFFFF, needed=True), "for": _FOR},
     "jump": {"counts": _whole(-(2**31), 2**31 - 1, needed=True)},

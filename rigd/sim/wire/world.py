@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
-from rigd.devices.canbus import pack_frame, unpack_frame
+from rigd.devices.canbus import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.parameters import RigParameters
 from rigd.sim.devices import SimulatedRig
 from rigd.sim.wire.clock import LockStep, WallClock
@@ -81,6 +81,8 @@ class World:
         Periods by which the rig itself moved.
     syncs : int
         SYNCs heard.
+    bus_off : bool
+        The host's controller is off the bus: neither side hears the other.
     """
 
     def __init__(
@@ -116,6 +118,7 @@ class World:
         self._unheard: deque[tuple[str, int, bytes]] = deque()
         self._emitting = False
         self._order = 0
+        self.bus_off = False
         self._postponed: list[tuple[float, int, Callable[[], None]]] = []
         self._planned: list[tuple[float, int, Callable[[], None]]] = []
         self._awaiting_drive: list[Fault] = []
@@ -267,13 +270,16 @@ class World:
     # The ways of what is sent.
 
     def _from_host(self, can_id: int, data: bytes, origin: object) -> None:
+        if self.bus_off:
+            return
         self._send(pack_frame(can_id, data), origin)
         for node in self._nodes.values():
             node.receive(can_id, data)
         self._let_hear()
 
     def _from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
-        self._send(pack_frame(can_id, data), None)
+        if not self.bus_off:
+            self._send(pack_frame(can_id, data), None)
         self._unheard.append((sender, can_id, data))
 
     def _let_hear(self) -> None:
@@ -302,6 +308,8 @@ class World:
         device = values.get("device", values.get("from", "drive"))
         if fault.kind in ("saturate", "status"):
             device = "sensor"
+        elif fault.kind in ("sto", "busoff"):
+            device = "drive"
         on_serial = self._serial is not None and device == "sensor"
         if device in ("drive", "sensor") and device not in self._nodes and not on_serial:
             raise FaultError(f"Fault '{fault}': this rig has no {device} on its lines.")
@@ -332,6 +340,11 @@ class World:
             self._set_for(fault, sensor, "status_bits", values["bits"])
         elif fault.kind == "emcy":
             drive.emergency(values["code"], values["register"], bytes(5))
+        elif fault.kind == "sto":
+            self._set_for(fault, drive, "sto_dropped", True)
+        elif fault.kind == "busoff":
+            self._send(BUS_OFF_FRAME, None)
+            self._set_for(fault, self, "bus_off", True)
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
         else:

@@ -33,6 +33,7 @@ _UP = {
     ("switched on", 0x0F): "enabled",
 }
 _FORMATS = {
+    0x6080: "<I",
     0x60B2: "<h",
     0x60E0: "<H",
     0x60E1: "<H",

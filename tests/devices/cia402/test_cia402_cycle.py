@@ -228,6 +228,11 @@ def switched_off(scripted):
     scripted.state = "switch-on disabled"
 
 
+def switched_off_with_a_reason(scripted):
+    switched_off(scripted)
+    scripted.emergency(0x3220)
+
+
 def ignores_torque(scripted):
     scripted.follows = False
 
@@ -256,7 +261,11 @@ def falls_silent(scripted):
             ["following error (error code 0x8611)", "01 02 00 00 00", "rigd reset"],
         ),
         (quick_stop, ['left "operation enabled"', '"quick stop active"', "0x0217"]),
-        (switched_off, ['left "operation enabled"', '"switch-on disabled"']),
+        (
+            switched_off,
+            ["the wired stop (STO) was dropped, or", 'left "operation enabled"', "reset the rig"],
+        ),
+        (switched_off_with_a_reason, ["under-voltage in the DC link", "rigd reset"]),
         (ignores_torque, ["ignores the target torque", "bit 12"]),
         (restarts, ["restarted"]),
         (leaves_operational, ["left operational for pre-operational"]),
@@ -278,6 +287,21 @@ def test_what_ends_a_session(make_drive, rig, scripted, happens, words):
     drive.disable()
     assert scripted.state in ("switch-on disabled", "fault")
     assert scripted.torque == 0
+
+
+def test_the_code_of_the_profile_says_that_the_wired_stop_was_dropped(make_drive, rig, scripted):
+    settings = replace(rig.cia402, sto_error_code=0xFF20)
+    ticks = Ticks(make_drive(replace(rig, cia402=settings)))
+    ticks.drive.connect()
+    ticks(5)
+    ticks.drive.enable()
+    ticks(5, torque_nm=0.1)
+    scripted.state = "fault"
+    scripted.emergency(0xFF20)
+    with pytest.raises(DeviceError) as caught:
+        ticks(5, torque_nm=0.1)
+    for words in ("the wired stop (STO) was dropped", "0xFF20", "rigd reset --profile scripted"):
+        assert words in str(caught.value)
 
 
 def test_silence_is_told_as_soon_as_it_is_too_long(ticks, drive, scripted):

@@ -30,6 +30,28 @@ def test_what_the_drive_is_told(drive, scripted):
     assert (0x1005, 0) not in told
 
 
+def limited(rig, speed_rad_s):
+    return replace(rig, cia402=replace(rig.cia402, max_speed_rad_s=speed_rad_s))
+
+
+def test_the_drive_is_told_its_own_speed_limit(make_drive, rig, scripted):
+    scripted.objects[0x6080, 0] = 20_000
+    make_drive(limited(rig, 5.0)).connect()
+    # 5 rad/s behind a gear of 100 are 4774.6 turns a minute.
+    assert writes_to(scripted, 0x6080) == [(0x6080, 0, 4775)]
+
+
+def test_a_speed_limit_of_0_leaves_what_the_drive_has(make_drive, rig, scripted):
+    scripted.objects[0x6080, 0] = 20_000
+    make_drive(limited(rig, 0.0)).connect()
+    assert writes_to(scripted, 0x6080) == []
+
+
+def test_a_drive_without_a_speed_limit_is_refused_where_one_is_asked_for(make_drive, rig):
+    with pytest.raises(DeviceError, match=r"object 6080.*cia402\.max_speed_rad_s = 0"):
+        make_drive(limited(rig, 5.0)).connect()
+
+
 def test_the_order_in_which_a_pdo_is_mapped(drive, scripted):
     drive.connect()
     assert writes_to(scripted, 0x1800, 0x1A00) == [

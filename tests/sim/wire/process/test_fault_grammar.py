@@ -19,6 +19,8 @@ OPTIONAL = {
     "reorder": ({"from": sender}, {"id": identifier, "frames": frames}),
     "freeze": ({"device": device}, {"for": positive}),
     "emcy": ({"code": whole(0, 0xFFFF)}, {"register": whole(0, 255)}),
+    "sto": ({}, {"for": positive}),
+    "busoff": ({}, {"for": positive}),
     "saturate": ({"gauge": whole(0, 5)}, {"for": positive}),
     "status": ({"bits": whole(0, 0xFFFF)}, {"for": positive}),
     "jump": ({"counts": whole(-(2**31), 2**31 - 1)}, {}),

@@ -293,6 +293,27 @@ def test_an_emergency_is_the_drive_s(make_world):
     assert rig.drive.emergencies == [(0x8130, 0x11, bytes(5))]
 
 
+def test_a_host_that_is_off_the_bus_is_told_and_neither_heard_nor_spoken_to(make_world):
+    rig = make_world()
+    rig.sync(1)
+    rig.sent.clear()
+    rig.world.inject(parse_fault("busoff,for=0.003"))
+    heard = len(rig.drive.heard)
+    rig.sync(2, 3)
+    assert [can_id for can_id, _ in rig.from_nodes()] == [0x2000_0040]
+    assert len(rig.drive.heard) == heard
+    assert rig.world.moved == 3  # the world goes on
+    rig.sync(4, 5)
+    assert len(rig.drive.heard) > heard
+
+
+def test_the_wired_stop_is_the_drive_s(make_world):
+    rig = make_world()
+    rig.drive.sto_dropped = False
+    rig.world.inject(parse_fault("sto"))
+    assert rig.drive.sto_dropped
+
+
 def test_the_bus_is_cut_by_who_holds_it(make_world):
     rig = make_world()
     rig.world.inject(parse_fault("cut"))

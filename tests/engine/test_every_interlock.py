@@ -1,0 +1,329 @@
+"""Every row of the table of interlocks: a session in which it happens, and how that ends."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from rigd.control import close_loop
+from rigd.devices.contracts import Devices
+from rigd.engine.board import Word
+from rigd.engine.clocks import VirtualClock
+from rigd.engine.jobs import SessionJob
+from rigd.engine.watch import make_watch
+from rigd.excitation import chirp, hold
+from rigd.profile import load_profile
+from rigd.safety import INTERLOCKS, Action
+from rigd.session.format import Status
+
+MIDDLE_NS = 3_000_000_000
+MIDDLE = 3000
+"""Tick and time in the middle of the record: tare and settling take 1.5 s, the record 5 s."""
+
+
+class Sensor:
+    """The simulated sensor, with faults from a given reading on."""
+
+    def __init__(self, inner, wrong_from):
+        self.inner = inner
+        self.wrong_from = wrong_from
+        self.reads = 0
+        self.added = [0.0] * 6
+        self.stale = self.saturated = False
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+    @property
+    def _wrong(self):
+        return self.reads >= self.wrong_from
+
+    @property
+    def wrench_stale(self):
+        return self.stale and self._wrong
+
+    @property
+    def wrench_saturated(self):
+        return self.saturated and self._wrong
+
+    def read_wrench(self):
+        self.reads += 1
+        wrench = self.inner.read_wrench()
+        if not self._wrong:
+            return wrench
+        return tuple(value + more for value, more in zip(wrench, self.added, strict=True))
+
+
+class Clock(VirtualClock):
+    """Late at some of its deadlines, and does something at one; not virtual if asked for."""
+
+    def __init__(self, action=None, late_ns=(), *, virtual=True):
+        super().__init__()
+        self.virtual = virtual
+        self._action = action
+        self._late_ns = dict(late_ns)
+
+    def wait_until(self, deadline_ns):
+        if self._action is not None and deadline_ns >= MIDDLE_NS:
+            action, self._action = self._action, None
+            action()
+        late_ns = max(self._late_ns.get(deadline_ns, 0), self._now_ns - deadline_ns)
+        self._now_ns = deadline_ns + late_ns
+        return late_ns
+
+
+def limit(session, **changes):
+    session.profile = replace(session.profile, limits=replace(session.profile.limits, **changes))
+
+
+def motor(session, **changes):
+    rig = session.profile.rig
+    changed = replace(rig, motor=replace(rig.motor, **changes))
+    session.profile = replace(session.profile, rig=changed)
+
+
+def sensor(session, wrong_from=MIDDLE, **faults):
+    faulty = Sensor(session.devices.sensor, wrong_from)
+    for name, value in faults.items():
+        setattr(faulty, name, value)
+    session.devices = Devices(session.drive, faulty, simulated=True)
+
+
+def jump(session):
+    session.drive.fault_at, session.drive.fault = MIDDLE, lambda angle_rad: angle_rad + 0.005
+
+
+def asks_too_much(session):
+    motor(session, peak_torque_nm=0.04)
+    limit(session, torque_command_nm=0.05)
+
+
+def drop_sto(session):
+    def drop():
+        assert session.drive.enabled
+        session.drive.inner.sto_dropped = True
+
+    session.clock = Clock(drop)
+
+
+def fill_disk(session):
+    session.clock = Clock(lambda: session.board.__setitem__(Word.DISK_FREE_MB, 40))
+
+
+def miss(session, *late_ns):
+    """Miss ticks from the middle on, so many ns half a second apart."""
+    late = {MIDDLE_NS + 500_000_000 * k: ns for k, ns in enumerate(late_ns)}
+    session.clock = Clock(late_ns=late, virtual=False)
+
+
+def lag(session):
+    limit(session, recorder_lag_s=1.0)
+    session.clock = Clock(virtual=False)  # nobody takes what is in the ring
+
+
+@dataclass(frozen=True)
+class Case:
+    """How an interlock is made to act, and what is said then."""
+
+    happens: Callable
+    says: str
+
+
+CASES = {
+    "angle": Case(
+        lambda s: limit(s, angle_rad=0.01), r"The angle of -?0\.01\d* rad exceeds .* of 0\.01 rad"
+    ),
+    "velocity": Case(
+        lambda s: limit(s, velocity_rad_s=0.3),
+        r"The speed of -?0\.3\d* rad/s exceeds .* 0\.3 rad/s",
+    ),
+    "tracking error": Case(
+        lambda s: limit(s, tracking_error_rad=0.005),
+        r"The tracking error of -?0\.005\d* rad exceeds .* 0\.005 rad",
+    ),
+    "encoder jump": Case(
+        jump, r"The encoder's jump of 0\.00[45]\d* rad exceeds its limit of 0\.002\d* rad"
+    ),
+    "torque command": Case(
+        asks_too_much,
+        r"The torque that the controller asks for of -?0\.0\d+ N·m exceeds .* of 0\.05 N·m",
+    ),
+    "i²t": Case(
+        lambda s: motor(s, continuous_torque_nm=0.01, thermal_time_constant_s=0.5),
+        r"The motor's mean torque \(i²t\) of 0\.0\d+ N·m exceeds its limit of 0\.01 N·m",
+    ),
+    "wrench range": Case(
+        lambda s: sensor(s, added=[0.0, -25.0, 0.0, 0.0, 0.0, 0.0]),
+        r"The sensor's fy of -25\.\d+ N exceeds its limit of 22 N",
+    ),
+    "gauge saturation": Case(
+        lambda s: (limit(s, saturated_ticks_in_a_row=5), sensor(s, saturated=True)),
+        r"The run of ticks with a saturated sensor of 6 ticks exceeds its limit of 5 ticks",
+    ),
+    "stale angle": Case(
+        lambda s: setattr(s.drive, "stale_at", MIDDLE),
+        r"The run of ticks without a new angle of 4 ticks exceeds its limit of 3 ticks",
+    ),
+    "stale wrench": Case(
+        lambda s: sensor(s, stale=True),
+        r"The run of ticks without a new wrench of 4 ticks exceeds its limit of 3 ticks",
+    ),
+    "missed ticks": Case(
+        lambda s: miss(s, 80_000_000),
+        r"The run of missed ticks of 80 ticks exceeds its limit of 50 ticks",
+    ),
+    "missed share": Case(
+        lambda s: miss(s, *[45_000_000] * 6),
+        r"The part of ticks missed of 2\.\d* % exceeds its limit of 2 %",
+    ),
+    "wired stop": Case(drop_sto, r"Simulated drive: the wired stop \(STO\) was dropped.* reset"),
+    "recorder lag": Case(lag, r"The recorder's lag of 1\.\d+ s exceeds its limit of 1 s"),
+    "disk space": Case(
+        fill_disk, r"The free space of the session's disk of 40 MB is below its limit of 50 MB"
+    ),
+    "operator stop": Case(
+        lambda s: setattr(s, "clock", Clock(s.stop.request)), r"Stopped by the operator\."
+    ),
+}
+ON_THE_WIRE = {
+    "bus-off": "controller off the bus",
+    "emergency message": "emergency message",
+    "wired stop": "wired stop dropped",
+}
+"""Rows of docs/faults.md, which are tests of their own."""
+AT_REST = {"tare drift"}
+BY_NAME = {row.name: row for row in INTERLOCKS}
+
+
+def test_every_interlock_has_its_test():
+    assert len(BY_NAME) == len(INTERLOCKS)
+    assert CASES.keys() | ON_THE_WIRE.keys() | AT_REST == BY_NAME.keys()
+    faults = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
+    assert all(f"\n| {row} | `" in faults for row in ON_THE_WIRE.values())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_interlock_ends_the_session_without_torque(make_session, name):
+    case, row = CASES[name], BY_NAME[name]
+    session = make_session()
+    case.happens(session)
+    session.run()
+    session.assert_safe()
+    assert not session.drive.inner._plant.enabled
+    finished = session.finished
+    assert finished["finished"] == ("stopped" if row.action is Action.STOP else "fault")
+    assert re.match(case.says, finished["reason"]), finished["reason"]
+    if row.limit:
+        assert f"({row.limit}). {row.remedy}" in finished["reason"]
+    samples = session.samples
+    assert samples["status"][-1] & Status.TORQUE_OFF
+    assert samples["torque_command_nm"][-1] == 0.0
+    counts = finished["counts"]
+    assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
+    assert counts["scheduled"] < 5000
+
+
+def resting(make_session):
+    """A session in which nothing moves: the beam does not swing after it."""
+    return make_session(excitation=hold(rate_hz=1000.0, duration_s=4.0, rest_s=1.0))
+
+
+def test_a_zero_that_moves_during_a_session_is_told(make_session):
+    session = resting(make_session)
+    sensor(session, wrong_from=8700, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.05])
+    finished = session.run().finished
+    session.assert_safe()
+    assert finished["finished"] == "complete"  # the record is what it is
+    assert re.match(
+        r"After the record: The drift of the coupling torque's zero of 0\.0\d+ N·m exceeds its "
+        r"limit of 0\.01 N·m \(limits\.tare_drift_nm\)",
+        finished["reason"],
+    )
+    assert 0.049 < float(finished["results"]["tare_drift_nm"]) < 0.051
+
+
+@pytest.mark.parametrize("operator_tares", [False, True])
+def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
+    make_session, operator_tares
+):
+    session = make_session()
+    sensor(session, wrong_from=10_001, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
+    job = {"session": SessionJob(session.profile, session.excitation)}
+    session.obey(*[job, *([{"tare": True}] if operator_tares else []), job])
+    session.assert_safe()
+    first, second = session.parent.said("finished")
+    assert (first["finished"], first["reason"]) == ("complete", "")
+    if operator_tares:
+        assert (second["finished"], second["reason"]) == ("complete", "")
+    else:
+        assert second["finished"] == "fault"
+        assert re.match(r"The drift of .* zero of -0\.0\d+ N·m exceeds", second["reason"])
+        assert "rigd tare" in second["reason"]
+        assert second["counts"]["scheduled"] == 0
+
+
+def test_a_small_drift_is_a_warning(make_session):
+    session = resting(make_session)
+    sensor(session, wrong_from=8700, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.005])
+    finished = session.run().finished
+    assert (finished["finished"], finished["reason"]) == ("complete", "")
+    [warning] = [event for event in session.events if event.level == "warning"]
+    assert re.match(r"The drift of the .* zero of 0\.00\d+ N·m is near", warning.message)
+
+
+def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(make_session):
+    session = make_session()
+    limit(session, angle_rad=0.028)  # of which 0.8 are 0.0224; the chirp reaches 0.025
+    finished = session.run().finished
+    assert finished["finished"] == "complete", finished
+    samples = session.samples
+    flagged = samples["status"] & Status.LIMIT_WARNING != 0
+    near = abs(samples["angle_rad"]) >= 0.8 * 0.028
+    assert near.sum() > 100
+    assert (flagged == near).all()
+    warnings = [event for event in session.events if event.level == "warning"]
+    assert 1 <= len(warnings) <= 3
+    assert all(re.match(r"The angle of .* is near its limit", w.message) for w in warnings)
+
+
+def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session):
+    commanded = make_session().run().samples["torque_command_nm"]
+    heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # over 10 000 s nothing cools down
+    session = make_session()
+    motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)
+    job = {"session": SessionJob(session.profile, session.excitation)}
+    session.obey(job, job)
+    first, second = session.parent.said("finished")
+    assert (first["finished"], first["reason"]) == ("complete", "")
+    assert second["finished"] == "fault"
+    assert "i²t" in second["reason"]
+    session.assert_safe()
+
+
+@pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
+def test_the_paper_s_chirp_comes_near_no_limit(name):
+    """Its torque, speed and angle, as predicted, through the watch of each shipped profile."""
+    profile = load_profile(name)
+    excitation = chirp(rate_hz=1000.0)
+    response = close_loop(profile.loop_model()).simulate(excitation.reference_rad)
+    watch = make_watch(profile)
+    resolution_rad = profile.rig.encoder.resolution_rad
+    angles_rad = (response.angle_rad / resolution_rad).round() * resolution_rad
+    rest, squares_nm2 = (0.0,) * 5, 0.0
+    for tick, (reference, angle, torque, coupling) in enumerate(
+        zip(
+            excitation.reference_rad.tolist(),
+            angles_rad.tolist(),
+            response.torque_nm.tolist(),
+            response.coupling_torque_nm.tolist(),
+            strict=True,
+        )
+    ):
+        assert watch.check(reference, angle, (*rest, coupling)) is None
+        squares_nm2 += torque**2
+        if tick % 64 == 0:
+            assert watch.look(tick * 1_000_000, squares_nm2) is None
+            squares_nm2 = 0.0
+    assert watch.take_notices() == []

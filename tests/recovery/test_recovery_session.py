@@ -1,0 +1,70 @@
+"""A session whose file cannot be written any more stops safely and keeps what it has."""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rigd.session import read_session, recover
+
+pytestmark = pytest.mark.xdist_group("realtime")
+
+RIGD = Path(sys.executable).parent / "rigd"
+
+
+def limit_files():
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000))
+
+
+def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
+    result = subprocess.run(
+        [RIGD, "run", "chirp", "--fast", "--output", tmp_path],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        preexec_fn=limit_files,
+    )
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    (part,) = tmp_path.glob("*.mcap.part")
+    assert f"{part} cannot be written: File too large" in result.stderr
+    assert f"What was recorded is in {part}" in result.stderr
+    samples = read_session(recover(part).path).samples
+    assert samples["tick"].tolist() == list(range(len(samples)))
+    assert len(samples) > 20_000
+
+
+def test_a_folder_that_is_removed_ends_the_session(tmp_path):
+    folder = tmp_path / "sessions"
+    process = subprocess.Popen(
+        [RIGD, "run", "hold", "--duration", "60", "--rest", "0", "--output", folder],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ,
+    )
+    try:
+        deadline = time.monotonic() + 30.0
+        while not any(p.stat().st_size > 60_000 for p in folder.glob("*.part")):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        shutil.rmtree(folder)
+        output, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 1, output + errors
+    assert "Traceback" not in errors
+    (part,) = tmp_path.glob("*.mcap.part")
+    assert "was removed or moved while it was recorded" in errors
+    assert f"What was recorded is now {part}; rigd recover {part}" in errors
+    samples = read_session(recover(part).path).samples
+    assert len(samples) > 300
+    assert (samples["tick"][1:] > samples["tick"][:-1]).all()

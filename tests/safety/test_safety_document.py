@@ -1,0 +1,72 @@
+"""docs/safety.md says what the code does."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rigd.checks.travel import travel_rows, worst_travel
+from rigd.profile import load_profile
+from rigd.profile.settings import keys
+from rigd.safety import INTERLOCKS
+
+TEXT = (Path(__file__).parents[2] / "docs" / "safety.md").read_text("utf-8")
+
+
+def as_line(row):
+    """An interlock as a line of the document's table."""
+    if row.warning is None:
+        warning = "–"
+    elif isinstance(row.warning, str):
+        warning = f"`{row.warning}`"
+    elif row.below:
+        warning = f"{row.warning:g} times that"
+    else:
+        warning = f"{100 * row.warning:g} % of it"
+    limit = f"`{row.limit}`" if row.limit else "it happens"
+    if row.name == "encoder jump":
+        limit += " and two encoder steps"
+    channel = row.channel.format(axis="fx … tz")
+    cells = (
+        row.name,
+        channel,
+        row.unit or "–",
+        warning,
+        limit,
+        row.checked.value,
+        row.action.value,
+        row.remedy,
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+@pytest.mark.parametrize("row", INTERLOCKS, ids=lambda row: row.name)
+def test_every_interlock_is_in_the_document(row):
+    assert as_line(row) in TEXT.splitlines(), f"docs/safety.md lacks the line\n{as_line(row)}"
+
+
+def test_the_document_has_no_other_interlock():
+    table = TEXT[TEXT.index("## The interlocks") :].partition("\n## ")[0]
+    lines = [line for line in table.splitlines() if line.startswith("| ")][1:]
+    assert lines == [as_line(row) for row in INTERLOCKS]
+
+
+def test_every_level_is_a_key_of_a_profile():
+    for row in INTERLOCKS:
+        if row.limit:
+            assert row.limit in keys()
+        if isinstance(row.warning, str):
+            assert row.warning in keys()
+        assert row.remedy.endswith(".")
+
+
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_the_travel_of_the_shipped_profiles_is_the_document_s(name):
+    profile = load_profile(name)
+    (row,) = travel_rows(profile)
+    numbers = re.findall(r"\d+\.\d\d rad", row.found + row.wanted)
+    assert len(numbers) == 4
+    section = TEXT[TEXT.index("## How far it turns") :].partition("\n## ")[0]
+    assert all(number in section for number in numbers)
+    free = worst_travel(profile.rig, profile.limits, profile.rig.cia402.heartbeat_timeout_s)
+    assert f"{free.total_rad:.2f} rad" in section

@@ -1,0 +1,80 @@
+"""How far the shaft turns after the loop has failed."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from rigd.checks.rows import Verdict
+from rigd.checks.travel import travel_rows, worst_travel
+from rigd.profile import load_profile
+
+
+@pytest.fixture
+def profile():
+    return load_profile("antenna_can")
+
+
+def with_motor(rig, **changes):
+    return replace(rig, motor=replace(rig.motor, **changes))
+
+
+def test_without_friction_it_turns_for_ever(profile):
+    rig = with_motor(profile.rig, viscous_nm_s_per_rad=0.0, coulomb_nm=0.0)
+    travel = worst_travel(rig, profile.limits, 0.05)
+    assert travel.driven_rad == pytest.approx(4.0 * 0.05 + 0.5 * 450.0 * 0.05**2, rel=1e-6)
+    assert travel.coasting_rad == math.inf
+
+
+def test_coulomb_friction_alone_brakes_evenly(profile):
+    rig = with_motor(profile.rig, viscous_nm_s_per_rad=0.0, coulomb_nm=0.1)
+    travel = worst_travel(rig, profile.limits, 0.05)
+    speed_rad_s = 4.0 + 0.8 / 2e-3 * 0.05
+    inertia_kg_m2 = 2e-3 + 4.7e-3 * 0.98**3 / 3
+    assert travel.driven_rad == pytest.approx((4.0 + speed_rad_s) / 2 * 0.05, rel=1e-6)
+    assert travel.coasting_rad == pytest.approx(
+        speed_rad_s**2 * inertia_kg_m2 / (2 * 0.1), rel=1e-3
+    )
+
+
+def test_viscous_friction_alone_brakes_by_its_time_constant(profile):
+    rig = with_motor(profile.rig, coulomb_nm=1e-6)
+    travel = worst_travel(rig, profile.limits, 0.0)
+    inertia_kg_m2 = 2e-3 + 4.7e-3 * 0.98**3 / 3
+    assert travel.driven_rad == 0.0
+    assert travel.coasting_rad == pytest.approx(4.0 * inertia_kg_m2 / 0.02, rel=1e-2)
+
+
+def test_the_drive_s_own_speed_limit_shortens_it(profile):
+    free = worst_travel(profile.rig, profile.limits, 0.05)
+    limited = worst_travel(profile.rig, profile.limits, 0.05, 5.0)
+    assert limited.driven_rad < 5.0 * 0.05
+    assert limited.total_rad < free.total_rad / 4
+
+
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_the_shipped_rigs_come_to_rest_in_time(name):
+    (row,) = travel_rows(load_profile(name))
+    assert row.verdict is Verdict.OK
+    assert "object 6080" in row.detail
+
+
+def test_a_drive_in_this_program_ends_with_it():
+    (row,) = travel_rows(load_profile("sim"))
+    assert row.verdict is Verdict.SKIPPED
+
+
+@pytest.mark.parametrize(
+    ("drive", "limits"),
+    [
+        ({"heartbeat_timeout_s": 0.5}, {}),
+        ({"max_speed_rad_s": 0.0}, {}),
+        ({}, {"stop_angle_rad": 2.0}),
+    ],
+)
+def test_a_travel_beyond_the_stop_is_refused(profile, drive, limits):
+    rig = replace(profile.rig, cia402=replace(profile.rig.cia402, **drive))
+    wrong = replace(profile, rig=rig, limits=replace(profile.limits, **limits))
+    (row,) = travel_rows(wrong)
+    assert row.verdict is Verdict.FAIL
+    assert "cia402.heartbeat_timeout_s" in row.detail

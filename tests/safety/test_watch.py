@@ -1,0 +1,183 @@
+"""The watch over jumps, heat, lag and disk, and how often it says that something is near."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigd.engine.watch import make_watch
+from rigd.excitation import hold
+from rigd.planning import RefusedError
+from rigd.profile import load_profile
+from rigd.safety import LOOK_EVERY
+from rigd.supervisor.orders import make_room
+
+PROFILE = load_profile("antenna_can")
+LIMITS = PROFILE.limits
+STEP_RAD = PROFILE.rig.encoder.resolution_rad
+REST = (0.0,) * 6
+PERIOD_NS = 1_000_000
+
+
+@pytest.fixture
+def watch():
+    return make_watch(PROFILE)
+
+
+def follow(watch, angles_rad):
+    """Check angles that are their own reference; return the first that ends the session."""
+    for tick, angle_rad in enumerate(angles_rad):
+        violation = watch.check(angle_rad, angle_rad, REST)
+        if violation is not None:
+            return tick, violation
+    return None
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("counts", [20, 50, 5000])
+def test_a_slip_of_the_encoder_at_rest_is_found_at_once(watch, counts, sign):
+    tick, violation = follow(watch, [0.0] * 10 + [sign * counts * STEP_RAD])
+    assert tick == 10
+    assert violation.channel == "encoder's jump"
+    assert violation.value == pytest.approx(sign * counts * STEP_RAD)
+    assert violation.limit == pytest.approx(1e-3 + 2 * STEP_RAD)
+
+
+def test_a_slip_in_motion_is_found_where_no_limit_of_speed_would(watch):
+    angles_rad = 0.5e-3 * np.arange(100)
+    angles_rad[60:] += 0.003  # 3.5 rad/s for a tick, where 4 are allowed
+    tick, violation = follow(watch, angles_rad.tolist())
+    assert tick == 60
+    assert violation.channel == "encoder's jump"
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.floats(0.0, 1.3),
+    st.floats(0.05, 20.0),
+    st.lists(st.floats(0.0, 0.8), min_size=50, max_size=50),
+    st.floats(0.0, 6.3),
+)
+def test_late_ticks_are_no_jumps(speed_rad_s, frequency_hz, lateness, phase):
+    """A shaft at up to the chirp's speed, latched late by up to 0.8 of a period."""
+    watch = make_watch(replace(PROFILE, limits=replace(LIMITS, velocity_rad_s=100.0)))
+    omega = min(2 * math.pi * frequency_hz, 900.0 / max(speed_rad_s, 1e-3))
+    late_s = np.array(lateness) * 1e-3
+    t_s = np.arange(50) * 1e-3 + late_s
+    angles_rad = speed_rad_s / omega * np.sin(omega * t_s + phase)
+    angles_rad = np.round(angles_rad / STEP_RAD) * STEP_RAD
+    watch.reset(float(angles_rad[0]))
+    # From rest to this speed nothing can go in one tick.
+    watch._previous_moved_rad = watch._before_that_rad = float(angles_rad[1] - angles_rad[0])
+    watch._previous_angle_rad = float(angles_rad[1])
+    limited = [v for v in angles_rad[2:].tolist() if abs(v) < 1.2]
+    assert follow(watch, limited) is None
+
+
+def test_angles_that_are_missing_make_no_jump(watch):
+    """Nine old angles in a row, while the motor goes from rest to 3 rad/s."""
+    speeds_rad_s = np.minimum(np.arange(20) * 0.4, 3.0)
+    angles_rad = np.cumsum(speeds_rad_s) * 1e-3
+    assert follow(watch, angles_rad[:2].tolist()) is None
+    for _ in range(9):
+        held = float(angles_rad[1])
+        assert watch.check(held, held, REST, angle_stale=True) is None
+    assert follow(watch, angles_rad[11:].tolist()) is None
+
+
+def heat(watch, torque_nm, seconds, start_s=0.0):
+    """Exert a torque; return when that ends the session."""
+    for look in range(round(seconds * 1000 / LOOK_EVERY)):
+        now_ns = round(start_s * 1e9) + look * LOOK_EVERY * PERIOD_NS
+        if watch.look(now_ns, LOOK_EVERY * torque_nm**2) is not None:
+            return (now_ns * 1e-9) - start_s
+    return None
+
+
+@pytest.mark.parametrize("torque_nm", [0.45, 0.6, 0.9])
+def test_the_motor_bears_a_torque_for_as_long_as_its_time_constant_says(watch, torque_nm):
+    motor = PROFILE.rig.motor
+    ratio = (motor.continuous_torque_nm / torque_nm) ** 2
+    expected_s = -motor.thermal_time_constant_s * math.log(1 - ratio)
+    assert heat(watch, torque_nm, 60.0) == pytest.approx(expected_s, abs=0.2)
+
+
+def test_the_motor_bears_its_continuous_torque_for_ever_and_cools_down_meanwhile(watch):
+    assert heat(watch, 0.99 * PROFILE.rig.motor.continuous_torque_nm, 300.0) is None
+    assert heat(watch, 0.9, 5.0, start_s=300.0) < 0.3
+    # A minute without a look, as between two sessions.
+    assert heat(watch, 0.9, 5.0, start_s=400.0) > 1.5
+
+
+def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
+    assert watch.look(0, 0.0, 0.6 * LIMITS.recorder_lag_s) is None
+    assert watch.check(0.0, 0.0, REST) is None
+    assert watch.warning
+    assert watch.look(LOOK_EVERY * PERIOD_NS, 0.0, 0.1 * LIMITS.recorder_lag_s) is None
+    assert watch.check(0.0, 0.0, REST) is None
+    assert not watch.warning
+    assert watch.look(2 * LOOK_EVERY * PERIOD_NS, disk_free_mb=400.0) is None
+    assert watch.check(0.0, 0.0, REST) is None
+    assert watch.warning
+    lag, disk = watch.take_notices()
+    assert "recorder's lag of 7.2 s is near its limit of 12 s" in lag
+    assert "free space of the session's disk of 400 MB is near its limit of 50 MB" in disk
+
+
+def test_a_channel_is_told_anew_after_a_second_clear_of_its_limit(watch):
+    near = 0.9 * LIMITS.angle_rad
+
+    def be_at(angle_rad, looks):
+        for _ in range(looks):
+            watch.reset(angle_rad)
+            assert watch.check(angle_rad, angle_rad, REST) is None
+            assert watch.look(0) is None
+        return len(watch.take_notices())
+
+    assert be_at(near, 50) == 1
+    assert be_at(0.0, 10) == 0
+    assert be_at(near, 1) == 0  # back after 0.6 s
+    assert be_at(0.0, 20) == 0
+    assert be_at(near, 1) == 1  # back after 1.3 s
+
+
+def test_what_is_beyond_its_limit_is_no_notice(watch):
+    watch.reset(2.0)
+    assert watch.check(2.0, 2.0, REST) is not None
+    assert watch.take_notices() == []
+
+
+def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
+    assert watch.check_missed(22, 22, 1000) is None
+    assert watch.check(0.0, 0.0, REST) is None
+    assert watch.warning
+    assert watch.check(0.0, 0.0, REST) is None
+    assert not watch.warning
+    [notice] = watch.take_notices()
+    assert notice.startswith("The run of missed ticks of 22 ticks is near its limit of 25 ticks")
+
+
+def test_a_torque_that_is_no_number_is_never_commanded(watch):
+    assert "not a number" in str(watch.check_torque(math.nan))
+    assert watch.check_torque(1.0) is None  # cut at 0.9 N·m, and told
+    assert len(watch.take_notices()) == 1
+
+
+def usage(free_mb):
+    return lambda _: SimpleNamespace(free=round(free_mb * 1e6))
+
+
+def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
+    excitation = hold(rate_hz=1000.0, duration_s=100.0)  # up to 19 MB with what is spare
+    monkeypatch.setattr("shutil.disk_usage", usage(75.0))
+    make_room(tmp_path / "sessions", excitation, LIMITS)
+    assert (tmp_path / "sessions").is_dir()
+    monkeypatch.setattr("shutil.disk_usage", usage(65.0))
+    with pytest.raises(
+        RefusedError, match=r"65\.0 MB .* limits\.disk_free_mb = 50 MB .* make room"
+    ):
+        make_room(tmp_path / "sessions", excitation, LIMITS)
