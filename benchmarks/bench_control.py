@@ -4,9 +4,9 @@ import numpy as np
 from timing import least_s
 
 from rigd.control import ClosedLoop, PidController, check_stability, close_loop, design_pid
+from rigd.engine.watch import make_watch
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.safety import LimitWatch
 
 CALLS = 20_000
 
@@ -26,7 +26,7 @@ def main() -> None:
     model, motor = profile.loop_model(), profile.rig.motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     pid = PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
-    watch = LimitWatch(profile.limits, profile.rig.sensor.range, profile.rig.rate_hz)
+    watch = make_watch(profile)
     wrench = (0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 
     def steps() -> None:

@@ -18,8 +18,8 @@ from rigd.devices.registry import open_devices
 from rigd.engine.clocks import VirtualClock
 from rigd.engine.cycle import Cycle
 from rigd.engine.metronome import Metronome
+from rigd.engine.watch import make_watch
 from rigd.profile import load_profile
-from rigd.safety import LimitWatch
 
 RIGD = Path(sys.executable).with_name("rigd")
 TICKS = 20_000
@@ -45,7 +45,7 @@ def cycle() -> Callable[[], None]:
     controller = PidController(gains, profile.control, rig.rate_hz, motor.peak_torque_nm)
     devices = open_devices(rig)
     devices.drive.enable()
-    watch = LimitWatch(profile.limits, rig.sensor.range, rig.rate_hz)
+    watch = make_watch(profile)
     tick = Cycle(devices, rig.sensor.projection, controller, watch)
     metronome = Metronome(VirtualClock(), rig.rate_hz)
 

@@ -96,11 +96,11 @@ class LimitWatch:
         sensor_range: Sequence[float],
         rate_hz: float,
         *,
-        resolution_rad: float = 0.0,
-        peak_torque_nm: float = inf,
-        continuous_torque_nm: float = inf,
-        thermal_time_constant_s: float = 10.0,
-        tare_warning_nm: float = inf,
+        resolution_rad: float,
+        peak_torque_nm: float,
+        continuous_torque_nm: float,
+        thermal_time_constant_s: float,
+        tare_warning_nm: float,
     ) -> None:
         self._limits = limits
         self._rate_hz = rate_hz

@@ -54,6 +54,19 @@ class SessionResult:
         """Whether nothing at all is to be said against it."""
         return self.outcome == "complete" and not self.reason
 
+    def as_dict(self) -> dict[str, object]:
+        """Return it as JSON documents have it."""
+        return {
+            "path": None if self.path is None else str(self.path),
+            "outcome": self.outcome,
+            "reason": self.reason,
+            "scheduled": self.scheduled,
+            "recorded": self.recorded,
+            "missed": self.missed,
+            "late": self.late,
+            "lost": self.lost,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class SessionProgress:
@@ -206,12 +219,16 @@ class Session:
     def _as_finished(self, reason: str) -> Message:
         """Say what the control process would have said, as far as the board tells."""
         board = self._board
-        counts = {
-            "scheduled": board[Word.SCHEDULED],
-            "missed": board[Word.MISSED],
-            "late": board[Word.LATE],
+        words = (Word.SCHEDULED, Word.MISSED, Word.LATE)
+        # Before this session's record they stand where the last one left them.
+        scheduled, missed, late = (board[word] if board[Word.GO] else 0 for word in words)
+        whole = scheduled == self._order.excitation.reference_rad.size
+        return {
+            "finished": "complete" if whole else "fault",
+            "reason": f"After the record: {reason}" if whole else reason,
+            "counts": {"scheduled": scheduled, "missed": missed, "late": late},
+            "results": {},
         }
-        return {"finished": "fault", "reason": reason, "counts": counts, "results": {}}
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -267,10 +284,11 @@ class Session:
         closed = self._ask_recorder("closed", 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
         counts = {"scheduled": 0, "missed": 0, "late": 0} | counts | closed.get("counts", {})
+        ended, reason = closed.get("outcome", (finished["finished"], finished["reason"]))
         return SessionResult(
             path=None if closed["closed"] is None else Path(closed["closed"]),
-            outcome=finished["finished"],
-            reason=finished["reason"],
+            outcome=ended,
+            reason=reason,
             scheduled=counts["scheduled"],
             recorded=counts.get("recorded", 0),
             missed=counts["missed"],

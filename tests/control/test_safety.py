@@ -27,11 +27,18 @@ LIMITS = Limits(
 )
 RANGE = (20.0, 20.0, 60.0, 1.0, 1.0, 1.0)
 REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+MOTOR = {
+    "resolution_rad": 0.0,
+    "peak_torque_nm": math.inf,
+    "continuous_torque_nm": math.inf,
+    "thermal_time_constant_s": 10.0,
+    "tare_warning_nm": math.inf,
+}
 
 
 @pytest.fixture
 def watch():
-    return LimitWatch(LIMITS, RANGE, 1000.0)
+    return LimitWatch(LIMITS, RANGE, 1000.0, **MOTOR)
 
 
 def test_ordinary_ticks_pass(watch):
@@ -92,7 +99,7 @@ def test_readings_that_are_no_numbers_end_the_session(watch, place, bad):
     fz=st.floats(-60, 60),
 )
 def test_fast_check_and_definition_agree(angle, error, tz, fz):
-    watch = LimitWatch(LIMITS, RANGE, 1000.0)
+    watch = LimitWatch(LIMITS, RANGE, 1000.0, **MOTOR)
     watch.reset(angle)
     reference = angle + error
     violation = watch.check(reference, angle, (0.0, 0.0, fz, 0.0, 0.0, tz))

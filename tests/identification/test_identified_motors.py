@@ -13,6 +13,7 @@ from rigd.control import PidController, design_pid
 from rigd.devices.contracts import Devices
 from rigd.devices.registry import open_devices
 from rigd.engine.cycle import Cycle
+from rigd.engine.watch import make_watch
 from rigd.identification.experiments import (
     TOP_HZ,
     lay_out_passes,
@@ -25,7 +26,6 @@ from rigd.identification.motor_estimate import Window, estimate_motor
 from rigd.identification.motor_moments import Timing
 from rigd.identification.tuning import cautious, tuned
 from rigd.profile import load_profile
-from rigd.safety import LimitWatch
 
 OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}
 
@@ -87,7 +87,7 @@ def record(profile, true_rig, scale, excitation):
         Devices(ScaledDrive(devices.drive, scale), devices.sensor, simulated=True),
         rig.sensor.projection,
         PidController(gains, profile.control, rig.rate_hz, motor.peak_torque_nm),
-        LimitWatch(profile.limits, rig.sensor.range, rig.rate_hz),
+        make_watch(profile),
     )
     due = range(0, 10**12, round(1e9 / rig.rate_hz)).__iter__()
     wrenches = []

@@ -172,12 +172,12 @@ def usage(free_mb):
 
 
 def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
-    excitation = hold(rate_hz=1000.0, duration_s=100.0)  # up to 19 MB with what is spare
-    monkeypatch.setattr("shutil.disk_usage", usage(75.0))
+    excitation = hold(rate_hz=1000.0, duration_s=100.0)  # up to 27 MB with what is spare
+    monkeypatch.setattr("shutil.disk_usage", usage(80.0))
     make_room(tmp_path / "sessions", excitation, LIMITS)
     assert (tmp_path / "sessions").is_dir()
-    monkeypatch.setattr("shutil.disk_usage", usage(65.0))
+    monkeypatch.setattr("shutil.disk_usage", usage(75.0))
     with pytest.raises(
-        RefusedError, match=r"65\.0 MB .* limits\.disk_free_mb = 50 MB .* make room"
+        RefusedError, match=r"75\.0 MB .* limits\.disk_free_mb = 50 MB .* make room"
     ):
         make_room(tmp_path / "sessions", excitation, LIMITS)
