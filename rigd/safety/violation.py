@@ -1,4 +1,4 @@
-"""A limit that was left or is near, in words."""
+"""A limit that was left, or whose warning level was, in words."""
 
 from dataclasses import dataclass
 from math import isfinite
@@ -19,7 +19,7 @@ class Violation:
     below
         The value must not fall below the limit, instead of exceeding it.
     near
-        The limit was not left yet.
+        The limit was not left yet: only the level of the warning.
     """
 
     channel: str
@@ -35,11 +35,11 @@ class Violation:
         """Return one or two sentences for the operator."""
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
-        left = "is below" if self.below else "exceeds"
-        how = "is near" if self.near else left
+        left = "is below its limit of" if self.below else "exceeds its limit of"
+        how = "is past its warning level; its limit is" if self.near else left
         where = f" ({self.key})" if self.key else ""
         remedy = f" {self.remedy}" if self.remedy else ""
         return (
-            f"The {self.channel} of {self.value:.4g} {self.unit} {how} its limit of "
+            f"The {self.channel} of {self.value:.4g} {self.unit} {how} "
             f"{self.limit:.4g} {self.unit}{where}.{remedy}"
         )

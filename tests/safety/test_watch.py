@@ -124,8 +124,11 @@ def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
     assert watch.check(0.0, 0.0, REST) is None
     assert watch.warning
     lag, disk = watch.take_notices()
-    assert "recorder's lag of 7.2 s is near its limit of 12 s" in lag
-    assert "free space of the session's disk of 400 MB is near its limit of 50 MB" in disk
+    assert "recorder's lag of 7.2 s is past its warning level; its limit is 12 s" in lag
+    assert (
+        "free space of the session's disk of 400 MB is past its warning level; its limit is 50 MB"
+        in disk
+    )
 
 
 def test_a_channel_is_told_anew_after_a_second_clear_of_its_limit(watch):
@@ -158,7 +161,9 @@ def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
     assert watch.check(0.0, 0.0, REST) is None
     assert not watch.warning
     [notice] = watch.take_notices()
-    assert notice.startswith("The run of missed ticks of 22 ticks is near its limit of 25 ticks")
+    assert notice.startswith(
+        "The run of missed ticks of 22 ticks is past its warning level; its limit is 25 ticks"
+    )
 
 
 def test_a_torque_that_is_no_number_is_never_commanded(watch):
