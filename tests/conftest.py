@@ -2,6 +2,7 @@
 
 import atexit
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,64 @@ os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 RIGD = Path(sys.executable).parent / "rigd"
+HW_PROFILES = Path(__file__).parents[1] / "hw_profiles"
+
+# A machine that stands still, or is slow, keeps no times: ticks are missed, replies come late, and
+# the torque that is held meanwhile swings the motor out. It ends no session in real time here; what
+# limits and time-outs do is tested where time is simulated.
+PATIENT = {
+    "motor.thermal_time_constant_s": "1.0e3",
+    "limits.angle_rad": "100.0",
+    "limits.stop_angle_rad": "200.0",
+    "limits.velocity_rad_s": "100.0",
+    "limits.acceleration_rad_s2": "1.0e6",
+    "limits.tracking_error_rad": "100.0",
+    "limits.torque_command_nm": "1.0e4",
+    "limits.sensor_range_percent": "200.0",
+    "limits.saturated_ticks_in_a_row": "1000000",
+    "limits.stale_ticks_in_a_row": "1000000",
+    "limits.missed_ticks_in_a_row": "1000000",
+    "limits.missed_percent": "100.0",
+    "limits.tare_drift_nm": "10.0",
+    "cia402.heartbeat_timeout_s": "5.0",
+    "cia402.max_speed_rad_s": "0.0",
+    "cia402.drive_heartbeat_timeout_s": "5.0",
+    "cia402.enable_timeout_s": "10.0",
+    "cia402.torque_tolerance_percent": "0.0",
+}
+BRIEF = {"session.tare_s": "0.5", "session.return_s": "0.3"}
+
+
+def with_values(text: str, values: dict[str, str]) -> str:
+    """A profile's text with other values, by `section.key`; what it has no section for is left."""
+    for name, value in values.items():
+        section, _, key = name.rpartition(".")
+        head, title, rest = text.partition(f"\n[{section}]\n" if section else "\n")
+        if title:
+            pattern = rf"^({key} = (?:\{{ value = )?)[^,\n]*"
+            rest, found = re.subn(pattern, rf"\g<1>{value}", rest, count=1, flags=re.MULTILINE)
+            assert found, name
+            text = head + title + rest
+    return text
+
+
+@pytest.fixture
+def write_profile(tmp_path):
+    """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
+
+    One that is `patient` bears that the machine stands still.
+    """
+
+    def write(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
+        text = (HW_PROFILES / f"{name}.toml").read_text("utf-8")
+        values = BRIEF | (PATIENT if patient else {}) | (values or {})
+        text = with_values(text, values)
+        stem = values.get("name", name).strip('"')
+        path = tmp_path / f"{stem}.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
 
 
 @pytest.fixture
@@ -52,7 +111,7 @@ def start_simulator(runtime_folder, tmp_path):
             )
         started.append(process)
         name = load_profile(profile).name
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while find_simulator(name) is None:
             assert process.poll() is None, Path(said.name).read_text()
             assert time.monotonic() < deadline, "the simulator does not answer"

@@ -3,6 +3,7 @@
 ``rigd bench`` measures what it comes to; ``docs/real_time.md`` says how to change it.
 """
 
+import ctypes
 import os
 import platform
 from collections.abc import Iterator
@@ -18,6 +19,9 @@ _CLOCK_SOURCE = Path("sys/devices/system/clocksource/clocksource0/current_clocks
 _THROTTLING = Path("proc/sys/kernel/sched_rt_runtime_us")
 _THROTTLING_PERIOD = Path("proc/sys/kernel/sched_rt_period_us")
 _REALTIME_KERNEL = Path("sys/kernel/realtime")
+_TIMEX_SIZE = 512
+"""More than the kernel's structure has on any architecture."""
+_NOT_SYNCHRONISED = 5
 _LEAST_RUNTIME = 0.95
 """Of each period that the kernel leaves to real-time processes unless told otherwise."""
 
@@ -42,6 +46,7 @@ def machine_rows(
     yield _core_row(settings, root)
     yield _governor_row(root)
     yield _clock_row(root)
+    yield _wall_clock_row()
     yield _throttling_row(settings, root)
 
 
@@ -91,13 +96,7 @@ def _core_row(settings: RealtimeSettings, root: Path) -> Row:
             f"Isolated core: set realtime.cpu to -1 or to one of {cores}.",
         )
     else:
-        last = (os.cpu_count() or 1) - 1
-        found, remedy = (
-            cores or "none",
-            "Isolated core: other programs may share the loop's core. Boot with isolcpus="
-            f"{last} nohz_full={last} irqaffinity=0 (GRUB_CMDLINE_LINUX in /etc/default/grub, then "
-            "update-grub).",
-        )
+        found, remedy = cores or "none", _how_to_isolate((os.cpu_count() or 1) - 1)
     return Row(
         _GROUP,
         "isolated core",
@@ -105,6 +104,18 @@ def _core_row(settings: RealtimeSettings, root: Path) -> Row:
         "one",
         grade(fail=False, warn=not alone),
         "" if alone else remedy,
+    )
+
+
+def _how_to_isolate(last: int) -> str:
+    if last == 0:
+        return (
+            "Isolated core: this computer has one core, which everything shares; use one with more."
+        )
+    return (
+        "Isolated core: other programs may share the loop's core. Boot with "
+        f"isolcpus={last} nohz_full={last} irqaffinity=0 (GRUB_CMDLINE_LINUX in /etc/default/grub, "
+        "then update-grub)."
     )
 
 
@@ -143,6 +154,21 @@ def _clock_row(root: Path) -> Row:
     )
 
 
+def _wall_clock_row() -> Row:
+    synchronised = _synchronised()
+    return Row(
+        _GROUP,
+        "wall clock",
+        "synchronised" if synchronised else "not synchronised",
+        "synchronised",
+        grade(fail=False, warn=not synchronised),
+        ""
+        if synchronised
+        else "Wall clock: the times in the files may be wrong (ticks do not depend on it); "
+        "timedatectl set-ntp true, or install chrony.",
+    )
+
+
 def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
     runtime_us = _number(root / _THROTTLING, -1)
     period_us = _number(root / _THROTTLING_PERIOD, 1_000_000)
@@ -159,6 +185,15 @@ def _throttling_row(settings: RealtimeSettings, root: Path) -> Row:
         if low
         else "",
     )
+
+
+def _synchronised() -> bool:
+    """Whether the kernel knows of somebody who keeps its wall clock right."""
+    try:
+        state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
+    except (OSError, AttributeError):
+        return False
+    return 0 <= state < _NOT_SYNCHRONISED
 
 
 def _read(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from rigd.checks.devices import inspect_devices
 from rigd.checks.loop import loop_rows
+from rigd.checks.machine import machine_rows
 from rigd.checks.on_paper import profile_rows, wiring_rows
 from rigd.checks.rights import rights_rows
 from rigd.checks.rows import Row, Verdict
@@ -22,6 +23,7 @@ def check_rig(profile: Profile) -> list[Row]:
         *loop_rows(profile),
         *travel_rows(profile),
         *rights_rows(profile.realtime),
+        *machine_rows(profile.realtime),
     ]
     if any(row.verdict is Verdict.FAIL for row in wiring):
         why = "not connected: first the bus has to be right"

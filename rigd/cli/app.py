@@ -7,12 +7,15 @@ import sys
 
 import typer
 
+from rigd.cli.bench import bench
 from rigd.cli.check import check, reset
+from rigd.cli.daemon import status, stop, tare, zero
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
 from rigd.cli.recover import recover
-from rigd.cli.run import run_app
+from rigd.cli.run import run_app, start_app
+from rigd.cli.serve import serve
 from rigd.cli.simulate import inject, simulate
 
 app = typer.Typer(
@@ -26,10 +29,17 @@ app = typer.Typer(
 # In the order in which an operator meets them.
 app.command()(check)
 app.add_typer(run_app, name="run")
+app.command()(serve)
+app.add_typer(start_app, name="start")
+app.command()(status)
+app.command()(stop)
+app.command()(tare)
+app.command()(zero)
+app.command()(reset)
 app.command()(info)
 app.command()(recover)
 app.add_typer(identify_app, name="identify")
-app.command()(reset)
+app.command()(bench)
 app.command()(simulate)
 app.command()(inject)
 

@@ -3,10 +3,11 @@
 import json
 import os
 import signal
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rigd.cli.daemon import reset_by_daemon
 from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
 from rigd.cli.options import AsJson, ProfileName, profile_named
 
@@ -42,13 +43,22 @@ def check(
         raise typer.Exit(EXIT_FAILED)
 
 
-def reset(profile: ProfileName = "sim") -> None:
-    """Reset a fault of the drive, after its cause is removed. No torque; the drive stays off.
+def reset(
+    profile: Annotated[
+        str | None,
+        typer.Option("--profile", help="Whose rig (default: that of the running daemon, or sim)."),
+    ] = None,
+) -> None:
+    """Reset a fault, after its cause is removed. No torque; the drive stays off.
+
+    Where a daemon has the rig, it is asked to; otherwise the fault of the drive is reset.
 
     Example: rigd reset --profile antenna_can
     """
     _end_as_by_ctrl_c()
-    rig_profile = _openable_profile(profile)
+    if reset_by_daemon(profile):
+        return
+    rig_profile = _openable_profile(profile or "sim")
     from rigd.devices.contracts import DeviceError
     from rigd.devices.resetting import reset_drive
 

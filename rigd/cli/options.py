@@ -25,6 +25,23 @@ Fast = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Write one JSON document to standard output.")]
 
+Repeat = Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")]
+Operator = Annotated[str, typer.Option("--operator", help="Goes into the file.")]
+Specimen = Annotated[str, typer.Option("--specimen", help="Goes into the file.")]
+Note = Annotated[str, typer.Option("--note", help="Goes into the file.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
+]
+
+
+def session_notes(operator: str, specimen: str, note: str) -> dict[str, str]:
+    """Return what is to go into the file; a text that cannot ends the command."""
+    notes = {"operator": operator, "specimen": specimen, "note": note}
+    for option, text in notes.items():
+        if not text.isprintable():
+            fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
+    return notes
+
 
 def profile_named(name: str) -> "Profile":
     """Load a profile; one that cannot be used ends the command."""

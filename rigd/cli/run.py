@@ -1,8 +1,13 @@
-"""``rigd run``: sessions in the foreground, one command an excitation."""
+"""``rigd run`` and ``rigd start``: sessions, one command an excitation.
+
+What an excitation is asked for stands here once; ``rigd run`` runs it in the foreground,
+``rigd start`` has the daemon run it.
+"""
 
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,15 +15,37 @@ import typer
 
 from rigd.cli.crew import start_crew
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
-from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed
+from rigd.cli.options import (
+    SESSIONS,
+    AsJson,
+    Fast,
+    Force,
+    Note,
+    Operator,
+    Output,
+    ProfileName,
+    Repeat,
+    Seed,
+    Specimen,
+    session_notes,
+)
+from rigd.cli.start import start_sessions
 
 if TYPE_CHECKING:
-    from rigd.excitation import Excitation
+    from rigd.excitation.named import Value
     from rigd.supervisor.session import SessionResult
 
 run_app = typer.Typer(
+    name="run",
     help="Run one or more sessions in the foreground; Ctrl-C stops safely.\n\n"
     "Example: rigd run chirp --profile sim --fast",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+start_app = typer.Typer(
+    name="start",
+    help="Have the daemon run one or more sessions; Ctrl-C stops them safely.\n\n"
+    "Example: rigd start chirp --repeat 20",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -32,55 +59,62 @@ RingDown = Annotated[float, typer.Option("--ring-down", help="Holding after it, 
 Taper = Annotated[float, typer.Option("--taper", help="Fade in and out over this time, s.")]
 
 
-Build = Callable[..., "Excitation"]
-"""Makes an excitation from the rate (first) and its own options."""
+Parameters = Callable[..., "dict[str, Value]"]
+"""Makes an excitation's parameters, by the names they have everywhere else, from its options."""
 
 
-def excitation_command(build: Build) -> Build:
-    """Register ``rigd run NAME``: the excitation's own options, then those of every session."""
-    own = list(inspect.signature(build).parameters.values())[1:]
-    common = list(inspect.signature(run_sessions).parameters.values())[1:]
+def excitation_command(parameters: Parameters) -> Parameters:
+    """Register ``rigd run NAME`` and ``rigd start NAME``.
+
+    Either takes the excitation's own options, then those of every session.
+    """
+    _register(run_app, run_sessions, parameters)
+    _register(start_app, start_sessions, parameters)
+    return parameters
+
+
+def _register(app: typer.Typer, perform: Callable[..., None], parameters: Parameters) -> None:
+    kind = parameters.__name__
+    own = list(inspect.signature(parameters).parameters.values())
+    common = list(inspect.signature(perform).parameters.values())[2:]
 
     def command(**options: Any) -> None:  # noqa: ANN401 - as typer hands them over
         shared = {parameter.name: options.pop(parameter.name) for parameter in common}
-        run_sessions(lambda rate_hz: build(rate_hz, **options), **shared)
+        perform(kind, parameters(**options), **shared)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*own, *common)]
     )
     command.__annotations__ = {p.name: p.annotation for p in (*own, *common)}
-    run_app.command(build.__name__, help=build.__doc__)(command)
-    return build
+    text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
+    app.command(kind, help=text)(command)
 
 
 def run_sessions(
-    build: Callable[[float], "Excitation"],
+    kind: str,
+    parameters: "Mapping[str, Value]",
     profile: ProfileName = "sim",
     output: Output = SESSIONS,
-    repeat: Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")] = 1,
+    repeat: Repeat = 1,
     seed: Seed = None,
-    operator: Annotated[str, typer.Option("--operator", help="Goes into the file.")] = "",
-    specimen: Annotated[str, typer.Option("--specimen", help="Goes into the file.")] = "",
-    note: Annotated[str, typer.Option("--note", help="Goes into the file.")] = "",
+    operator: Operator = "",
+    specimen: Specimen = "",
+    note: Note = "",
     fast: Fast = False,
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
-    ] = False,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
-    notes = {"operator": operator, "specimen": specimen, "note": note}
-    for option, text in notes.items():
-        if not text.isprintable():
-            fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
+    notes = session_notes(operator, specimen, note)
     stop, crew = start_crew(live=live)
     from rigd.engine.signals import ignore
+    from rigd.excitation.named import make_excitation
     from rigd.foreground import ForegroundError, run_in_foreground
 
     try:
         results = run_in_foreground(
-            build,
+            partial(make_excitation, kind, parameters),
             crew,
             stop,
             profile_name=profile,
@@ -109,7 +143,6 @@ def run_sessions(
 
 @excitation_command
 def chirp(
-    rate_hz: float,
     amplitude: Amplitude = 0.025,
     start_hz: StartHz = 0.05,
     stop_hz: StopHz = 50.0,
@@ -117,64 +150,54 @@ def chirp(
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
     taper: Taper = 0.0,
-) -> "Excitation":
+) -> "dict[str, Value]":
     """Sweep linearly through a band, by default as in the paper.
 
-    Example: rigd run chirp --profile sim --fast --output sessions
+    Example: rigd run chirp --stop-hz 20 --repeat 5
     """
-    from rigd import excitation
-
-    return excitation.chirp(
-        rate_hz=rate_hz,
-        amplitude_rad=amplitude,
-        start_hz=start_hz,
-        stop_hz=stop_hz,
-        duration_s=duration,
-        rest_s=rest,
-        ring_down_s=ring_down,
-        taper_s=taper,
-    )
+    return {
+        "amplitude_rad": amplitude,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "duration_s": duration,
+        "rest_s": rest,
+        "ring_down_s": ring_down,
+        "taper_s": taper,
+    }
 
 
 @excitation_command
 def hold(
-    rate_hz: float, duration: Duration = 10.0, rest: Rest = 1.0, ring_down: RingDown = 0.0
-) -> "Excitation":
+    duration: Duration = 10.0, rest: Rest = 1.0, ring_down: RingDown = 0.0
+) -> "dict[str, Value]":
     """Hold the motor where it stands, for noise and drift.
 
     Example: rigd run hold --duration 30
     """
-    from rigd import excitation
-
-    return excitation.hold(rate_hz=rate_hz, duration_s=duration, rest_s=rest, ring_down_s=ring_down)
+    return {"duration_s": duration, "rest_s": rest, "ring_down_s": ring_down}
 
 
 @excitation_command
 def step(
-    rate_hz: float,
     amplitude: Amplitude = 0.025,
     duration: Duration = 10.0,
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
-) -> "Excitation":
+) -> "dict[str, Value]":
     """Step by an amplitude.
 
-    Example: rigd run step --amplitude 0.01 --fast
+    Example: rigd run step --amplitude 0.01
     """
-    from rigd import excitation
-
-    return excitation.step(
-        rate_hz=rate_hz,
-        amplitude_rad=amplitude,
-        duration_s=duration,
-        rest_s=rest,
-        ring_down_s=ring_down,
-    )
+    return {
+        "amplitude_rad": amplitude,
+        "duration_s": duration,
+        "rest_s": rest,
+        "ring_down_s": ring_down,
+    }
 
 
 @excitation_command
 def multisine(
-    rate_hz: float,
     amplitude: Amplitude = 0.025,
     start_hz: StartHz = 0.05,
     stop_hz: StopHz = 50.0,
@@ -186,30 +209,26 @@ def multisine(
     phase_seed: Annotated[
         int, typer.Option("--phase-seed", min=0, help="Of the random phases.")
     ] = 0,
-) -> "Excitation":
+) -> "dict[str, Value]":
     """Excite with equal sines of random phase; the amplitude is the peak of their sum.
 
-    Example: rigd run multisine --amplitude 0.01 --period 20 --fast
+    Example: rigd run multisine --amplitude 0.01 --period 20
     """
-    from rigd import excitation
-
-    return excitation.multisine(
-        rate_hz=rate_hz,
-        amplitude_rad=amplitude,
-        start_hz=start_hz,
-        stop_hz=stop_hz,
-        period_s=period,
-        duration_s=duration,
-        rest_s=rest,
-        ring_down_s=ring_down,
-        taper_s=taper,
-        seed=phase_seed,
-    )
+    return {
+        "amplitude_rad": amplitude,
+        "start_hz": start_hz,
+        "stop_hz": stop_hz,
+        "period_s": period,
+        "duration_s": duration,
+        "rest_s": rest,
+        "ring_down_s": ring_down,
+        "taper_s": taper,
+        "seed": phase_seed,
+    }
 
 
 @excitation_command
 def file(
-    rate_hz: float,
     path: Annotated[
         Path,
         typer.Argument(
@@ -218,31 +237,16 @@ def file(
     ],
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
-) -> "Excitation":
+) -> "dict[str, Value]":
     """Follow a reference from a CSV file.
 
-    Example: rigd run file reference.csv --fast
+    Example: rigd run file reference.csv
     """
-    from rigd import excitation
-
-    return excitation.from_csv(path, rate_hz=rate_hz, rest_s=rest, ring_down_s=ring_down)
+    return {"path": path, "rest_s": rest, "ring_down_s": ring_down}
 
 
 def _write_json(results: "list[SessionResult]") -> None:
     try:
-        typer.echo(json.dumps({"sessions": [_as_json(result) for result in results]}))
+        typer.echo(json.dumps({"sessions": [result.as_dict() for result in results]}))
     except OSError as error:
         fail(f"The JSON document cannot be written ({error.strerror}).", EXIT_FAILED)
-
-
-def _as_json(result: "SessionResult") -> dict[str, object]:
-    return {
-        "path": None if result.path is None else str(result.path),
-        "outcome": result.outcome,
-        "reason": result.reason,
-        "scheduled": result.scheduled,
-        "recorded": result.recorded,
-        "missed": result.missed,
-        "late": result.late,
-        "lost": result.lost,
-    }

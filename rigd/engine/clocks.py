@@ -6,6 +6,7 @@ is the same code under either.
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 SUSPENDED_S = 0.01
@@ -104,7 +105,7 @@ class SuspendWatch:
     def suspended_s(self) -> float:
         """Return for how long the computer was suspended since this watch began.
 
-        A fraction of a microsecond's work, for the loop.
+        About a microsecond's work: now and then, not in every tick.
         """
         ahead_ns = self._boot_ns() - self._monotonic_ns()
         return max(0, ahead_ns - self._ahead_ns) * 1e-9
@@ -113,4 +114,4 @@ class SuspendWatch:
 def _clock_since_boot() -> Callable[[], int]:
     if not hasattr(time, "CLOCK_BOOTTIME"):
         return time.monotonic_ns
-    return lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    return partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)

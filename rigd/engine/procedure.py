@@ -12,11 +12,12 @@ import numpy as np
 from rigd.devices.contracts import DeviceError
 from rigd.engine.board import Board, Phase, Stop, Word
 from rigd.engine.channels import Channels
-from rigd.engine.clocks import Clock
+from rigd.engine.clocks import SUSPENDED_S, Clock, SuspendWatch
 from rigd.engine.cycle import Cycle
 from rigd.engine.events import Event, Level, write_event
 from rigd.engine.metronome import Metronome
 from rigd.engine.process import Parent
+from rigd.engine.realtime import page_faults
 from rigd.engine.rest import Rest, observe_rest
 from rigd.engine.sample_log import SampleLog
 from rigd.engine.signals import StopRequest
@@ -101,6 +102,8 @@ class Procedure:
         self._stop = stop
         self._rate_hz = profile.rig.rate_hz
         self._metronome = metronome
+        self._suspends = SuspendWatch()
+        self._page_faults = 0
         self._looks_unanswered = 0
         self._supervisor_beat = -1
         late_ns = int(profile.realtime.late_us * 1000)
@@ -237,6 +240,7 @@ class Procedure:
         stop, scheduled = board.word(Word.STOP), board.word(Word.SCHEDULED)
         metronome.restart()
         self._recording = True
+        self._page_faults = page_faults()
         wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
         # Under the real clock tick 0 is still ahead, or up to one period behind.
         ahead_ns = 0 if virtual else metronome.start_ns - before_ns
@@ -390,6 +394,13 @@ class Procedure:
         if violation is not None:
             return SessionEnd("fault", str(violation))
         if not self._clock.virtual:
+            suspended_s = self._suspends.suspended_s()
+            if suspended_s > SUSPENDED_S:
+                return SessionEnd(
+                    "fault",
+                    f"The computer was suspended for {suspended_s:.1f} s, in which nobody "
+                    "controlled the motor; turn its power management off.",
+                )
             beat = self._board[Word.SUPERVISOR_BEAT]
             self._looks_unanswered = (
                 self._looks_unanswered + 1 if beat == self._supervisor_beat else 0
@@ -416,6 +427,7 @@ class Procedure:
         self.results["end_utc_ns"] = str(now_ns)
         if self._clock.virtual:
             return
+        self.results["page_faults"] = str(page_faults() - self._page_faults)
         elapsed_ns = time.monotonic_ns() - before_ns
         self.results["wall_clock_drift_ppm"] = repr(((now_ns - wall_ns) / elapsed_ns - 1) * 1e6)
         intervals = self.counts.scheduled - self.counts.missed - 1

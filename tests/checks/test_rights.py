@@ -1,6 +1,7 @@
 """Real-time rights are tried elsewhere: this process stays as it is."""
 
 import os
+import pwd
 from dataclasses import replace
 
 import pytest
@@ -22,7 +23,14 @@ def state():
 def test_every_setting_has_a_row_and_none_sticks(asked):
     before = state()
     rows = {row.what: row for row in rights_rows(asked)}
-    assert set(rows) == {"memory", "timer slack", "garbage collector", "cpu", "scheduling"}
+    assert set(rows) == {
+        "memory",
+        "timer slack",
+        "garbage collector",
+        "cpu",
+        "idle states",
+        "scheduling",
+    }
     assert rows["timer slack"].verdict is Verdict.OK
     assert state() == before
 
@@ -45,3 +53,26 @@ def test_a_trial_that_fails_is_told(asked, monkeypatch):
     (row,) = rights_rows(asked)
     assert row.verdict is Verdict.WARNING
     assert "could not be tried" in row.found
+
+
+def test_the_lines_that_grant_what_is_lacking_are_spelt_out(asked, monkeypatch):
+    granted = {
+        "memory": "refused: not enough",
+        "idle_states": "refused: not yours",
+        "scheduling": "refused: not permitted",
+    }
+    monkeypatch.setattr("rigd.checks.rights.settings_granted", lambda settings: granted)
+    rows = {row.what: row for row in rights_rows(asked)}
+    user = pwd.getpwuid(os.geteuid()).pw_name
+    assert f"{user} - memlock unlimited" in rows["memory"].detail
+    assert f"{user} - rtprio {asked.priority}" in rows["scheduling"].detail
+    assert 'KERNEL=="cpu_dma_latency"' in rows["idle states"].detail
+    assert all(row.verdict is Verdict.WARNING for row in rows.values())
+
+
+def test_memory_that_is_locked_in_part_only_is_a_warning(asked, monkeypatch):
+    granted = {"memory": "locked, but for what is allocated later (limit of 8 MB)"}
+    monkeypatch.setattr("rigd.checks.rights.settings_granted", lambda settings: granted)
+    (row,) = rights_rows(asked)
+    assert row.verdict is Verdict.WARNING
+    assert "memlock unlimited" in row.detail

@@ -14,7 +14,7 @@ COMMANDS = Path(sys.executable).parent
 def rigd(tmp_path):
     """Run `rigd` in an empty folder; returns the completed process."""
 
-    def run(*arguments, timeout=60):
+    def run(*arguments, timeout=100):
         return subprocess.run(
             [COMMANDS / "rigd", *map(str, arguments)],
             cwd=tmp_path,
@@ -29,15 +29,21 @@ def rigd(tmp_path):
 
 
 @pytest.fixture
+def patient(write_profile):
+    """The simulated rig, for sessions in real time on a machine that may stand still."""
+    return write_profile("sim", patient=True)
+
+
+@pytest.fixture
 def start_rigd(tmp_path):
     """Start `rigd` in an empty folder; it is killed if a test leaves it running."""
     started = []
 
-    def start(*arguments):
+    def start(*arguments, folder=tmp_path):
         started.append(
             subprocess.Popen(
                 [COMMANDS / "rigd", *map(str, arguments)],
-                cwd=tmp_path,
+                cwd=folder,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,

@@ -1,5 +1,6 @@
 """`rigd run`, from the command line to the closed file."""
 
+import contextlib
 import json
 import os
 import signal
@@ -11,9 +12,6 @@ import pytest
 
 from rigd.session import Status, read_controls, read_session
 
-# Sessions in real time share a core: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
 SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")
 
 
@@ -23,7 +21,7 @@ def the_session(done):
     return session
 
 
-def test_the_paper_s_chirp_is_recorded_whole(rigd, tmp_path):
+def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(rigd, tmp_path):
     session = the_session(rigd("run", "chirp", "--fast", "--json", "--output", "out"))
     assert session["outcome"] == "complete"
     assert session["scheduled"] == session["recorded"] == 136_000
@@ -49,27 +47,12 @@ def test_the_paper_s_chirp_is_recorded_whole(rigd, tmp_path):
     assert record.attachments["profile.toml"].decode().startswith("# The simulated rig")
     assert not list((tmp_path / "out").glob("*.part"))
 
-
-def test_all_three_modes_are_excited_and_the_torque_stays_below_the_limit(rigd, tmp_path):
-    session = the_session(rigd("run", "chirp", "--fast", "--json"))
-    samples = read_session(tmp_path / session["path"]).samples[1000:121_000]
     assert np.abs(samples["torque_command_nm"]).max() < 0.9
-    spectrum = np.abs(np.fft.rfft(samples["coupling_torque_nm"]))
+    spectrum = np.abs(np.fft.rfft(samples["coupling_torque_nm"][1000:121_000]))
     frequency_hz = np.fft.rfftfreq(120_000, 1e-3)
     noise = np.median(spectrum[frequency_hz > 100])
     for mode_hz in (2.57, 16.05, 44.5):
         assert spectrum[np.abs(frequency_hz - mode_hz) < 0.5].max() > 20 * noise
-
-
-def test_the_same_seed_gives_equal_data_and_another_does_not(rigd, tmp_path):
-    paths = [
-        tmp_path
-        / the_session(rigd("run", "chirp", "--fast", "--json", "--seed", seed, *SHORT))["path"]
-        for seed in (5, 5, 6)
-    ]
-    first, again, other = (read_session(path).samples for path in paths)
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
 
 
 @pytest.mark.parametrize(
@@ -104,31 +87,32 @@ def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
 
 
 def test_a_series_is_reproduced_by_its_seed_and_its_sessions_differ(rigd, tmp_path):
-    series = []
-    for _ in range(2):
-        done = rigd("run", "chirp", "--fast", "--json", "--repeat", "2", "--note", "twice", *SHORT)
-        sessions = json.loads(done.stdout)["sessions"]
-        series.append([read_session(tmp_path / session["path"]) for session in sessions])
-    for records in series:
-        assert [record.metadata["series"] for record in records] == ["1 of 2", "2 of 2"]
-        assert {record.metadata["note"] for record in records} == {"twice"}
-        assert {record.metadata["simulation_seed"] for record in records} == {"1"}
-        assert not np.array_equal(records[0].samples, records[1].samples)
-    for first, again in zip(*series, strict=True):
-        assert np.array_equal(first.samples, again.samples)
+    def series(seed, repeat):
+        options = ("--seed", seed, "--repeat", repeat, "--note", "a series", *SHORT)
+        sessions = json.loads(rigd("run", "chirp", "--fast", "--json", *options).stdout)["sessions"]
+        return [read_session(tmp_path / session["path"]) for session in sessions]
+
+    records, again, (other,) = series(5, 2), series(5, 2), series(6, 1)
+    assert [record.metadata["series"] for record in records] == ["1 of 2", "2 of 2"]
+    assert {record.metadata["note"] for record in records} == {"a series"}
+    assert {record.metadata["simulation_seed"] for record in records} == {"5"}
+    assert not np.array_equal(records[0].samples, records[1].samples)
+    assert not np.array_equal(records[0].samples, other.samples)
+    for first, second in zip(records, again, strict=True):
+        assert np.array_equal(first.samples, second.samples)
 
 
-def test_real_time_keeps_its_books(rigd, tmp_path):
-    session = the_session(
-        rigd("run", "chirp", "--json", "--duration", "3", "--rest", "0.5", "--ring-down", "0.5")
-    )
-    assert session["scheduled"] == 4000
+def test_real_time_keeps_its_books(rigd, patient, tmp_path):
+    lengths = ("--duration", "1", "--rest", "0.5", "--ring-down", "0.5")
+    session = the_session(rigd("run", "chirp", "--json", "--profile", patient, *lengths))
+    assert session["scheduled"] == 2000
     assert session["lost"] == 0
-    assert session["recorded"] + session["missed"] == 4000
+    assert session["recorded"] + session["missed"] == 2000
     record = read_session(tmp_path / session["path"])
     assert len(record.samples) == session["recorded"]
-    rate_hz = float(record.outcome["true_rate_hz"])
-    assert rate_hz == pytest.approx(1000 * session["recorded"] / 4000, rel=0.01)
+    began_s = 1e-9 * (record.samples["t_ns"] + record.samples["lateness_ns"].astype(int))
+    rate_hz = (len(began_s) - 1) / (began_s[-1] - began_s[0])
+    assert float(record.outcome["true_rate_hz"]) == pytest.approx(rate_hz, rel=0.01)
     assert record.metadata["realtime_clock"] == "real"
     late = record.samples["status"] & Status.LATE
     assert np.count_nonzero(late) == session["late"]
@@ -143,54 +127,82 @@ def to_one(process, number):
     process.send_signal(number)
 
 
+def recorded(folder, size=50_000):
+    """Wait until a session is being recorded in a folder; return its file."""
+
+    def grown():
+        for part in folder.glob("sessions/*.part"):
+            with contextlib.suppress(FileNotFoundError):
+                if part.stat().st_size > size:
+                    return part
+        return None
+
+    return wait_for(grown)
+
+
 @pytest.mark.parametrize("send", [to_all, to_one])
-@pytest.mark.parametrize(
-    "interrupt",
-    [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP],
-)
 def test_every_stop_leaves_the_torque_off_and_a_complete_file(
-    start_rigd, tmp_path, interrupt, send
+    start_rigd, write_profile, tmp_path, send
 ):
-    process = start_rigd("run", "chirp", "--json", "--duration", "60")
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    wait_for(lambda: part.stat().st_size > 50_000)
+    interrupts = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+    running = {}
+    for name in interrupts:  # all at once: what takes time is waiting
+        (tmp_path / name).mkdir()
+        values = {"name": f'"{name}"', "realtime.priority": "0"}
+        profile = write_profile("sim", values, patient=True)
+        options = ("--json", "--duration", "60", "--profile", profile)
+        running[name] = start_rigd("run", "chirp", *options, folder=tmp_path / name)
+    for name in interrupts:
+        recorded(tmp_path / name)
     for _ in range(3):  # an impatient operator presses again
-        send(process, interrupt)
+        for name, process in running.items():
+            send(process, signal.Signals[name])
         time.sleep(0.05)
-    output, errors = process.communicate(timeout=20)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in errors
-    (session,) = json.loads(output)["sessions"]
-    assert session["outcome"] == "stopped"
-    assert session["scheduled"] == session["recorded"] + session["missed"]
-    record = read_session(tmp_path / session["path"])
-    assert record.outcome["outcome"] == "stopped"
-    last = record.samples[-1]
-    assert last["torque_command_nm"] == 0.0
-    assert last["status"] & Status.TORQUE_OFF
-    assert not list(tmp_path.glob("sessions/*.part"))
+    for name, process in running.items():
+        folder = tmp_path / name
+        output, errors = process.communicate(timeout=60)
+        assert process.returncode == 130, errors
+        assert "Traceback" not in errors
+        (session,) = json.loads(output)["sessions"]
+        assert session["outcome"] == "stopped"
+        assert session["scheduled"] == session["recorded"] + session["missed"]
+        record = read_session(folder / session["path"])
+        assert record.outcome["outcome"] == "stopped"
+        last = record.samples[-1]
+        assert last["torque_command_nm"] == 0.0
+        assert last["status"] & Status.TORQUE_OFF
+        assert not list(folder.glob("sessions/*.part"))
 
 
-@pytest.mark.parametrize("after_s", [0.1, 0.2, 0.3, 0.45, 0.7])
-def test_a_stop_before_the_record_leaves_no_file(start_rigd, tmp_path, after_s):
-    process = start_rigd("run", "chirp", "--json")
-    time.sleep(after_s)
-    to_all(process, signal.SIGINT)
-    output, errors = process.communicate(timeout=20)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in errors
-    assert not list(tmp_path.glob("sessions/*"))
-    if output:  # it had come as far as to have something to say
-        for session in json.loads(output)["sessions"]:
-            assert session["path"] is None
-            assert session["scheduled"] == 0
+def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_path):
+    running = []
+    for number in range(5):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        values = {"name": f'"{number}"', "session.tare_s": "60"}
+        profile = write_profile("sim", values, patient=True)
+        running.append(
+            (folder, start_rigd("run", "chirp", "--json", "--profile", profile, folder=folder))
+        )
+    for _, process in running:  # each in another part of its start
+        time.sleep(0.3)
+        to_all(process, signal.SIGINT)
+    for folder, process in running:
+        output, errors = process.communicate(timeout=60)
+        assert process.returncode == 130, errors
+        assert "Traceback" not in errors
+        assert not list(folder.glob("sessions/*"))
+        if output:  # it had come as far as to have something to say
+            for session in json.loads(output)["sessions"]:
+                assert session["path"] is None
+                assert session["scheduled"] == 0
 
 
 def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--fast", "--repeat", "50", *SHORT)
     wait_for(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
     to_all(process, signal.SIGINT)
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     sessions = json.loads(output)["sessions"]
@@ -201,13 +213,12 @@ def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
         read_session(tmp_path / path)
 
 
-def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, tmp_path):
-    process = start_rigd("run", "chirp", "--json", "--duration", "60")
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    wait_for(lambda: part.stat().st_size > 50_000)
+def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, tmp_path):
+    process = start_rigd("run", "chirp", "--json", "--duration", "60", "--profile", patient)
+    recorded(tmp_path)
     os.kill(child_of(process.pid, "rigd.engine.control"), signal.SIGSTOP)
     to_one(process, signal.SIGINT)
-    output, errors = process.communicate(timeout=30)
+    output, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
     (session,) = json.loads(output)["sessions"]
     assert session["outcome"] == "fault"
@@ -216,11 +227,11 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, tmp_path):
     assert len(record.samples) == session["recorded"]
 
 
-def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, tmp_path):
-    process = start_rigd("run", "hold", "--duration", "2")
+def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
+    process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
     part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
     part.with_suffix("").write_text("somebody else's")
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "Traceback" not in errors
     assert "not overwritten" in errors
@@ -231,12 +242,11 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, tmp_path):
 @pytest.mark.parametrize(
     ("victim", "words"), [("rigd.engine.control", "control process"), ("rigd.engine.recorder", "")]
 )
-def test_a_killed_process_ends_the_session_safely(start_rigd, tmp_path, victim, words):
-    process = start_rigd("run", "chirp", "--duration", "60")
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    wait_for(lambda: part.stat().st_size > 100_000)
+def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path, victim, words):
+    process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
+    recorded(tmp_path)
     os.kill(child_of(process.pid, victim), signal.SIGKILL)
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=60)
     assert process.returncode == 1, (output, errors)
     assert "Traceback" not in errors
     if victim == "rigd.engine.control":
@@ -247,38 +257,29 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, tmp_path, victim, 
         counts = {name: int(record.outcome[name]) for name in ("scheduled", "missed", "lost")}
         assert counts["scheduled"] == len(record.samples) + counts["missed"] + counts["lost"]
     else:
-        assert part.exists()
+        assert list(tmp_path.glob("sessions/*.part"))
         assert "recorder process was killed" in output + errors
 
 
-def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, tmp_path):
-    process = start_rigd("run", "hold", "--json", "--duration", "1", "--repeat", "3")
+def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, tmp_path):
+    options = ("--json", "--duration", "2", "--rest", "0", "--repeat", "30", "--profile", patient)
+    process = start_rigd("run", "hold", *options)
     wait_for(lambda: list(tmp_path.glob("sessions/*-01.mcap")))
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*-02.mcap.part"), None))
-    wait_for(lambda: part.stat().st_size > 1000)
+    recorded(tmp_path, 1000)
     os.kill(child_of(process.pid, "rigd.engine.recorder"), signal.SIGKILL)
-    output, errors = process.communicate(timeout=30)
+    output, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    (session,) = json.loads(output)["sessions"]
-    assert session["outcome"] == "complete"
-    assert str(part.name) in errors
+    (part,) = tmp_path.glob("sessions/*.part")
+    sessions = json.loads(output)["sessions"]
+    # Usually one, but this test may have stood still.
+    assert len(sessions) == int(part.name.split(".")[0].rsplit("-")[-1]) - 1 >= 1
+    assert {session["outcome"] for session in sessions} == {"complete"}
+    assert part.name in errors
 
 
-def test_a_long_record_starts_without_a_gap(start_rigd, tmp_path):
-    process = start_rigd("run", "hold", "--duration", "3600", "--rest", "0")
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    wait_for(lambda: part.stat().st_size > 30_000)
-    to_one(process, signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 130, errors
-    (path,) = tmp_path.glob("sessions/*.mcap")
-    assert read_session(path).samples["tick"][0] <= 2
-
-
-def test_a_dead_supervisor_ends_the_session_safely(start_rigd, tmp_path):
-    process = start_rigd("run", "chirp", "--duration", "60")
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
-    wait_for(lambda: part.stat().st_size > 100_000)
+def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path):
+    process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
+    recorded(tmp_path)
     control = child_of(process.pid, "rigd.engine.control")
     process.kill()
     process.wait()
@@ -291,7 +292,7 @@ def test_a_dead_supervisor_ends_the_session_safely(start_rigd, tmp_path):
     wait_for(lambda: not Path(f"/proc/{control}").exists() or zombie(control))
 
 
-def wait_for(condition, timeout_s=20.0):
+def wait_for(condition, timeout_s=60.0):
     deadline = time.monotonic() + timeout_s
     while not (found := condition()):
         assert time.monotonic() < deadline, "it did not happen in time"

@@ -1,6 +1,13 @@
 """What an operator can get wrong: one or two sentences, an exit code, nothing broken."""
 
+import contextlib
+from dataclasses import dataclass
+
 import pytest
+from typer.testing import CliRunner
+
+from rigd.cli.app import app
+from rigd.engine.signals import StopRequest
 
 PROFILE_CHANGES = {
     "missing key": ("viscous_nm_s_per_rad = ", "# viscous_nm_s_per_rad = ", "viscous_nm_s_per_rad"),
@@ -25,6 +32,31 @@ PROFILE_CHANGES = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def rigd_here(tmp_path, monkeypatch):
+    """Run `rigd` in this process, as far as it comes without any other."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    no_crew = StopRequest(), contextlib.nullcontext()
+    for command in ("run", "identify"):
+        monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
+    monkeypatch.setattr("rigd.engine.signals.ignore", lambda **_: None)  # of the test runner
+
+    def run(*arguments):
+        done = CliRunner().invoke(app, list(map(str, arguments)))
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return Done(done.exit_code, done.stdout, done.stderr)
+
+    return run
+
+
 def assert_refused(done, code, *words):
     text = done.stdout + done.stderr
     assert done.returncode == code, text
@@ -35,14 +67,14 @@ def assert_refused(done, code, *words):
 
 
 @pytest.mark.parametrize("change", PROFILE_CHANGES.values(), ids=PROFILE_CHANGES.keys())
-def test_a_bad_profile_is_refused(rigd, tmp_path, change):
+def test_a_bad_profile_is_refused(rigd_here, tmp_path, change):
     from rigd.profile import load_profile
 
     old, new, word = change
     text = load_profile("sim").text
     assert old in text
     (tmp_path / "bad.toml").write_text(text.replace(old, new, 1))
-    done = rigd("run", "chirp", "--fast", "--profile", "bad.toml")
+    done = rigd_here("run", "chirp", "--fast", "--profile", "bad.toml")
     assert_refused(done, 2, word)
     assert not (tmp_path / "sessions").exists()
 
@@ -67,9 +99,9 @@ def test_a_bad_profile_is_refused(rigd, tmp_path, change):
         (("--note", "two\nlines"), ("--note",)),
     ],
 )
-def test_an_absurd_option_is_refused(rigd, tmp_path, arguments, words):
+def test_an_absurd_option_is_refused(rigd_here, tmp_path, arguments, words):
     (tmp_path / "taken").write_text("a file")
-    assert_refused(rigd("run", "chirp", "--fast", *arguments), 2, *words)
+    assert_refused(rigd_here("run", "chirp", "--fast", *arguments), 2, *words)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["taken"]
 
 
@@ -79,8 +111,8 @@ def test_ten_times_the_amplitude_is_refused_before_anything_moves_unless_forced(
     assert not (tmp_path / "sessions").exists()
 
 
-def test_what_a_limit_forbids_cannot_be_forced(rigd, tmp_path):
-    done = rigd("run", "chirp", "--fast", "--force", "--amplitude", "3", "--stop-hz", "1")
+def test_what_a_limit_forbids_cannot_be_forced(rigd_here, tmp_path):
+    done = rigd_here("run", "chirp", "--fast", "--force", "--amplitude", "3", "--stop-hz", "1")
     assert_refused(done, 2, "angle", "limits.angle_rad")
     assert not (tmp_path / "sessions").exists()
 
@@ -88,15 +120,15 @@ def test_what_a_limit_forbids_cannot_be_forced(rigd, tmp_path):
 @pytest.mark.parametrize(
     "content", [None, b"", b"time,angle\n", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" * 2]
 )
-def test_info_on_what_is_no_session_file(rigd, tmp_path, content):
+def test_info_on_what_is_no_session_file(rigd_here, tmp_path, content):
     path = tmp_path / "broken.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert_refused(rigd("info", path), 1, "broken.mcap")
+    assert_refused(rigd_here("info", path), 1, "broken.mcap")
     if content is not None:
         assert path.read_bytes() == content
 
 
-def test_a_plain_word_in_the_wrong_place_is_explained(rigd, tmp_path):
+def test_a_plain_word_in_the_wrong_place_is_explained(rigd_here, tmp_path):
     (tmp_path / "reference.csv").write_text("time_s;angle_rad\n0;0\n1;0.1\n")
-    assert_refused(rigd("run", "file", "reference.csv", "--fast"), 2, "semicolons", "commas")
+    assert_refused(rigd_here("run", "file", "reference.csv", "--fast"), 2, "semicolons", "commas")

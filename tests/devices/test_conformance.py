@@ -24,52 +24,31 @@ def connect(devices):
     devices.sensor.connect()
 
 
-def test_readings_are_finite_fresh_and_complete(devices):
+def test_until_it_is_enabled_the_rig_is_read_and_nothing_moves(devices):
     connect(devices)
-    angles, wrenches = run(devices, 0, 200)
+    assert json.loads(json.dumps(devices.sensor.calibration()))
+    angles, wrenches = run(devices, 0, 300, torque_nm=0.3)
     assert all(isfinite(angle) for angle in angles)
     assert all(len(wrench) == 6 and all(map(isfinite, wrench)) for wrench in wrenches)
     assert not devices.drive.angle_stale
     assert not devices.sensor.wrench_stale
     assert not devices.sensor.wrench_saturated
-
-
-def test_the_calibration_can_be_written_to_the_file(devices):
-    connect(devices)
-    assert json.loads(json.dumps(devices.sensor.calibration()))
-
-
-def test_without_enabling_no_command_moves_the_motor(devices):
-    connect(devices)
-    angles, _ = run(devices, 0, 300, torque_nm=0.3)
     assert max(angles) - min(angles) < 1e-3
 
 
-def test_positive_torque_turns_towards_positive_angles(devices):
-    connect(devices)
-    run(devices, 0, 10)
-    devices.drive.enable()
-    angles, _ = run(devices, 10, 60, torque_nm=0.2)
-    assert angles[-1] > angles[0] + 1e-3
-
-
-def test_enabling_alone_exerts_no_torque(devices):
+def test_torque_is_what_was_commanded_from_enabling_to_disabling(devices):
     connect(devices)
     devices.drive.enable()
     angles, _ = run(devices, 0, 300)
     assert max(angles) - min(angles) < 1e-3
-
-
-def test_disabling_ends_the_torque_whatever_was_commanded(devices):
-    connect(devices)
-    devices.drive.enable()
-    run(devices, 0, 30, torque_nm=0.3)
+    angles, _ = run(devices, 300, 60, torque_nm=0.3)
+    assert angles[-1] > angles[0] + 1e-3  # positive turns towards positive
     devices.drive.disable()
     devices.drive.disable()
     speeds = []
-    last = run(devices, 30, 1, torque_nm=0.3)[0][0]
+    last = run(devices, 360, 1, torque_nm=0.3)[0][0]
     for block in range(20):
-        angles, _ = run(devices, 31 + 100 * block, 100, torque_nm=0.3)
+        angles, _ = run(devices, 361 + 100 * block, 100, torque_nm=0.3)
         speeds.append(abs(angles[-1] - last))
         last = angles[-1]
     assert speeds[-1] < 0.2 * max(speeds)

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.devices.contracts import DeviceError
 from rigd.engine.board import Phase, Word
-from rigd.engine.clocks import VirtualClock
+from rigd.engine.clocks import SuspendWatch, VirtualClock
 from rigd.engine.jobs import SessionJob
 from rigd.excitation import hold, step
 from rigd.session.format import Status
@@ -171,6 +171,27 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
     assert 2900 < len(samples) < 3300
     assert samples["status"][-1] & Status.TORQUE_OFF
     assert samples["torque_command_nm"][-1] == 0.0
+
+
+def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
+    boot_ns = [0]
+    watch = SuspendWatch(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
+    monkeypatch.setattr("rigd.engine.procedure.SuspendWatch", lambda: watch)
+    session = make_session(clock=FakeRealClock())
+
+    read_angle = session.drive.read_angle
+
+    def suspended():
+        if session.board[Word.SCHEDULED] == 1000:
+            boot_ns[0] = 90_000_000_000
+        return read_angle()
+
+    session.drive.read_angle = suspended
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert "suspended for 90.0 s" in session.finished["reason"]
+    assert 1000 < len(session.samples) <= 1066
 
 
 def test_the_board_shows_what_is_read_and_that_somebody_reads(make_session):

@@ -5,7 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine.clocks import RealClock, VirtualClock
+from rigd.engine.clocks import SUSPENDED_S, RealClock, SuspendWatch, VirtualClock
 from rigd.engine.metronome import Metronome
 
 
@@ -87,3 +87,42 @@ def test_spinning_ends_the_wait_at_the_deadline_and_not_before():
         deadline_ns = clock.now_ns() + 1_000_000
         assert clock.wait_until(deadline_ns) >= 0
         assert clock.now_ns() >= deadline_ns
+
+
+class SuspendableComputer:
+    """Two clocks of a computer; each reading takes its time, and a suspend stops one of them."""
+
+    def __init__(self, steps_ns=()):
+        self._steps_ns = iter(steps_ns)
+        self.now_ns = 10**12
+        self.suspended_ns = 0
+
+    def monotonic_ns(self):
+        self.now_ns += next(self._steps_ns, 100)
+        return self.now_ns
+
+    def boot_ns(self):
+        return self.monotonic_ns() + self.suspended_ns + 7 * 10**9
+
+    def watch(self):
+        return SuspendWatch(self.monotonic_ns, self.boot_ns)
+
+
+@given(
+    st.lists(st.integers(0, 10**9), min_size=4, max_size=4), st.integers(0, 10**13), st.booleans()
+)
+def test_a_suspend_shows_and_a_delay_between_two_readings_does_not(steps_ns, suspended_ns, delayed):
+    computer = SuspendableComputer(steps_ns if delayed else ())
+    watch = computer.watch()
+    assert watch.suspended_s() == 0.0
+    computer.suspended_ns = suspended_ns
+    told_s = watch.suspended_s()
+    assert told_s <= suspended_ns * 1e-9
+    if not delayed:
+        assert told_s >= suspended_ns * 1e-9 - 1e-6
+
+
+def test_this_computer_was_not_suspended_meanwhile():
+    watch = SuspendWatch()
+    time.sleep(0.01)
+    assert watch.suspended_s() < SUSPENDED_S

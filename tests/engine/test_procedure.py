@@ -1,5 +1,6 @@
 """A session from rest to rest, and every way out of it: the torque is off, the books balance."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -277,6 +278,38 @@ def test_missed_ticks_are_skipped_flagged_and_counted(make_session):
     assert after.tolist() == [gap + 1]
     assert samples["lateness_ns"][gap + 1] == 200_000
     assert np.flatnonzero(samples["status"] & Status.LATE).size == 1
+
+
+class WorkingClock(VirtualClock):
+    """A clock that goes on while this thread works, but not while the machine stands still."""
+
+    virtual = False
+
+    def __init__(self, end_ns, at_end):
+        super().__init__()
+        self._since_ns = time.thread_time_ns()
+        self._end_ns = end_ns
+        self._at_end = at_end
+
+    def now_ns(self):
+        return self._now_ns + time.thread_time_ns() - self._since_ns
+
+    def wait_until(self, deadline_ns):
+        if deadline_ns > self._end_ns:
+            self._at_end()
+        late_ns = max(0, self.now_ns() - deadline_ns)
+        self._now_ns = deadline_ns + late_ns
+        self._since_ns = time.thread_time_ns()
+        return late_ns
+
+
+def test_a_long_record_starts_without_a_gap(make_session):
+    rate_hz = make_session().profile.rig.rate_hz
+    session = make_session(excitation=hold(rate_hz=rate_hz, duration_s=3600.0, rest_s=0.0))
+    session.clock = WorkingClock(3_000_000_000, session.stop.request)
+    session.run()
+    assert session.finished["finished"] == "stopped"
+    assert session.samples["tick"][0] <= 2
 
 
 def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):

@@ -1,31 +1,57 @@
 """Real-time settings: tried one by one, and reported as granted or refused."""
 
+import json
 import os
+import resource
+import struct
 import subprocess
 import sys
 
+import pytest
+
+from rigd.engine.realtime import WAKE_UP_US, _lock_memory, cores_of, isolated_cores, page_faults
+
 CODE = """
-import json, os
+import json, os, resource, sys
+from pathlib import Path
 from rigd.engine.realtime import obtain
-obtained = obtain(priority={priority}, cpu={cpu})
+{before}
+obtained = obtain(priority={priority}, cpu={cpu}, root=Path({root!r}))
 print(json.dumps([obtained, sorted(os.sched_getaffinity(0)), os.sched_getscheduler(0)]))
+"""
+NO_RIGHTS = """
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (4096, 4096))
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.geteuid() == 0:
+    os.setuid(65534)
 """
 
 
-def obtained_by_a_process(**settings):
-    import json
-
-    done = subprocess.run(
-        [sys.executable, "-c", CODE.format(**settings)], capture_output=True, check=True
-    )
+def obtained_by_a_process(*, priority=0, cpu=-1, root="/", before=""):
+    code = CODE.format(priority=priority, cpu=cpu, root=str(root), before=before)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     return json.loads(done.stdout)
 
 
+@pytest.fixture
+def machine(tmp_path):
+    """A file system that says what the test wants of the computer."""
+
+    def write(path, text):
+        file = tmp_path / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+        return tmp_path
+
+    return write
+
+
 def test_what_is_reported_is_what_was_obtained():
-    report, affinity, policy = obtained_by_a_process(priority=10, cpu=-1)
+    report, affinity, policy = obtained_by_a_process(priority=10)
     assert report["garbage_collector"] == "off"
-    assert affinity == [max(os.sched_getaffinity(0))]
-    assert report["cpu"] == str(affinity[0])
+    if not isolated_cores():
+        assert affinity == [max(os.sched_getaffinity(0))]
+    assert report["cpu"].split(",")[0] == str(affinity[0])
     if policy == os.SCHED_FIFO:
         assert report["scheduling"] == "SCHED_FIFO 10"
     else:
@@ -33,8 +59,89 @@ def test_what_is_reported_is_what_was_obtained():
 
 
 def test_a_core_that_does_not_exist_is_refused_and_the_rest_is_tried():
-    report, affinity, _ = obtained_by_a_process(priority=0, cpu=4000)
+    report, affinity, _ = obtained_by_a_process(cpu=4000)
     assert report["cpu"].startswith("refused: ")
     assert set(affinity) == os.sched_getaffinity(0)
     assert "scheduling" not in report
     assert "memory" in report
+
+
+def test_without_rights_each_refusal_is_told_and_the_rest_is_done():
+    report, affinity, policy = obtained_by_a_process(priority=80, before=NO_RIGHTS)
+    assert policy == os.SCHED_OTHER
+    assert report["scheduling"].startswith("refused: ")
+    assert report["memory"].startswith("refused: ")
+    assert (report["garbage_collector"], report["timer_slack"]) == ("off", "1 ns")
+    assert len(affinity) == 1
+
+
+class Libc:
+    """Grants everything and notes what it was asked for."""
+
+    flags = 0
+
+    def mlockall(self, flags):
+        self.flags = flags
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("limit", "flags", "report"),
+    [(resource.RLIM_INFINITY, 3, "locked"), (200_000_000, 1, "limit of 200 MB")],
+)
+def test_memory_under_a_limit_is_not_locked_for_the_future(monkeypatch, limit, flags, report):
+    # Otherwise an allocation beyond the limit would fail in mid-session.
+    monkeypatch.setattr("rigd.engine.realtime.resource.getrlimit", lambda _: (limit, limit))
+    monkeypatch.setattr("rigd.engine.realtime.os.geteuid", lambda: 1000)
+    libc = Libc()
+    assert report in _lock_memory(libc)
+    assert libc.flags == flags
+
+
+def test_an_isolated_core_is_preferred(machine):
+    first = min(os.sched_getaffinity(0))
+    root = machine("sys/devices/system/cpu/isolated", f"{first}\n")
+    report, affinity, _ = obtained_by_a_process(root=root)
+    assert report["cpu"] == f"{first}, isolated"
+    assert affinity == [first]
+
+
+def test_an_isolated_core_that_may_not_be_used_is_left(machine):
+    root = machine("sys/devices/system/cpu/isolated", "4000\n")
+    report, affinity, _ = obtained_by_a_process(root=root)
+    assert report["cpu"] == str(max(os.sched_getaffinity(0)))
+    assert affinity == [max(os.sched_getaffinity(0))]
+
+
+def test_deep_idle_states_are_kept_away(machine):
+    machine("sys/devices/system/cpu/cpu0/cpuidle/state0/latency", "0\n")
+    root = machine("sys/devices/system/cpu/cpu0/cpuidle/state1/latency", "133\n")
+    assert obtained_by_a_process(root=root)[0]["idle_states"].startswith("refused: ")
+    bound = machine("dev/cpu_dma_latency", "") / "dev/cpu_dma_latency"
+    assert "left within" in obtained_by_a_process(root=root)[0]["idle_states"]
+    assert struct.unpack("=i", bound.read_bytes()) == (WAKE_UP_US,)
+
+
+def test_where_no_idle_state_is_deep_none_is_bounded(machine):
+    root = machine("sys/devices/system/cpu/cpu0/cpuidle/state0/latency", "1\n")
+    assert "refused" not in obtained_by_a_process(root=root)[0]["idle_states"]
+
+
+@pytest.mark.parametrize(
+    ("text", "cores"),
+    [("\n", set()), ("3\n", {3}), ("0-2,5", {0, 1, 2, 5}), ("2-3,6-7", {2, 3, 6, 7})],
+)
+def test_lists_of_cores_are_read_as_the_kernel_writes_them(text, cores):
+    assert cores_of(text) == cores
+
+
+def test_a_list_that_cannot_be_read_isolates_nothing(machine, tmp_path):
+    assert isolated_cores(tmp_path) == frozenset()
+    assert isolated_cores(machine("sys/devices/system/cpu/isolated", "(null)")) == frozenset()
+
+
+def test_touching_new_memory_is_counted():
+    before = page_faults()
+    block = bytearray(64 << 20)
+    block[:: 1 << 12] = bytes(len(block) >> 12)
+    assert page_faults() > before

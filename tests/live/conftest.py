@@ -109,7 +109,7 @@ class Publisher:
     def end(self) -> tuple[int, str, str]:
         """Close its input; return its exit code and what else it wrote."""
         self.process.stdin.close()
-        self.process.wait(10.0)
+        self.process.wait(60.0)
         return (
             self.process.returncode,
             self.process.stdout.read().decode(),
@@ -125,7 +125,7 @@ class Publisher:
         os.close(self.board.fd)
 
     def _first_line(self) -> bytes:
-        ready, _, _ = select.select([self.process.stdout], [], [], 30.0)
+        ready, _, _ = select.select([self.process.stdout], [], [], 60.0)
         assert ready, "the publisher does not answer"
         return self.process.stdout.readline()
 
@@ -168,7 +168,7 @@ def send_job():
 def eventually():
     """Whether a condition comes true; the limit only ends a test that fails."""
 
-    def wait(condition, within_s: float = 15.0) -> bool:
+    def wait(condition, within_s: float = 60.0) -> bool:
         deadline = time.monotonic() + within_s
         while not (met := condition()) and time.monotonic() < deadline:
             time.sleep(0.02)

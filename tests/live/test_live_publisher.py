@@ -16,9 +16,6 @@ from rigd.engine.board import Board
 from rigd.engine.ring import shared_memory_fd
 from rigd.live.job import LiveJob
 
-# Sessions in real time share a core: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 LISTENING = "0A"
 
@@ -44,23 +41,25 @@ def sockets(pid: int) -> list[tuple[str, str, str]]:
 
 def page(publisher) -> str:
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    with opener.open(publisher.answer["url"], timeout=5.0) as response:
+    with opener.open(publisher.answer["url"], timeout=30.0) as response:
         return response.read().decode()
 
 
 def accepts(port: int) -> bool:
     try:
-        socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+        socket.create_connection(("127.0.0.1", port), timeout=30.0).close()
     except OSError:
         return False
     return True
 
 
 def settled(path: Path) -> bool:
-    """Whether a file has stopped growing."""
-    size = path.stat().st_size
-    time.sleep(0.5)
-    return path.stat().st_size == size
+    """Whether a file has stopped growing: looked at often, as a sleep may be one of the machine."""
+    sizes = []
+    for _ in range(8):
+        sizes.append(path.stat().st_size)
+        time.sleep(0.1)
+    return len(set(sizes)) == 1
 
 
 def receive(rerun_program, publisher, producer, path: Path, enough_bytes: int, eventually):
@@ -80,7 +79,7 @@ def receive(rerun_program, publisher, producer, path: Path, enough_bytes: int, e
         assert eventually(lambda: settled(path))
         # It completes the file when the server goes away.
         publisher.end()
-        assert saver.wait(10.0) == 0
+        assert saver.wait(60.0) == 0
     finally:
         saver.kill()
         saver.wait()
@@ -146,12 +145,12 @@ def test_ends_with_its_input_and_takes_the_server_along(publisher, gone):
 
 
 def test_stays_open_for_as_long_as_asked(start_publisher):
-    publisher = start_publisher(linger_s=1.5)
+    publisher = start_publisher(linger_s=2.5)
     publisher.process.stdin.close()
     with pytest.raises(subprocess.TimeoutExpired):
-        publisher.process.wait(0.5)
+        publisher.process.wait(0.2)
     assert page(publisher)
-    assert publisher.process.wait(10.0) == 0
+    assert publisher.process.wait(60.0) == 0
 
 
 def test_interrupt_is_the_supervisors_business(publisher, gone):

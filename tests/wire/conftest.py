@@ -6,14 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from rigd.engine.board import Phase
+from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
 from rigd.excitation import chirp
 from rigd.profile import load_profile
+from rigd.sim.wire.simulate import inject
 from rigd.supervisor.orders import Order
 from rigd.supervisor.rig import Rig
-from rigd.supervisor.session import SessionResult
-
-HW_PROFILES = Path(__file__).parents[2] / "hw_profiles"
+from rigd.supervisor.session import SessionProgress, SessionResult
 
 
 @dataclass(frozen=True)
@@ -36,31 +37,31 @@ class DriveLog:
 
 
 @pytest.fixture
-def quiet_profile(tmp_path):
+def quiet_profile(write_profile):
     """A shipped profile whose simulated sensor has no noise, as a file; more can be changed."""
 
-    def make(name: str, *changes: tuple[str, str]) -> Path:
-        text = (HW_PROFILES / f"{name}.toml").read_text("utf-8")
-        quiet = (
-            ("torque_noise_nm = { value = 5.0e-3", "torque_noise_nm = { value = 0.0"),
-            ("force_noise_n = { value = 2.0e-2", "force_noise_n = { value = 0.0"),
-        )
-        for old, new in (*quiet, *changes):
-            assert old in text, old
-            text = text.replace(old, new, 1)
-        path = tmp_path / f"{name}.toml"
-        path.write_text(text, encoding="utf-8")
-        return path
+    def make(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
+        quiet = {"simulation.torque_noise_nm": "0.0", "simulation.force_noise_n": "0.0"}
+        return write_profile(name, quiet | (values or {}), patient=patient)
 
     return make
 
 
 @pytest.fixture
 def run_order(tmp_path):
-    """Run a short chirp on a profile, without the command line."""
+    """Run a short chirp on a profile, without the command line.
 
-    def run(profile, name: str, *, fast: bool, **options) -> SessionResult:
-        settings = {"duration_s": 4.0, "rest_s": 0.3, "ring_down_s": 0.5, "stop_hz": 20.0}
+    A fault is injected in the middle of the record, however long the start takes.
+    """
+
+    def run(profile, name: str, *, fast: bool, fault: str = "", **options) -> SessionResult:
+        def watch(progress: SessionProgress, _: list[Event]) -> None:
+            nonlocal fault
+            if fault and progress.phase == Phase.RUNNING and progress.tick > 200:
+                inject(profile.name, [fault])
+                fault = ""
+
+        settings = {"duration_s": 2.0, "rest_s": 0.3, "ring_down_s": 0.5, "stop_hz": 20.0}
         excitation = chirp(rate_hz=profile.rig.rate_hz, **(settings | options))
         order = Order(
             profile=profile,
@@ -70,7 +71,7 @@ def run_order(tmp_path):
         rig = Rig(profile, fast=fast)
         try:
             rig.connect()
-            return rig.run(order, StopRequest(), lambda *_: None)
+            return rig.run(order, StopRequest(), watch)
         finally:
             rig.disconnect()
 

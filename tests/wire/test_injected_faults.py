@@ -9,31 +9,33 @@ import pytest
 
 from rigd.session import Status, read_session
 
-# Sessions of several processes share a core: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
-AT_S = 1.0  # after the drive was enabled: in the middle of the chirp
-SHORT = {"duration_s": 2.0, "rest_s": 0.1, "ring_down_s": 0.1}
+# Fast from the beginning, so that every fault is met while the motor moves.
+CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}
+# For a reply that does not come a tick in lock-step waits half a second: where ten of them are what
+# another row shows as well, three have to do.
+STALE = 3
 
 FATAL, BORNE = "## Faults that end a session", "## Faults that a session bears"
 MESSAGES = {
     "angle lost": r"angle.*10 ticks",
     "wrench lost": r"wrench.*10 ticks",
-    "half of each wrench lost": r"wrench.*10 ticks",
-    "drive silent": r"angle.*10 ticks",
-    "sensor silent": r"wrench.*10 ticks",
+    "half of each wrench lost": rf"wrench.*{STALE} ticks",
+    "drive silent": rf"angle.*{STALE} ticks",
+    "sensor silent": rf"wrench.*{STALE} ticks",
     "emergency message": r"Drive .*0x2310",
+    "wired stop dropped": r"Drive .*wired stop \(STO\) was dropped.*switch-on disabled",
+    "controller off the bus": r"CAN bus .*bus-off",
     "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
-    "encoder jumps": r"speed|tracking error",
+    "encoder jumps": r"encoder's jump of .* rad exceeds",
     "statusword corrupted": r"Drive .*statusword",
     "sensor reports an error": r"Sensor .*0x8040.*calibration",
     "gauge at its end": r"sensor's f. of .* N exceeds its limit",
-    "bus cut": r"CAN bus .*(cut off|takes no more frames)",
-    "loop's frames lost": r"10 ticks",
+    "bus cut": r"CAN bus .*(cut off|takes no more frames|cannot be read)",
+    "loop's frames lost": rf"{STALE} ticks",
     "loop's heartbeat lost": r"Drive .*0x8130",
     "torque commands lost": r"Drive .*exerts .* commanded, for 10 ticks",
     "serial line cut": r"Sensor ATI Digital F/T on /dev/pts",
-    "stream silent": r"wrench.*10 ticks",
+    "stream silent": rf"wrench.*{STALE} ticks",
     "stream reports an error": r"Sensor ATI Digital F/T .*error",
 }
 
@@ -60,7 +62,7 @@ def rows(heading):
     return [Row(c[0], c[1].strip("`"), c[2], int(c[3]), c[4]) for c in cells]
 
 
-def eventually(condition, within_s=3.0):
+def eventually(condition, within_s=20.0):
     deadline = time.monotonic() + within_s
     while not (met := condition()) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -79,11 +81,13 @@ def test_every_row_has_its_message():
 def test_a_fault_ends_in_a_drive_without_torque(
     row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
 ):
-    profile, log = quiet_profile(row.profile), tmp_path / "drive.jsonl"
-    simulator = start_simulator(
-        profile, "--lock-step", "--log", log, "--fault", f"{row.fault}@{AT_S}"
-    )
-    result = run_order(load(profile), "session", fast=True, **SHORT)
+    shortened = MESSAGES[row.name].endswith(f"{STALE} ticks")
+    values = {"limits.stale_ticks_in_a_row": str(STALE)} if shortened else {}
+    profile, log = quiet_profile(row.profile, values), tmp_path / "drive.jsonl"
+    simulator = start_simulator(profile, "--lock-step", "--log", log)
+    # The record could go on for long, so that the fault comes before its end at any pace.
+    options = CHIRP | {"duration_s": 60.0}
+    result = run_order(load(profile), "session", fast=True, fault=row.fault, **options)
     assert result.outcome == "fault"
     assert re.search(MESSAGES[row.name], result.reason), result.reason
     assert result.scheduled == result.recorded + result.missed + result.lost
@@ -94,7 +98,7 @@ def test_a_fault_ends_in_a_drive_without_torque(
     # A drive that nobody can reach any more goes off a little later, by itself.
     assert eventually(lambda: drive_log(log).last_torque["enabled"] is False)
     simulator.terminate()
-    assert simulator.wait(10.0) == 0
+    assert simulator.wait(30.0) == 0
 
     said = drive_log(log)
     (begun,) = said.of("fault", "simulator")
@@ -102,7 +106,12 @@ def test_a_fault_ends_in_a_drive_without_torque(
     assert (end["enabled"], end["torque_nm"]) == (False, 0.0)
     off = next(e for e in said.of("torque") if e["t_s"] >= begun["t_s"] and not e["enabled"])
     assert off["torque_nm"] == 0.0
-    assert round((off["t_s"] - begun["t_s"]) * 1000) <= row.ticks
+    ticks = row.ticks - (10 - STALE if shortened and row.last.startswith("the loop: ten") else 0)
+    if row.name == "torque commands lost":
+        # Nor does it get the command to switch off. That is tried for 50 ms of the computer's time
+        # before it goes by SDO, in which a lock-step passes as many ticks as it can.
+        ticks *= 4
+    assert round((off["t_s"] - begun["t_s"]) * 1000) <= ticks
 
 
 @pytest.mark.parametrize("row", rows(BORNE), ids=named)
@@ -110,8 +119,9 @@ def test_a_passing_fault_is_flagged_and_borne(
     row, quiet_profile, start_simulator, run_order, load, tmp_path
 ):
     profile = quiet_profile(row.profile)
-    start_simulator(profile, "--lock-step", "--fault", f"{row.fault}@{AT_S}")
-    result = run_order(load(profile), "session", fast=True, **SHORT)
+    start_simulator(profile, "--lock-step")
+    options = CHIRP | {"duration_s": 3.0}
+    result = run_order(load(profile), "session", fast=True, fault=row.fault, **options)
     assert result.went_well, result.reason
     status = read_session(result.path).samples["status"]
     stale = status & (Status.ANGLE_STALE | Status.WRENCH_STALE)

@@ -1,0 +1,133 @@
+"""What came of one measurement, and its figures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+HELD = 0.999
+"""Share of its ticks that a computer has to run in their periods to hold a rate."""
+STALL_US = 2000.0
+"""A wake-up that is as late as this was held up by no loop and no rate: the host of a virtual
+machine took the processor away, or firmware did."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Percentiles, in µs."""
+
+    p50: float
+    p90: float
+    p99: float
+    p999: float
+    largest: float
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One loop, run for some seconds."""
+
+    name: str
+    rate_hz: float
+    lateness_us: npt.NDArray[np.float64]
+    """(n,) of every tick that was run: wake-up after the deadline that was waited for."""
+    work_us: npt.NDArray[np.float64]
+    """(n,) from the wake-up to the end of its work; empty where none was done."""
+    scheduled: int
+    missed: int
+    cpu_percent: float | None = None
+    """Of one core, that the process of the loop took."""
+    page_faults: int | None = None
+
+    @property
+    def held(self) -> float:
+        """Share of the scheduled ticks that were run in their periods."""
+        return 1.0 - self.missed / self.scheduled
+
+    @property
+    def held_between_stalls(self) -> float:
+        """The same, leaving out the ticks that passed while the computer stood still."""
+        stalls_us = self.lateness_us[self.lateness_us >= STALL_US]
+        passed = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
+        return 1.0 - (self.missed - passed) / (self.scheduled - passed)
+
+    @property
+    def stalls(self) -> int:
+        """How often it stood still."""
+        return int(np.count_nonzero(self.lateness_us >= STALL_US))
+
+
+def figures(values_us: npt.NDArray[np.float64]) -> Figures:
+    """Return the percentiles of at least one value."""
+    return Figures(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
+
+
+def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
+    """Return by how much each wake-up missed the deadline that was waited for.
+
+    The lateness of a sample counts from the tick that was run, which after missed ticks is a later
+    one than that which was waited for.
+
+    Parameters
+    ----------
+    samples
+        As recorded, with none lost.
+    rate_hz
+        Ticks a second.
+    """
+    ticks: npt.NDArray[np.int64] = samples["tick"].astype(np.int64)
+    missed = np.diff(ticks, prepend=-1) - 1
+    late_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed * (1e6 / rate_hz)
+    return late_us
+
+
+def measurement(
+    name: str,
+    rate_hz: float,
+    samples: npt.NDArray[np.void],
+    *,
+    scheduled: int,
+    cpu_percent: float | None,
+    page_faults: int | None,
+) -> Measurement:
+    """Return what the samples of a record tell.
+
+    Parameters
+    ----------
+    name
+        What was measured.
+    rate_hz
+        Ticks a second.
+    samples
+        Of the record; those that are not there were missed.
+    scheduled
+        Ticks of the record.
+    cpu_percent, page_faults
+        Of the control process.
+    """
+    return Measurement(
+        name,
+        rate_hz,
+        wake_ups_us(samples, rate_hz),
+        samples["work_ns"] * 1e-3,
+        scheduled,
+        scheduled - samples.size,
+        cpu_percent,
+        page_faults,
+    )
+
+
+def pooled(name: str, parts: list[Measurement]) -> Measurement:
+    """Return several measurements of the same as one."""
+    costs = [part.cpu_percent for part in parts if part.cpu_percent is not None]
+    faults = [part.page_faults for part in parts if part.page_faults is not None]
+    return Measurement(
+        name,
+        parts[0].rate_hz,
+        np.concatenate([part.lateness_us for part in parts]),
+        np.concatenate([part.work_us for part in parts]),
+        sum(part.scheduled for part in parts),
+        sum(part.missed for part in parts),
+        sum(costs) / len(costs) if costs else None,
+        sum(faults) if faults else None,
+    )

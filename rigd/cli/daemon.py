@@ -1,0 +1,174 @@
+"""``rigd status``, ``stop``, ``tare`` and ``zero``: what is asked of a running daemon."""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
+from rigd.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from rigd.service.client import Client
+
+_LOOK_S = 0.5
+
+DaemonOf = Annotated[
+    str | None,
+    typer.Option("--profile", help="Whose daemon (default: the only one that is running)."),
+]
+
+
+@contextmanager
+def daemon_of(profile: str | None) -> "Iterator[Client]":
+    """Connect to the daemon of a profile; whatever goes wrong with it ends the command."""
+    from rigd.service.address import AddressError, find
+    from rigd.service.client import Client, DaemonGoneError, RefusedByDaemonError
+
+    try:
+        with Client(find(rig_name(profile))) as client:
+            yield client
+    except (AddressError, DaemonGoneError) as error:
+        fail(str(error), EXIT_FAILED)
+    except RefusedByDaemonError as error:
+        fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+
+
+def rig_name(profile: str | None) -> str | None:
+    """Return the name by which the daemon of a profile is found."""
+    if profile is None:
+        return None
+    from rigd.service.address import running, socket_path
+
+    # Reading a profile takes a while, and is of no use where its daemon is known by that name.
+    if any(path.name == socket_path(profile).name for path in running()):
+        return profile
+    from rigd.cli.options import profile_named
+
+    return profile_named(profile).name
+
+
+def status(
+    profile: DaemonOf = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it, until Ctrl-C.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show how the daemon, its rig and a running session are.
+
+    Example: rigd status --watch
+    """
+    if watch:
+        if as_json:
+            fail("--watch and --json do not go together; ask for one.", EXIT_WRONG_USE)
+        _watch(profile)
+        return
+    with daemon_of(profile) as client:
+        told = client.ask("status")
+    if as_json:
+        del told["reply"], told["ok"]
+        typer.echo(json.dumps(told))
+        return
+    from rigd.cli.status_view import print_status
+
+    print_status(told)
+
+
+def stop(profile: DaemonOf = None) -> None:
+    """End the running session safely; its file is kept. Anybody may.
+
+    Example: rigd stop
+    """
+    with daemon_of(profile) as client:
+        told = client.ask("stop")
+    if told["stopping"]:
+        typer.echo("The session is being stopped; rigd status shows when it has ended.")
+    else:
+        typer.echo("No session is running; the torque is off.")
+
+
+def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
+    """Average the sensor at rest, and make that its zero. No torque.
+
+    Example: rigd tare
+    """
+    with daemon_of(profile) as client:
+        told = client.ask("tare")
+    if as_json:
+        typer.echo(json.dumps(_measured(told)))
+        return
+    for axis, mean in told["mean"].items():
+        unit = "N·m" if axis.endswith("_nm") else "N"
+        name = axis.removesuffix("_nm").removesuffix("_n")
+        typer.echo(f"{name}: {mean:.4g} {unit}, scatter {told['std'][axis]:.2g} {unit}")
+    typer.echo(f"coupling torque: scatter {told['torque_std_nm']:.2g} N·m")
+
+
+def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
+    """Make the angle where the motor stands the zero, to which the limits are relative. No torque.
+
+    Example: rigd zero
+    """
+    with daemon_of(profile) as client:
+        told = client.ask("zero")
+    if as_json:
+        typer.echo(json.dumps(_measured(told)))
+    else:
+        typer.echo(
+            f"The zero is where the motor stands now; before, that was {told['moved_rad']:.5f} rad."
+        )
+
+
+def reset_by_daemon(profile: str | None) -> bool:
+    """Have the daemon of a profile, or the only one there is, reset its rig; False: there is none.
+
+    A refusal or a failure ends the command.
+    """
+    from rigd.service.address import running, socket_path
+
+    sockets = running()
+    if profile is None:
+        if not sockets:
+            return False
+    else:
+        name = rig_name(profile)
+        if name is None or socket_path(name).name not in {path.name for path in sockets}:
+            return False
+    with daemon_of(profile) as client:
+        told = client.ask("reset")
+    typer.echo("The fault is reset; the devices are connected and the torque is off.")
+    if told["zero_lost"]:
+        typer.echo("The zero of the angle was lost: move the motor to its middle, run rigd zero.")
+    return True
+
+
+def _measured(told: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in told.items() if name not in ("reply", "ok")}
+
+
+def _watch(profile: str | None) -> None:
+    """Show the status over and over; a daemon that ends may come back."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from rigd.cli.status_view import status_table
+    from rigd.service.address import AddressError, find
+    from rigd.service.client import Client, DaemonGoneError, RefusedByDaemonError
+
+    name = rig_name(profile)
+    with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:
+        link: Client | None = client
+        while True:
+            try:
+                link = link or Client(find(name))
+                told = link.ask("status")
+                name = name or told["daemon"]["profile"]
+                live.update(status_table(told), refresh=True)
+            except (DaemonGoneError, AddressError, RefusedByDaemonError) as error:
+                if link is not None:
+                    link.close()
+                    link = None
+                live.update(f"{error} Waiting for it; Ctrl-C ends.", refresh=True)
+            time.sleep(_LOOK_S)

@@ -1,0 +1,111 @@
+"""``rigd serve`` from its first to its last moment: lock, socket, rig, signals."""
+
+import asyncio
+import logging
+import signal
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+from rigd.devices.registry import Reality, reality, simulated_differently
+from rigd.profile import Profile
+from rigd.service.address import COMMON, bind, socket_path
+from rigd.service.server import Server
+from rigd.service.service import Service
+from rigd.supervisor.lock import RigLock
+from rigd.supervisor.rig import Rig
+
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
+
+_log = logging.getLogger("rigd.serve")
+
+
+def run_daemon(
+    profile: Profile, folder: Path, *, group: str | None, live: bool, fast: bool
+) -> signal.Signals:
+    """Own a rig until a signal asks for the end.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    folder
+        Where session files go.
+    group
+        Whose members may command it, beside this user.
+    live, fast
+        See :class:`rigd.supervisor.rig.Rig`.
+
+    Returns
+    -------
+    Signals
+        The one that ended it.
+
+    Raises
+    ------
+    RigBusyError
+        If another program runs the rig.
+    AddressError
+        If there can be no socket.
+    """
+    _log_to_standard_error()
+    moving = reality(profile.rig)
+    with ExitStack() as ending:
+        ending.enter_context(
+            RigLock(profile.name, "rigd serve", hardware=moving is Reality.HARDWARE)
+        )
+        path = socket_path(profile.name, None if group is None else COMMON)
+        listener = ending.enter_context(bind(path, group))
+        ending.callback(path.unlink, missing_ok=True)
+        worker = ending.enter_context(ThreadPoolExecutor(1, "rig"))
+        server = Server(listener)
+        service = Service(
+            Rig(profile, fast=fast, live=live),
+            profile,
+            folder,
+            worker,
+            server.publish,
+            partial(reality, profile.rig),
+            fast=fast,
+            live=live,
+        )
+        _log.info("%s: %s; listening on %s", profile.name, moving.value, path)
+        for difference in simulated_differently(profile.rig):
+            _log.warning("the simulated rig has %s", difference)
+        return asyncio.run(_run(server, service))
+
+
+async def _run(server: Server, service: Service) -> signal.Signals:
+    loop = asyncio.get_running_loop()
+    asked: asyncio.Future[signal.Signals] = loop.create_future()
+
+    def end(number: signal.Signals) -> None:
+        if not asked.done():
+            asked.set_result(number)
+
+    for number in _ENDING:
+        if signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            loop.add_signal_handler(number, end, number)
+    server.serve(service)
+    opening = asyncio.create_task(service.open())
+    attending = asyncio.create_task(service.attend())
+    # Attending ends only by a mistake in the program, which must not leave a rig unattended.
+    attending.add_done_callback(lambda _: end(signal.SIGABRT))
+    await asked
+    why = f"the daemon got {asked.result().name}"
+    _log.info("%s and ends", why)
+    await service.close(why)
+    attending.cancel()
+    await asyncio.gather(opening, attending, return_exceptions=True)
+    await server.close()
+    return asked.result()
+
+
+def _log_to_standard_error() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logging.raiseExceptions = False  # a terminal that is gone must not end anything
+    _log.addHandler(handler)
+    _log.setLevel(logging.INFO)

@@ -1,0 +1,223 @@
+"""Requests to the daemon: from a line of bytes to something that may be obeyed, or a refusal.
+
+Whatever comes in is untrusted. A refusal names what is wrong; docs/control_socket.md has the rules.
+"""
+
+import inspect
+import json
+from math import isfinite
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NoReturn
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from rigd.excitation.named import KINDS, Value
+
+LONGEST_LINE = 65_536
+"""Bytes of a request, its newline included."""
+MOST_SESSIONS = 1000
+_LONGEST_PATH = 4096
+_SHOWN = 60
+
+Id = int | Annotated[str, Field(max_length=64)]
+
+
+class RequestError(Exception):
+    """A request cannot be understood; the message says why, `request_id` whose it was."""
+
+    def __init__(self, message: str, request_id: Id | None = None) -> None:
+        super().__init__(message)
+        self.request_id = request_id
+
+
+class Request(BaseModel):
+    """What every request may have."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    controlling: ClassVar[bool] = False
+    """Only the client that holds control may ask for it."""
+
+    command: str
+    id: Id | None = None
+
+
+class Status(Request):
+    """Tell how everything is."""
+
+    command: Literal["status"]
+
+
+class Watch(Request):
+    """Send the events from now on."""
+
+    command: Literal["watch"]
+
+
+class Stop(Request):
+    """End the running session safely."""
+
+    command: Literal["stop"]
+
+
+class Tare(Request):
+    """Average the sensor at rest."""
+
+    controlling = True
+    command: Literal["tare"]
+
+
+class Zero(Request):
+    """Make the present angle the zero."""
+
+    controlling = True
+    command: Literal["zero"]
+
+
+class Reset(Request):
+    """Leave the fault."""
+
+    controlling = True
+    command: Literal["reset"]
+
+
+class Start(Request):
+    """Run a session, or a series of them."""
+
+    controlling = True
+    command: Literal["start"]
+    excitation: str
+    parameters: dict[str, Any] = {}
+    repeat: int = Field(default=1, ge=1, le=MOST_SESSIONS)
+    notes: dict[
+        Literal["operator", "specimen", "note"], Annotated[str, Field(max_length=1000)]
+    ] = {}
+    force: bool = False
+
+
+AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Start
+_REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
+    Annotated[AnyRequest, Field(discriminator="command")]
+)
+_COMMANDS = ("status", "watch", "stop", "tare", "zero", "reset", "start")
+
+
+def parse_request(line: bytes) -> AnyRequest:
+    """Understand one line.
+
+    Raises
+    ------
+    RequestError
+        Naming what is wrong with it.
+    """
+    given = _parse_object(line)
+    request_id = given.get("id")
+    if not isinstance(request_id, int | str) or isinstance(request_id, bool):
+        request_id = None
+    command = given.get("command")
+    if command not in _COMMANDS:
+        raise RequestError(
+            f"command = {_shown(command)} is not known; there are {', '.join(_COMMANDS)}.",
+            request_id,
+        )
+    try:
+        request = _REQUESTS.validate_python(given)
+    except ValidationError as error:
+        raise RequestError(_first_complaint(error), request_id) from None
+    try:
+        return _checked(request) if isinstance(request, Start) else request
+    except RequestError as error:
+        raise RequestError(str(error), request_id) from None
+
+
+def _parse_object(line: bytes) -> dict[str, Any]:
+    try:
+        given = json.loads(line.decode(), parse_constant=_no_constant)
+    except UnicodeDecodeError:
+        raise RequestError("The line is not UTF-8.") from None
+    except RecursionError:
+        raise RequestError("The line is nested too deeply.") from None
+    except ValueError as error:
+        raise RequestError(f"The line is not JSON ({error}).") from None
+    if not isinstance(given, dict):
+        raise RequestError("A request is a JSON object.")
+    return given
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number")
+
+
+def _first_complaint(error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_context=False)[0]
+    where = ".".join(str(part)[:_SHOWN] for part in first["loc"][1:]) or "The request"
+    return f"{where}: {first['msg']}."
+
+
+def _checked(request: Start) -> Start:
+    """Check what depends on the excitation, by the signature of its function."""
+    if request.excitation not in KINDS:
+        raise RequestError(
+            f"excitation = {_shown(request.excitation)} is not known; there are {', '.join(KINDS)}."
+        )
+    for note, text in request.notes.items():
+        if not text.isprintable():
+            raise RequestError(f"notes.{note} is not plain text of one line.")
+    function = KINDS[request.excitation]
+    known = {
+        name: parameter
+        for name, parameter in inspect.signature(function).parameters.items()
+        if name != "rate_hz"
+    }
+    values: dict[str, Value] = {}
+    for name, given in request.parameters.items():
+        if name not in known:
+            raise RequestError(
+                f"parameters: {_shown(name)} is not a parameter of {request.excitation}; there are "
+                f"{', '.join(known)}."
+            )
+        values[name] = _value(name, given, known[name].annotation)
+    for name, parameter in known.items():
+        if parameter.default is inspect.Parameter.empty and name not in values:
+            raise RequestError(f"parameters.{name} is missing.")
+    return request.model_copy(update={"parameters": values})
+
+
+def _value(name: str, given: object, wanted: object) -> Value:
+    if wanted is float:
+        return _number(name, given)
+    if wanted is int:
+        if isinstance(given, int) and not isinstance(given, bool) and abs(given) < 2**63:
+            return given
+        raise RequestError(f"parameters.{name} = {_shown(given)} is not a whole number.")
+    if (
+        isinstance(given, str)
+        and given.isprintable()
+        and len(given) < _LONGEST_PATH
+        and Path(given).is_absolute()
+    ):
+        return Path(given)
+    raise RequestError(
+        f"parameters.{name} = {_shown(given)} is not the absolute path of a file; give one that "
+        "the daemon can read."
+    )
+
+
+def _number(name: str, given: object) -> float:
+    if isinstance(given, int | float) and not isinstance(given, bool):
+        try:
+            number = float(given)
+        except OverflowError:
+            number = float("inf")
+        if isfinite(number):
+            return number
+    raise RequestError(f"parameters.{name} = {_shown(given)} is not a finite number.")
+
+
+def _shown(value: object) -> str:
+    """Return a value as JSON, cut to what a message can bear."""
+    try:
+        text = json.dumps(value)
+    except (ValueError, RecursionError):
+        text = "..."
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."

@@ -1,0 +1,79 @@
+"""``rigd bench`` as the operator calls it."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from rigd.bench.loops import LoopError
+from rigd.bench.program import Results
+from rigd.cli.app import app
+from rigd.supervisor.lock import RigLock
+
+
+@pytest.fixture
+def bench(monkeypatch, measured):
+    """The command, with results made up."""
+    asked = []
+
+    class MadeUp:
+        fails = ""
+
+        def __init__(self, profile, **options):
+            asked.append((profile.name, options))
+            self.profile = profile
+
+        def run(self):
+            if self.fails:
+                raise LoopError(self.fails)
+            results = Results("sim", 1000.0, 1.0, 0.0, {"cpu": "0"}, (0.5, 0.4, 0.3))
+            results.rounds.append((measured(), None))
+            results.sessions.append(measured())
+            results.search.append(measured())
+            return results
+
+    monkeypatch.setattr("rigd.bench.Bench", MadeUp)
+    made = CliRunner()
+
+    def run(*arguments):
+        return made.invoke(app, ["bench", *arguments])
+
+    run.asked, run.made_up = asked, MadeUp
+    return run
+
+
+def test_the_report_ends_with_a_verdict(bench):
+    done = bench("--rate", "2000", "--seconds", "5", "--spin-us", "50")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[-1].startswith("This computer holds 1000 Hz")
+    ((name, options),) = bench.asked
+    assert name == "sim"
+    assert (options["rate_hz"], options["seconds"], options["spin_us"]) == (2000.0, 5.0, 50.0)
+
+
+def test_a_document_is_all_there_is_on_standard_output(bench):
+    done = bench("--json")
+    assert json.loads(done.stdout)["highest_rate_hz"] == 1000.0
+
+
+def test_a_failure_is_one_sentence(bench):
+    bench.made_up.fails = "There is no shared memory."
+    done = bench()
+    assert done.exit_code == 1
+    assert "Error: There is no shared memory." in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_it_does_not_run_beside_a_session(bench):
+    with RigLock("sim", "rigd run", hardware=False):
+        done = bench()
+    assert done.exit_code == 1
+    assert "in use" in done.stderr
+    assert not bench.asked
+
+
+@pytest.mark.parametrize("wrong", [("--rate", "20"), ("--seconds", "0"), ("--profile", "nobody")])
+def test_wrong_use_is_refused(bench, wrong):
+    done = bench(*wrong)
+    assert done.exit_code == 2
+    assert not bench.asked

@@ -1,0 +1,124 @@
+"""From samples and the kernel's accounts to figures and a histogram."""
+
+import os
+from dataclasses import astuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rigd.bench.histogram import counts_of, edges_us, histogram_lines
+from rigd.bench.measure import figures, measurement, pooled, wake_ups_us
+from rigd.bench.usage import UsageMeter, usage_of
+from rigd.engine.board import Phase
+from rigd.session.format import SAMPLE_DTYPE
+
+
+def samples(ticks, lateness_ns, work_ns=1000):
+    made = np.zeros(len(ticks), SAMPLE_DTYPE)
+    made["tick"], made["lateness_ns"], made["work_ns"] = ticks, lateness_ns, work_ns
+    return made
+
+
+def test_a_wake_up_after_missed_ticks_is_late_by_them_too():
+    late_us = wake_ups_us(samples([0, 1, 5, 6], [10_000, 20_000, 300_000, 0]), 1000.0)
+    np.testing.assert_allclose(late_us, [10.0, 20.0, 3300.0, 0.0])
+
+
+def test_ticks_missed_at_the_start_count():
+    np.testing.assert_allclose(wake_ups_us(samples([2], [5000]), 2000.0), [1005.0])
+
+
+def test_scheduled_ticks_are_recorded_or_missed():
+    found = measurement(
+        "a", 1000.0, samples([0, 1, 5], 0), scheduled=10, cpu_percent=None, page_faults=None
+    )
+    assert (found.missed, found.held) == (7, pytest.approx(0.3))
+
+
+def test_ticks_that_pass_in_a_stall_are_told_apart():
+    ticks = [0, 1, 32, 33, 35, 36]
+    found = measurement(
+        "a",
+        1000.0,
+        samples(ticks, [0, 0, 500_000, 0, 900_000, 0]),
+        scheduled=37,
+        cpu_percent=None,
+        page_faults=None,
+    )
+    assert (found.missed, found.stalls) == (31, 1)
+    assert found.held == pytest.approx(6 / 37)
+    # The stall swallowed 30 ticks, the wake-up that was 1.9 ms late another one.
+    assert found.held_between_stalls == pytest.approx(6 / 7)
+
+
+def test_percentiles_are_numpys():
+    found = figures(np.arange(1001.0))
+    assert astuple(found) == pytest.approx((500.0, 900.0, 990.0, 999.0, 1000.0))
+
+
+def test_rounds_together_count_every_tick(measured):
+    both = pooled("both", [measured(held=0.5, cpu=4.0), measured(cpu=6.0)])
+    assert (both.scheduled, both.missed) == (3000, 1000)
+    assert both.lateness_us.size == 2000
+    assert both.cpu_percent == 5.0
+
+
+@given(st.lists(st.floats(0.0, 1e7), max_size=50))
+def test_every_delay_is_in_one_bin(delays_us):
+    counts = counts_of(np.array(delays_us))
+    edges = [*edges_us(), np.inf]
+    assert len(counts) == len(edges_us())
+    for count, low, high in zip(counts, edges[:-1], edges[1:], strict=True):
+        assert count == sum(low <= delay < high for delay in delays_us)
+
+
+def test_the_histogram_shows_what_is_rare_and_leaves_out_what_is_empty():
+    lines = histogram_lines(
+        [("ours", np.array([30.0] * 9999 + [700.0])), ("theirs", np.full(100, 12.0))]
+    )
+    assert "ours" in lines[0]
+    assert "theirs" in lines[0]
+    assert lines[1].split()[0] == "10–20"
+    assert lines[-1].split()[0] == "500–1000"
+    assert "█" in lines[-1]
+    assert len(lines) == 1 + 6
+
+
+def test_nothing_makes_no_histogram():
+    assert histogram_lines([("none", np.empty(0))]) == []
+
+
+def test_the_account_of_a_process_is_read_whatever_its_name(tmp_path):
+    folder = tmp_path / "42"
+    folder.mkdir()
+    (folder / "stat").write_text("42 (a) b (c) S 1 2 3 4 5 6 700 8 11 10 1 2 3\n")
+    (folder / "schedstat").write_text("2500000000 12 13\n")
+    usage = usage_of(42, tmp_path)
+    assert (usage.cpu_s, usage.page_faults) == (2.5, 711)
+
+
+def test_usage_is_taken_between_looks_at_a_running_record():
+    meter = UsageMeter(os.getpid())
+    meter.look(Phase.TARING)
+    assert meter.cpu_percent is None
+    meter.look(Phase.RUNNING)
+    assert (meter.cpu_percent, meter.page_faults) == (None, None)
+    block = bytearray(16 << 20)
+    block[:: 1 << 12] = bytes(len(block) >> 12)
+    meter.look(Phase.RUNNING)
+    faults = meter.page_faults
+    assert meter.cpu_percent is not None
+    assert meter.cpu_percent > 0.0
+    assert faults > 0
+    meter.look(Phase.RETURNING)
+    assert meter.page_faults == faults
+
+
+def test_a_process_that_is_gone_leaves_no_usage(monkeypatch):
+    monkeypatch.setattr("rigd.bench.usage.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
+    meter = UsageMeter(1)
+    meter.look(Phase.RUNNING)
+    assert meter.cpu_percent is None

@@ -1,0 +1,54 @@
+"""The loop is measured in the processes of a real session, for as short as it can be."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rigd.bench import loops
+from rigd.profile import load_profile
+
+# Whole processes in real time: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+SECONDS = 0.3
+
+
+@pytest.fixture
+def profile():
+    return loops.rig_for(load_profile("antenna_serial"), 500.0, 0.0)
+
+
+def assert_accounted(found):
+    assert found.scheduled == 150
+    assert found.scheduled == found.lateness_us.size + found.missed
+    assert found.work_us.size == found.lateness_us.size
+    assert (found.lateness_us >= 0.0).all()
+    assert (found.work_us > 0.0).all()
+
+
+def test_the_loop_alone_is_measured_without_a_file(profile):
+    looks = []
+    assert_accounted(loops.run_alone("alone", profile, SECONDS, lambda: looks.append(1)))
+    assert looks
+
+
+def test_a_session_is_measured_and_its_file_goes(profile, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert_accounted(loops.run_session("session", profile, SECONDS, lambda: None))
+    assert not list(tmp_path.glob("rigd-bench-*"))
+
+
+def test_a_loop_that_fails_is_told(profile, monkeypatch):
+    def no_memory(**_):
+        raise OSError("no shared memory")
+
+    monkeypatch.setattr("rigd.bench.loops.Crew", no_memory)
+    with pytest.raises(loops.LoopError, match="no shared memory"):
+        loops.run_alone("alone", profile, SECONDS, lambda: None)
+
+
+def test_the_stranger_is_gone_afterwards():
+    with loops.busy_stranger(os.sched_getaffinity(0)) as pid:
+        assert Path(f"/proc/{pid}").exists()
+    assert not Path(f"/proc/{pid}").exists()

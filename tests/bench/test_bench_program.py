@@ -1,0 +1,206 @@
+"""The order of the measurements, the search for the highest rate, and what is told of them."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from rigd.bench import Bench, as_json, cyclictest, loops, report_lines
+from rigd.bench.program import cores_beside
+from rigd.engine.realtime import REFUSED
+from rigd.profile import load_profile
+
+GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}
+
+
+@pytest.fixture
+def computer(monkeypatch, measured):
+    """Stands in for the loop and cyclictest: holds rates up to one, and notes what it ran."""
+
+    class Computer:
+        holds_hz = 4000.0
+        peer_late_us = 10.0
+        peer_missing = False
+        unlucky = 0
+
+        def __init__(self):
+            self.granted = dict(GRANTED)
+            self.ran = []
+
+        def loop(self, name, profile, seconds, look, *, live=False):
+            rate_hz = profile.rig.rate_hz
+            self.ran.append((name, rate_hz, live))
+            look()
+            holds = rate_hz <= self.holds_hz
+            if holds and self.unlucky:
+                self.unlucky -= 1
+                holds = False
+            return measured(name, rate_hz=rate_hz, held=1.0 if holds else 0.9)
+
+        def peer(self, rate_hz, seconds, *, cpu, priority):
+            self.ran.append((cyclictest.NAME, rate_hz, priority))
+            if self.peer_missing:
+                raise cyclictest.CyclictestError("it is gone")
+            return measured("cyclictest", late_us=(self.peer_late_us,), works=False)
+
+    made = Computer()
+    monkeypatch.setattr("rigd.bench.program.loops.run_alone", made.loop)
+    monkeypatch.setattr("rigd.bench.program.loops.run_session", made.loop)
+    monkeypatch.setattr("rigd.bench.program.cyclictest.run", made.peer)
+    monkeypatch.setattr("rigd.bench.program.cyclictest.installed", lambda: True)
+    monkeypatch.setattr("rigd.bench.program.settings_granted", lambda _: made.granted)
+    return made
+
+
+@pytest.fixture
+def bench(computer):
+    told = []
+
+    def run(rate_hz=1000.0):
+        program = Bench(
+            load_profile("sim"),
+            rate_hz=rate_hz,
+            seconds=10.0,
+            spin_us=0.0,
+            tell=lambda what, left_s: told.append((what, left_s)),
+        )
+        return program.run()
+
+    run.told = told
+    return run
+
+
+def test_loop_and_cyclictest_take_turns(bench, computer):
+    results = bench()
+    names = [name for name, *_ in computer.ran[:6]]
+    assert names == ["loop alone", "cyclictest"] * 3
+    assert len(results.rounds) == 3
+    assert results.ratios() == (3.0, 3.0)
+    assert results.alone.scheduled == 3000
+
+
+def test_sessions_come_with_more_and_more_beside_them(bench):
+    results = bench()
+    names = [one.name for one in results.sessions]
+    assert names == ["with recorder", "with recorder and live view", "… and a busy neighbour"]
+
+
+@pytest.mark.parametrize("holds_hz", [1000.0, 4000.0])
+def test_the_highest_rate_is_looked_for_upwards(bench, computer, holds_hz):
+    computer.holds_hz = holds_hz
+    results = bench()
+    assert results.highest_rate_hz == holds_hz
+    assert [one.rate_hz for one in results.search][-1] == 2 * holds_hz
+    assert f"holds {holds_hz:g} Hz" in "\n".join(report_lines(results))
+
+
+def test_where_the_rate_itself_does_not_hold_lower_ones_are_tried(bench, computer):
+    computer.holds_hz = 300.0
+    results = bench()
+    assert [one.rate_hz for one in results.search] == [1000.0, 500.0, 250.0]
+    assert results.highest_rate_hz == 250.0
+
+
+def test_a_rate_has_a_second_try(bench, computer):
+    computer.unlucky = 4  # the rounds, and one session of the three
+    assert bench().highest_rate_hz == 4000.0
+
+
+def test_stalls_do_not_stop_the_search_and_are_told(bench, computer, measured, monkeypatch):
+    def stalling(name, profile, seconds, look, *, live=False):
+        rate_hz = profile.rig.rate_hz
+        found = measured(name, rate_hz=rate_hz, held=1.0 if rate_hz <= 2000.0 else 0.9)
+        found.lateness_us[0] = 30_010.0
+        passed = int(0.03 * rate_hz)
+        return replace(found, missed=found.missed + passed, scheduled=found.scheduled + passed)
+
+    monkeypatch.setattr("rigd.bench.program.loops.run_session", stalling)
+    results = bench()
+    assert results.highest_rate_hz is None
+    assert results.highest_rate_between_stalls_hz == 2000.0
+    assert "would hold 2000 Hz" in "\n".join(report_lines(results))
+
+
+def test_the_search_ends_where_nothing_holds(bench, computer):
+    computer.holds_hz = 0.0
+    results = bench()
+    assert results.highest_rate_hz is None
+    assert results.search[-1].rate_hz >= 100.0
+    assert "holds none" in "\n".join(report_lines(results))
+
+
+def test_the_search_ends_where_everything_holds(bench, computer):
+    computer.holds_hz = 1e9
+    assert bench().highest_rate_hz == 16_000.0
+
+
+def test_the_time_left_only_shrinks(bench, monkeypatch):
+    monkeypatch.setattr("rigd.bench.program.time.monotonic", lambda: 5.0)
+    bench()
+    left = [left_s for _, left_s in bench.told]
+    assert all(later <= earlier for earlier, later in pairwise(left))
+    assert left[0] > 100.0
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_without_cyclictest_the_rest_is_measured(bench, computer, monkeypatch, installed):
+    computer.peer_missing = True
+    monkeypatch.setattr("rigd.bench.program.cyclictest.installed", lambda: installed)
+    results = bench()
+    assert results.peer is None
+    assert results.ratios() is None
+    text = "\n".join(report_lines(results))
+    assert ("it is gone" if installed else "rt-tests") in text
+    assert as_json(results)["ratio_to_cyclictest"] is None
+
+
+def test_cyclictest_runs_with_no_more_rights_than_the_loop(bench, computer):
+    computer.granted["scheduling"] = f"{REFUSED}not permitted"
+    results = bench()
+    assert (cyclictest.NAME, 1000.0, 0) in computer.ran
+    assert "Not granted: scheduling" in "\n".join(report_lines(results))
+
+
+def test_what_the_computer_itself_misses_is_told(bench, computer):
+    computer.peer_late_us = 2500.0
+    computer.holds_hz = 500.0
+    results = bench()
+    results.rounds[:] = [
+        (ours, cyclictest.measured("002500 000010\n000010 000990", 1000.0))
+        for ours, _ in results.rounds
+    ]
+    assert "whatever runs on it" in "\n".join(report_lines(results))
+
+
+def test_the_document_is_plain_json(bench):
+    document = json.loads(json.dumps(as_json(bench())))
+    assert document["highest_rate_hz"] == 4000.0
+    assert document["ratio_to_cyclictest"] == {"p50": 3.0, "p99": 3.0}
+    assert document["sessions"][0]["lateness_us"]["p99"] == 30.0
+    assert document["rounds"][0]["cyclictest"]["work_us"] is None
+    assert document["realtime"] == GRANTED
+
+
+def test_the_table_has_a_row_for_each(bench):
+    text = "\n".join(report_lines(bench()))
+    for name in ("loop alone", "cyclictest", "with recorder", "… and a busy neighbour", "20–50 µs"):
+        assert name in text
+
+
+def test_the_neighbour_works_beside_the_loop(monkeypatch):
+    monkeypatch.setattr("rigd.bench.program.os.sched_getaffinity", lambda _: {0, 1, 2})
+    assert cores_beside({"cpu": "2"}) == {0, 1}
+    assert cores_beside({"cpu": "2, isolated"}) == {0, 1}
+    monkeypatch.setattr("rigd.bench.program.os.sched_getaffinity", lambda _: {0})
+    assert cores_beside({"cpu": f"{REFUSED}no"}) == {0}
+
+
+@pytest.mark.parametrize("name", ["sim", "antenna_can", "antenna_serial"])
+def test_no_profile_leads_to_its_hardware(name):
+    profile = load_profile(name)
+    rig = loops.rig_for(profile, 2000.0, 50.0).rig
+    assert (rig.devices.drive, rig.devices.sensor) == ("sim", "sim")
+    assert rig.simulation is not None
+    assert [rig.can, rig.cia402, rig.ati_can, rig.ati_serial] == [None] * 4
+    assert rig.rate_hz == 2000.0

@@ -1,0 +1,673 @@
+"""Kill or suspend the processes of a session at random moments, and look at what is left.
+
+`rigd simulate` and `rigd run`, or `rigd serve` and `rigd start`, are processes of their own. The
+simulated drive says by its log when it was switched off, the file says what was kept.
+
+    python tests/chaos/kill_rig.py --kills 50 --stops 50
+"""
+
+import argparse
+import contextlib
+import fcntl
+import json
+import os
+import random
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigd.devices.simulator import find_simulator
+from rigd.session import Status, read_session
+from rigd.sim.wire.control import ask
+
+BIN = Path(sys.executable).parent
+PROFILE = Path(__file__).parents[2] / "hw_profiles" / "antenna_can.toml"
+
+HEARTBEAT_TIMEOUT_S = 0.3
+RECORDER_LAG_S = 2.0
+CHANGES = (
+    # A virtual machine that is short of processor time stands still for 0.1 s at a time.
+    ("stale_ticks_in_a_row = { value = 10", "stale_ticks_in_a_row = { value = 400"),
+    ("missed_ticks_in_a_row = { value = 25", "missed_ticks_in_a_row = { value = 400"),
+    ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
+    ("drive_heartbeat_timeout_s = { value = 0.1", "drive_heartbeat_timeout_s = { value = 1.0"),
+    ("\nheartbeat_timeout_s = { value = 0.05", "\nheartbeat_timeout_s = { value = 0.3"),
+    # Soon enough for a short session to see it.
+    ("recorder_lag_s = { value = 12.0", f"recorder_lag_s = {{ value = {RECORDER_LAG_S}"),
+    ("\ntare_s = { value = 1.0", "\ntare_s = { value = 0.5"),
+    ("return_s = { value = 2.0", "return_s = { value = 0.3"),
+)
+REST_S, RING_DOWN_S = 0.2, 0.3
+
+MODULES = {
+    "control": b"rigd.engine.control",
+    "recorder": b"rigd.engine.recorder",
+    "publisher": b"rigd.live.publisher",
+}
+VICTIMS = ("control", "recorder", "publisher", "supervisor", "all")
+
+KEPT_S = 0.3
+"""No sample older than this at the moment of the kill may be lost."""
+_TRANSPORT_S = 5e-3
+"""A torque stands in the drive's log a tick after its sample, on a grid half a tick off."""
+_ENDED_S = 15.0
+_LONGEST_S = 60.0
+
+# By when the drive has to be off, after the signal: its own watchdog, or the process that notices.
+OFF_WITHIN_S = {
+    ("control", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
+    ("control", signal.SIGSTOP): HEARTBEAT_TIMEOUT_S,
+    ("all", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
+    ("all", signal.SIGSTOP): HEARTBEAT_TIMEOUT_S,
+    ("supervisor", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
+    ("supervisor", signal.SIGSTOP): 3.0,
+    ("recorder", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
+    ("recorder", signal.SIGSTOP): RECORDER_LAG_S + 1.0,
+}
+
+
+class HarnessError(Exception):
+    """The case could not be staged: nothing is said of the rig."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is done to whom, and when."""
+
+    victim: str
+    how: signal.Signals
+    moment_s: float
+    """After the first bytes of the record, or after the start of the command."""
+    anywhere: bool = False
+    """The moment counts from the start of the command."""
+    daemon: bool = False
+    """`rigd serve` and `rigd start` in place of `rigd run`."""
+    sweep_s: float = 5.0
+    analysed: bool = True
+    """Whether to let `analyze` have a go at the file."""
+    grace_s: float = 0.0
+    """Added to what is allowed, where the computer may stand still."""
+    afterwards: signal.Signals = signal.SIGCONT
+    """What ends the suspension of a supervisor and of all that was suspended with it: they go on,
+    or the supervisor is killed, and the others have to go on by themselves."""
+
+    def __str__(self) -> str:
+        where = "start" if self.anywhere else "record"
+        then = f", then {self.afterwards.name}" if self._ends_suspended else ""
+        served = " (serve)" if self.daemon else ""
+        what = f"{self.how.name} of {self.victim}{served}"
+        return f"{what} {self.moment_s:.2f} s into the {where}{then}"
+
+    @property
+    def _ends_suspended(self) -> bool:
+        return self.how == signal.SIGSTOP and self.victim in ("supervisor", "all")
+
+    @property
+    def live(self) -> bool:
+        return self.victim in ("publisher", "all")
+
+    @property
+    def released(self) -> bool:
+        """Whether somebody outside has to end the suspension."""
+        return self._ends_suspended
+
+
+@dataclass
+class Verdict:
+    """What came of a case."""
+
+    case: Case
+    complaints: list[str] = field(default_factory=list)
+    exit_code: int | None = None
+    said: str = ""
+    outcome: str = "none"
+    kept: str = "-"
+    off_s: float | None = None
+    """Drive off, after the signal; None: it was off before, or the session went on."""
+    behind_s: float | None = None
+    """Age of the newest sample in the file at the moment of the signal."""
+    gone_s: float = 0.0
+    """From the signal (or its end) until the last process of the session was gone."""
+    analysis: str = "-"
+    missed: tuple[int, int] = (0, 0)
+    """Missed ticks in the two seconds before and after the signal."""
+
+    def row(self) -> str:
+        def number(value: float | None) -> str:
+            return "-" if value is None else f"{value:.3f}"
+
+        return (
+            f"{self.case!s:58} exit {self.exit_code!s:>3}  {self.outcome:9} {self.kept:9} "
+            f"off {number(self.off_s):>6}  behind {number(self.behind_s):>6}  "
+            f"gone {self.gone_s:5.2f}  {self.analysis:9} missed {self.missed[0]}/{self.missed[1]}  "
+            f"{'; '.join(self.complaints) or 'ok'}"
+        )
+
+
+class DriveLog:
+    """The log of the simulated rig, read as it grows."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._read = 0
+        self.entries: list[dict[str, Any]] = []
+
+    def look(self) -> None:
+        with self._path.open("rb") as file:
+            file.seek(self._read)
+            fresh = file.read()
+        whole = fresh[: fresh.rfind(b"\n") + 1]
+        self._read += len(whole)
+        self.entries += [json.loads(line) for line in whole.splitlines()]
+
+    @property
+    def torques(self) -> list[dict[str, Any]]:
+        return [e for e in self.entries if e["device"] == "drive" and e["what"] == "torque"]
+
+    @property
+    def enabled(self) -> bool:
+        return bool(self.torques and self.torques[-1]["enabled"])
+
+
+class Scene:
+    """A simulated rig and a session on it, in processes of their own."""
+
+    def __init__(self, folder: Path, *, live: bool, sweep_s: float, daemon: bool) -> None:
+        self.folder = folder
+        self.sessions = folder / "sessions"
+        self._runtime = Path(tempfile.mkdtemp(prefix="rigd-kill-"))
+        self._mark = f"XDG_RUNTIME_DIR={self._runtime}".encode()
+        self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(self._runtime)}
+        self._log_path = folder / "drive.jsonl"
+        self._said = (folder / "said.txt").open("w+", encoding="utf-8")
+        self._json = (folder / "out.json").open("w+", encoding="utf-8")
+        profile = folder / "rig.toml"
+        profile.write_text(changed(PROFILE.read_text("utf-8"), CHANGES), encoding="utf-8")
+        self.simulator = self._start("simulate", "--profile", profile, "--log", self._log_path)
+        self._origin_s = self._await_simulator()
+        self.log = DriveLog(self._log_path)
+        options = ["--rest", REST_S, "--duration", sweep_s, "--ring-down", RING_DOWN_S]
+        options += ["--stop-hz", 10, "--json"]
+        where = ["--profile", profile, "--output", self.sessions, *(["--live"] if live else [])]
+        if daemon:
+            self.supervisor = self._start("serve", *where)
+            wait_for(lambda: self.state == "ready", 30.0, "daemon that is ready")
+            self.session = self._start("start", "chirp", *options)
+        else:
+            self.session = self.supervisor = self._start("run", "chirp", *where, *options)
+
+    def _start(self, *arguments: object) -> subprocess.Popen[str]:
+        telling = "simulate" not in arguments
+        return subprocess.Popen(
+            [BIN / "rigd", *map(str, arguments)],
+            cwd=self.folder,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=self._json if telling else subprocess.DEVNULL,
+            stderr=self._said if telling else subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+        )
+
+    @property
+    def state(self) -> str:
+        """What the daemon says of itself."""
+        done = subprocess.run(
+            [BIN / "rigd", "status", "--json"],
+            env=self._environment, capture_output=True, text=True, timeout=30.0, check=False,
+        )  # fmt: skip
+        return str(json.loads(done.stdout)["state"]) if done.returncode == 0 else ""
+
+    def _await_simulator(self) -> float:
+        """Wait until it can be found; return its time at the zero of the monotonic clock."""
+        with _environ(XDG_RUNTIME_DIR=str(self._runtime)):
+            wait_for(lambda: find_simulator("antenna_can"), 20.0, "simulator")
+            address = find_simulator("antenna_can")
+        assert address is not None
+        origins = []
+        for _ in range(20):  # an idle one looks at its clock every 10 ms
+            there_s = ask(address, {"status": True})["time_s"]
+            origins.append(there_s - time.monotonic())
+            time.sleep(0.003)
+        return max(origins)
+
+    def time_of(self, monotonic_ns: int) -> float:
+        """Return the simulated rig's time at a moment of the monotonic clock."""
+        return self._origin_s + monotonic_ns * 1e-9
+
+    def processes(self) -> dict[int, bytes]:
+        """Return the processes of the session and their command lines."""
+        found = {}
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdigit() or int(entry.name) == self.simulator.pid:
+                continue
+            with contextlib.suppress(OSError):
+                if self._mark in (entry / "environ").read_bytes().split(b"\0"):
+                    found[int(entry.name)] = (entry / "cmdline").read_bytes()
+        return found
+
+    def find(self, victim: str) -> list[int]:
+        """Return the processes to be hit, the one with the torque first."""
+        if victim == "supervisor":
+            return [self.supervisor.pid]
+        processes = self.processes()
+        names = MODULES if victim == "all" else {victim: MODULES[victim]}
+        found = [
+            pid
+            for module in names.values()
+            for pid, command in processes.items()
+            if module in command.split(b"\0")
+        ]
+        return [*found, self.supervisor.pid] if victim == "all" else found
+
+    def recording(self) -> bool:
+        return any(part.stat().st_size > 0 for part in self.sessions.glob("*.part"))
+
+    @property
+    def said(self) -> str:
+        self._said.flush()
+        return Path(self._said.name).read_text("utf-8")
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        text = Path(self._json.name).read_text("utf-8").strip()
+        return json.loads(text)["sessions"][0] if text and json.loads(text)["sessions"] else None
+
+    @property
+    def files(self) -> list[Path]:
+        return sorted(self.sessions.glob("*.mcap*"))
+
+    @property
+    def locks_held(self) -> list[str]:
+        """Return the locks that somebody still has."""
+        held = []
+        for path in (self._runtime / "rigd").glob("*.lock"):
+            with path.open("a") as file:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except OSError:
+                    held.append(path.name)
+        return held
+
+    def end_simulator(self) -> None:
+        self.simulator.send_signal(signal.SIGTERM)
+        self.simulator.wait(10.0)
+        self.log.look()
+
+    def close(self) -> None:
+        for pid in (*self.processes(), self.simulator.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.session.wait()
+        self.supervisor.wait()
+        self.simulator.wait()
+        self._said.close()
+        self._json.close()
+        shutil.rmtree(self._runtime, ignore_errors=True)
+
+
+def play(case: Case, folder: Path) -> Verdict:
+    """Stage a case and judge it.
+
+    Raises
+    ------
+    HarnessError
+        If the case could not be staged.
+    """
+    scene = Scene(folder, live=case.live, sweep_s=case.sweep_s, daemon=case.daemon)
+    try:
+        return _play(case, scene)
+    finally:
+        scene.close()
+
+
+def _play(case: Case, scene: Scene) -> Verdict:
+    verdict = Verdict(case)
+    if not case.anywhere:
+        wait_for(scene.recording, 30.0, "record")
+    time.sleep(case.moment_s)
+    wait_for(lambda: scene.find(case.victim) or _ended(scene), 10.0, case.victim)
+    if _ended(scene):
+        raise HarnessError(f"The session had ended by itself:\n{scene.said}")
+    scene.log.look()
+    was_on = scene.log.enabled
+    wall_ns = time.time_ns() - time.monotonic_ns()
+    hit = scene.find(case.victim)
+    before_ns = time.monotonic_ns()
+    _send(hit, case.how)
+    hit_ns = time.monotonic_ns()
+    from_s = time.monotonic()
+    if case.released:
+        _await_off(scene, OFF_WITHIN_S[case.victim, case.how] + 3.0)
+        _send(hit if case.afterwards == signal.SIGCONT else [scene.supervisor.pid], case.afterwards)
+        from_s = time.monotonic()
+    try:
+        verdict.exit_code = scene.session.wait(_LONGEST_S)
+    except subprocess.TimeoutExpired:
+        verdict.complaints.append(f"the session goes on after {_LONGEST_S:g} s")
+    if case.daemon and scene.supervisor.poll() is None:
+        _end_daemon(verdict, scene)
+    ended_s = time.monotonic()
+    while (left := scene.processes()) and time.monotonic() - ended_s < _ENDED_S:
+        time.sleep(0.02)
+    verdict.gone_s = time.monotonic() - from_s
+    for command in left.values():
+        verdict.complaints.append(f"left behind: {command.replace(bytes(1), b' ').decode()}")
+    _await_off(scene, HEARTBEAT_TIMEOUT_S + 2.0)
+    scene.end_simulator()
+    if not left and scene.locks_held:
+        verdict.complaints.append(f"locked: {', '.join(scene.locks_held)}")
+    verdict.said = scene.said
+    _judge_end(verdict, scene)
+    _judge_drive(verdict, scene.log, scene.time_of(before_ns), scene.time_of(hit_ns), was_on=was_on)
+    _judge_file(verdict, scene, hit_ns, wall_ns)
+    return verdict
+
+
+def _end_daemon(verdict: Verdict, scene: Scene) -> None:
+    """See how the daemon took it, and have it end."""
+    expected = {"ready"} if verdict.exit_code == 0 else {"ready", "fault"}
+    state = scene.state
+    if state not in expected:
+        verdict.complaints.append(f"the daemon is in the state {state!r}")
+    scene.supervisor.send_signal(signal.SIGTERM)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        scene.supervisor.wait(_ENDED_S)
+    if scene.supervisor.returncode != 0:
+        verdict.complaints.append(f"rigd serve ended with {scene.supervisor.returncode}")
+
+
+def _ended(scene: Scene) -> bool:
+    return scene.session.poll() is not None
+
+
+def _send(processes: list[int], number: signal.Signals) -> None:
+    for pid in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, number)
+
+
+def _await_off(scene: Scene, patience_s: float) -> None:
+    """Wait until the drive is off; that it is not is found out by the judge."""
+    deadline = time.monotonic() + patience_s
+    scene.log.look()
+    while scene.log.enabled and time.monotonic() < deadline:
+        time.sleep(0.05)
+        scene.log.look()
+
+
+def _judge_end(verdict: Verdict, scene: Scene) -> None:
+    case, result = verdict.case, scene.result
+    if result is not None:
+        verdict.outcome = result["outcome"]
+    complete = result is not None and result["outcome"] == "complete" and not result["reason"]
+    if case.victim == "publisher":
+        expected = [0]
+        if not complete:
+            verdict.complaints.append(f"the session did not go on: {verdict.outcome}")
+        if not case.anywhere and "started again" not in verdict.said:
+            verdict.complaints.append("the publisher was not started again")
+    elif signal.SIGKILL in (case.how, case.released and case.afterwards) and (
+        case.victim in ("supervisor", "all")
+    ):
+        expected = [1] if case.daemon else [-signal.SIGKILL]
+    elif case.anywhere or (case.victim, case.how) == ("recorder", signal.SIGSTOP):
+        expected = [0] if complete else [1]
+    else:
+        expected = [1]
+    if verdict.exit_code not in expected:
+        verdict.complaints.append(f"exit code {verdict.exit_code} instead of {expected}")
+    if "Traceback" in verdict.said:
+        verdict.complaints.append("a traceback")
+    if verdict.exit_code == 1 and not ("Error: " in verdict.said or "fault" in verdict.said):
+        verdict.complaints.append("no message")
+
+
+def _judge_drive(
+    verdict: Verdict, log: DriveLog, before_s: float, hit_s: float, *, was_on: bool
+) -> None:
+    case, torques = verdict.case, log.torques
+    if torques and (torques[-1]["enabled"] or torques[-1]["torque_nm"]):
+        verdict.complaints.append(f"the drive is on in the end: {torques[-1]}")
+        return
+    offs = [e["t_s"] for e in torques if not e["enabled"] and e["t_s"] > before_s - _TRANSPORT_S]
+    if case.victim == "publisher" or not (was_on and offs):
+        return
+    verdict.off_s = offs[0] - hit_s
+    if verdict.outcome == "complete":
+        return  # it was hit so late, or gave so little reason, that the session came to its end
+    within_s = OFF_WITHIN_S[case.victim, case.how] + case.grace_s
+    if verdict.off_s > within_s + _TRANSPORT_S:
+        verdict.complaints.append(f"the drive was off after {verdict.off_s:.3f} s, not {within_s}")
+
+
+def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> None:
+    path = _only_file(verdict, scene)
+    if path is None:
+        return
+    if path.suffix == ".part":
+        path = _recovered(verdict, path, scene)
+        if path is None:
+            return
+    session = read_session(path)
+    samples, outcome = session.samples, session.outcome
+    if outcome is None:
+        verdict.complaints.append("a file without outcome")
+        return
+    if verdict.outcome == "none":
+        verdict.outcome = outcome["outcome"]
+    counts = {key: int(outcome[key]) for key in ("scheduled", "recorded", "missed", "lost")}
+    if counts["scheduled"] != counts["recorded"] + counts["missed"] + counts["lost"]:
+        verdict.complaints.append(f"counts: {counts}")
+    if counts["recorded"] != len(samples):
+        verdict.complaints.append(f"{len(samples)} samples, {counts['recorded']} recorded")
+    if not len(samples):
+        return
+    log = scene.log
+    # In the simulated rig's time.
+    due_s = (session.start_utc_ns - wall_ns + samples["t_ns"].astype(np.int64)) * 1e-9
+    due_s += scene.time_of(0)
+    hit_s = scene.time_of(hit_ns)
+    ticks = samples["tick"].astype(np.int64)
+    if due_s[0] < hit_s < due_s[0] + REST_S + verdict.case.sweep_s + RING_DOWN_S:
+        verdict.behind_s = float(hit_s - due_s[-1])
+        kept_s = KEPT_S + verdict.case.grace_s
+        gone = [
+            e["t_s"]
+            for e in log.torques
+            if due_s[-1] + _TRANSPORT_S < e["t_s"] < hit_s - kept_s and e["enabled"]
+        ]
+        if gone:
+            verdict.complaints.append(f"lost {len(gone)} ticks from {hit_s - gone[0]:.3f} s before")
+        gaps = np.diff(ticks) - 1
+        before = gaps[(due_s[1:] > hit_s - 2.0) & (due_s[1:] <= hit_s)].sum()
+        after = gaps[(due_s[1:] > hit_s) & (due_s[1:] <= hit_s + 2.0)].sum()
+        verdict.missed = int(before), int(after)
+    if outcome["outcome"] != "complete" and verdict.case.victim == "supervisor":
+        last = samples[-1]
+        off = last["torque_command_nm"] == 0.0 and last["status"] & Status.TORQUE_OFF
+        if not off and counts["scheduled"] == ticks[-1] + 1:
+            verdict.complaints.append("the last sample has a torque")
+    if verdict.case.analysed:
+        verdict.analysis = _analysed(verdict, path, len(samples))
+
+
+def _only_file(verdict: Verdict, scene: Scene) -> Path | None:
+    files = scene.files
+    if not files:
+        if not verdict.case.anywhere:
+            verdict.complaints.append("no file")
+        return None
+    if len(files) > 1:
+        verdict.complaints.append(f"files: {[path.name for path in files]}")
+    verdict.kept = files[0].suffix[1:]
+    return files[0]
+
+
+def _recovered(verdict: Verdict, part: Path, scene: Scene) -> Path | None:
+    """Make a file of what the recorder left."""
+    done = subprocess.run(
+        [BIN / "rigd", "recover", part],
+        cwd=scene.folder, capture_output=True, text=True, timeout=60.0, check=False,
+    )  # fmt: skip
+    path = part.with_suffix("")
+    if "Traceback" in done.stderr:
+        verdict.complaints.append("a traceback of rigd recover")
+    if done.returncode != 0 or not path.exists():
+        if part.stat().st_size and not verdict.case.anywhere:
+            verdict.complaints.append(f"rigd recover: {done.returncode}, {_line(done.stderr)}")
+        return None
+    return path
+
+
+def _analysed(verdict: Verdict, path: Path, samples: int) -> str:
+    options = ["--frf", "fft", "--types", "VI", "--weights", "omega", "--json", "-"]
+    done = subprocess.run(
+        [BIN / "analyze", path, *options],
+        cwd=path.parent, capture_output=True, text=True, timeout=60.0, check=False,
+    )  # fmt: skip
+    if done.returncode == 0:
+        return "accepted"
+    if "Traceback" in done.stderr or not done.stderr.startswith("Error: "):
+        verdict.complaints.append(f"analyze: {_line(done.stderr)}")
+        return "refused"
+    if "missing or stale" in done.stderr:
+        return "gaps"  # for as long as the loop was suspended, or the computer busy with others
+    if samples > 1000 * (REST_S + 1.5):
+        verdict.complaints.append(f"analyze on {samples} samples: {_line(done.stderr)}")
+    return "too short"
+
+
+def _line(text: str) -> str:
+    return text.strip().rsplit("\n", 1)[-1][:200]
+
+
+def changed(text: str, changes: tuple[tuple[str, str], ...]) -> str:
+    """Return a profile with other numbers."""
+    for old, new in changes:
+        if old not in text:
+            raise HarnessError(f"{PROFILE} has no {old!r}")
+        text = text.replace(old, new, 1)
+    return text
+
+
+def wait_for(condition: Callable[[], object], patience_s: float, what: str) -> None:
+    deadline = time.monotonic() + patience_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise HarnessError(f"No {what} within {patience_s:g} s.")
+        time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def _environ(**values: str) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def random_cases(
+    chooser: random.Random, how: signal.Signals, count: int, victims: tuple[str, ...]
+) -> Iterator[Case]:
+    """Draw the cases: five out of six in the record; one out of three with a daemon."""
+    for number in range(count):
+        anywhere = number % 6 == 5
+        victim = chooser.choice(victims) if anywhere else victims[number % len(victims)]
+        # Long enough for the supervisor to see that it hangs.
+        long = (victim, how) == ("publisher", signal.SIGSTOP) and not anywhere
+        yield Case(
+            victim=victim,
+            how=how,
+            moment_s=chooser.uniform(*((0.3, 7.0) if anywhere else (0.3, 1.5 if long else 4.5))),
+            anywhere=anywhere,
+            daemon=number % 3 == 2,
+            sweep_s=9.0 if long else 5.0,
+            afterwards=chooser.choice((signal.SIGCONT, signal.SIGCONT, signal.SIGKILL)),
+        )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--stops", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--victims", default=",".join(VICTIMS))
+    parser.add_argument("--keep", type=Path, help="Folder for what a case with complaints left.")
+    given = parser.parse_args()
+    victims = tuple(given.victims.split(","))
+    chooser = random.Random(given.seed)
+    cases = [
+        *random_cases(chooser, signal.SIGKILL, given.kills, victims),
+        *random_cases(chooser, signal.SIGSTOP, given.stops, victims),
+    ]
+    print(f"seed {given.seed}, {len(cases)} cases")  # noqa: T201
+    started_s = time.monotonic()
+    verdicts, skipped = [], 0
+    for number, case in enumerate(cases):
+        folder = Path(tempfile.mkdtemp(prefix="rigd-case-"))
+        try:
+            verdict = play(case, folder)
+        except HarnessError as error:
+            skipped += 1
+            print(f"{number:3} {case}: not staged. {error}", flush=True)  # noqa: T201
+            shutil.rmtree(folder)
+            continue
+        verdicts.append(verdict)
+        print(f"{number:3} {verdict.row()}", flush=True)  # noqa: T201
+        if verdict.complaints and given.keep:
+            print(verdict.said)  # noqa: T201
+            given.keep.mkdir(parents=True, exist_ok=True)
+            shutil.copytree(folder, given.keep / f"{number:03}", dirs_exist_ok=True)
+        shutil.rmtree(folder)
+    print(summary(verdicts))  # noqa: T201
+    took_s = time.monotonic() - started_s
+    bad = [verdict for verdict in verdicts if verdict.complaints]
+    counted = f"{len(verdicts)} cases, {len(bad)} with complaints, {skipped} not staged"
+    print(f"{counted}, {took_s:.0f} s")  # noqa: T201
+    return 1 if bad else 0
+
+
+def summary(verdicts: list[Verdict]) -> str:
+    """Return a table: a line a victim and signal."""
+    lines = [
+        f"{'victim':10} {'signal':8} cases  bad  off p50/max s   behind p50/max s  gone max s  "
+        "missed before/after"
+    ]
+    for victim in VICTIMS:
+        for how in (signal.SIGKILL, signal.SIGSTOP):
+            mine = [v for v in verdicts if (v.case.victim, v.case.how) == (victim, how)]
+            if not mine:
+                continue
+            off = [v.off_s for v in mine if v.off_s is not None]
+            behind = [v.behind_s for v in mine if v.behind_s is not None]
+            lines.append(
+                f"{victim:10} {how.name:8} {len(mine):5} {sum(bool(v.complaints) for v in mine):4}"
+                f"  {_spread(off):>14}  {_spread(behind):>16}  {max(v.gone_s for v in mine):10.2f}"
+                f"  {sum(v.missed[0] for v in mine)}/{sum(v.missed[1] for v in mine)}"
+            )
+    return "\n".join(lines)
+
+
+def _spread(values: list[float]) -> str:
+    return f"{statistics.median(values):.3f}/{max(values):.3f}" if values else "-"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,89 @@
+"""What happens after the last tick of a record does not make it any less complete."""
+
+import os
+import signal
+from dataclasses import replace
+
+import pytest
+
+from rigd.engine.board import Phase, Word
+from rigd.engine.channels import DESCRIPTORS, create_channels
+from rigd.engine.recorder import Recorder
+from rigd.engine.ring import shared_memory_fd
+from rigd.engine.signals import StopRequest
+from rigd.excitation import hold
+from rigd.profile import load_profile
+from rigd.session import SessionWriter, read_session
+from rigd.session.format import pack_sample_into
+from rigd.supervisor.orders import Order
+from rigd.supervisor.rig import Rig
+
+# Sessions in real time share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+
+@pytest.fixture
+def channels():
+    descriptors = [shared_memory_fd() for _ in range(DESCRIPTORS)]
+    channels = create_channels(1000.0, descriptors)
+    yield channels
+    channels.close()
+    for descriptor in descriptors:
+        os.close(descriptor)
+
+
+@pytest.mark.parametrize(
+    ("ticks", "outcome", "reason"),
+    [
+        (300, "complete", "After the record: The supervising process ended."),
+        (299, "fault", "The supervising process ended during the session."),
+    ],
+)
+def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcome, reason):
+    board, ring = channels.board, channels.samples
+    recorder = Recorder(channels, SessionWriter(tmp_path / "alone.mcap"))
+    recorder.header = {
+        "metadata": {"rate_hz": "1000.0"},
+        "segments": {"rest": [0, 100], "sweep": [100, 300]},
+        "attachments": {},
+    }
+    for tick in range(ticks):
+        pack_sample_into(ring.buffer, ring.slot(), tick * 10**6, tick, *[0.0] * 10, 0, 0, 0)
+        ring.publish()
+    board[Word.START_UTC_NS] = 10**18
+    board[Word.SCHEDULED] = ticks
+    board[Word.PHASE] = Phase.OFF
+    recorder.transfer()
+    recorder.finish_orphaned()
+    session = read_session(tmp_path / "alone.mcap")
+    assert len(session.samples) == ticks
+    assert session.outcome["outcome"] == outcome
+    assert session.outcome["reason"] == reason
+    assert session.outcome["scheduled"] == session.outcome["recorded"] == str(ticks)
+
+
+def test_a_control_process_that_dies_on_the_way_back_leaves_a_whole_record(tmp_path):
+    profile = load_profile("sim")
+    # A virtual machine that is short of processor time stands still for 0.1 s at a time.
+    limits = replace(profile.limits, missed_ticks_in_a_row=1000, missed_percent=100.0)
+    profile = replace(
+        profile, limits=limits, session=replace(profile.session, tare_s=0.5, return_s=30.0)
+    )
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=0.3, rest_s=0.1, ring_down_s=0.0)
+    rig = Rig(profile)
+
+    def watcher(progress, events):
+        control = next(p for p in rig.status().processes if p.name == "control")
+        if progress.phase is Phase.RETURNING and control.state != "ended":
+            os.kill(control.pid, signal.SIGKILL)
+
+    try:
+        rig.connect()
+        result = rig.run(Order(profile, excitation, tmp_path / "a.mcap"), StopRequest(), watcher)
+    finally:
+        rig.disconnect()
+    assert result.outcome == "complete"
+    assert result.reason == "After the record: The control process was killed by signal 9."
+    assert not result.went_well
+    assert result.scheduled == 400 == result.recorded + result.missed
+    assert read_session(result.path).outcome["outcome"] == "complete"

@@ -1,0 +1,61 @@
+"""The cases of ``kill_rig.py``, one of each kind that no test of `rigd run` has."""
+
+import importlib.util
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+# Sessions in real time share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+STANDSTILL_S = 1.0
+"""For which a virtual machine may stop, at the worst moment, and no test fails."""
+
+
+@pytest.fixture(scope="module")
+def rig():
+    spec = importlib.util.spec_from_file_location(
+        "kill_rig", Path(__file__).with_name("kill_rig.py")
+    )
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.mark.parametrize(
+    ("victim", "how", "moment_s", "others"),
+    [
+        ("all", signal.SIGKILL, 0.6, {"analysed": True}),
+        # The others have to go on by themselves, for the drive's sake and for the file's.
+        ("all", signal.SIGSTOP, 0.4, {"afterwards": signal.SIGKILL}),
+        ("recorder", signal.SIGSTOP, 0.3, {"sweep_s": 0.5}),
+        ("publisher", signal.SIGKILL, 0.3, {"sweep_s": 1.0}),
+        ("supervisor", signal.SIGSTOP, 0.3, {}),
+    ],
+)
+def test_the_drive_goes_off_and_the_record_stays(rig, tmp_path, victim, how, moment_s, others):
+    options = {"analysed": False, "grace_s": STANDSTILL_S, **others}
+    verdict = rig.play(rig.Case(victim, how, moment_s, **options), tmp_path)
+    assert not verdict.complaints, f"{verdict.row()}\n{verdict.said}"
+
+
+@pytest.mark.parametrize(
+    ("off_s", "torque_nm", "complaint"),
+    [(10.29, 0.0, ""), (10.4, 0.0, "off after 0.400 s"), (None, 0.2, "on in the end")],
+)
+def test_the_judge_sees_a_drive_that_goes_on(rig, tmp_path, off_s, torque_nm, complaint):
+    log = rig.DriveLog(tmp_path / "drive.jsonl")
+    told = [(9.0, 0.1, True), (10.001, 0.2, True)]
+    if off_s is not None:
+        told.append((off_s, torque_nm, False))
+    log.entries = [
+        {"t_s": t_s, "device": "drive", "what": "torque", "torque_nm": torque, "enabled": enabled}
+        for t_s, torque, enabled in told
+    ]
+    verdict = rig.Verdict(rig.Case("control", signal.SIGKILL, 1.0))
+    rig._judge_drive(verdict, log, 10.0, 10.0, was_on=True)
+    assert complaint in "; ".join(verdict.complaints)
+    assert bool(verdict.complaints) == bool(complaint)

@@ -1,0 +1,111 @@
+"""Advice on the computer: read from its files, told with a remedy, never a refusal."""
+
+from dataclasses import replace
+
+import pytest
+
+from rigd.checks.machine import machine_rows
+from rigd.checks.rows import Verdict
+from rigd.profile import load_profile
+
+CPU = "sys/devices/system/cpu"
+GOOD = {
+    "proc/cpuinfo": "flags : fpu tsc\n",
+    f"{CPU}/isolated": "2-3\n",
+    f"{CPU}/cpu0/cpufreq/scaling_governor": "performance\n",
+    f"{CPU}/cpu1/cpufreq/scaling_governor": "performance\n",
+    "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc\n",
+    "proc/sys/kernel/sched_rt_runtime_us": "950000\n",
+    "proc/sys/kernel/sched_rt_period_us": "1000000\n",
+}
+REALTIME_KERNEL = "#1 SMP PREEMPT_RT Debian 6.1"
+
+
+@pytest.fixture
+def rows(tmp_path, monkeypatch):
+    """The rows of a good computer, but for some files."""
+    monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: True)
+
+    def of(changed=None, *, kernel=REALTIME_KERNEL, **settings):
+        for path, text in (GOOD | (changed or {})).items():
+            file = tmp_path / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+        asked = replace(load_profile("sim").realtime, **settings)
+        return {row.what: row for row in machine_rows(asked, tmp_path, kernel)}
+
+    return of
+
+
+def test_a_good_computer_has_no_advice(rows):
+    found = rows()
+    assert {row.verdict for row in found.values()} == {Verdict.OK}
+    assert not any(row.detail for row in found.values())
+    assert found["isolated core"].found == "2, 3"
+
+
+@pytest.mark.parametrize(
+    ("what", "path", "text", "found", "remedy"),
+    [
+        ("hardware", "proc/cpuinfo", "flags : fpu hypervisor", "virtual machine", "of its own"),
+        ("hardware", "sys/hypervisor/type", "xen", "virtual machine", "of its own"),
+        ("isolated core", f"{CPU}/isolated", "", "none", "isol"),
+        (
+            "frequency governor",
+            f"{CPU}/cpu1/cpufreq/scaling_governor",
+            "powersave",
+            "performance, powersave",
+            "cpupower",
+        ),
+        (
+            "clock source",
+            "sys/devices/system/clocksource/clocksource0/current_clocksource",
+            "hpet",
+            "hpet",
+            "dmesg",
+        ),
+        ("real-time share", "proc/sys/kernel/sched_rt_runtime_us", "500000", "50 %", "950000"),
+    ],
+)
+def test_what_is_not_good_is_a_warning_with_a_remedy(rows, what, path, text, found, remedy):
+    rows_found = rows({path: text})
+    row = rows_found.pop(what)
+    assert row.verdict is Verdict.WARNING
+    assert found in row.found
+    assert remedy in row.detail
+    assert {other.verdict for other in rows_found.values()} == {Verdict.OK}
+
+
+@pytest.mark.parametrize(
+    ("kernel", "found"),
+    [("#1 SMP PREEMPT_DYNAMIC x", "preemptible"), ("#1 SMP x", "not preemptible")],
+)
+def test_an_ordinary_kernel_is_a_warning(rows, kernel, found):
+    row = rows(kernel=kernel)["kernel"]
+    assert (row.found, row.verdict) == (found, Verdict.WARNING)
+
+
+def test_a_kernel_may_say_in_its_files_that_it_is_a_realtime_one(rows):
+    assert rows({"sys/kernel/realtime": "1\n"}, kernel="#1 SMP")["kernel"].verdict is Verdict.OK
+
+
+def test_a_loop_that_is_kept_off_the_isolated_core_is_told_so(rows):
+    row = rows(cpu=1)["isolated core"]
+    assert row.verdict is Verdict.WARNING
+    assert "realtime.cpu" in row.detail
+    assert rows(cpu=3)["isolated core"].verdict is Verdict.OK
+
+
+def test_a_wall_clock_that_nobody_keeps_is_told(rows, monkeypatch):
+    monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: False)
+    assert rows()["wall clock"].verdict is Verdict.WARNING
+
+
+def test_nothing_is_read_that_is_not_there(tmp_path):
+    found = list(machine_rows(load_profile("sim").realtime, tmp_path))
+    assert Verdict.FAIL not in {row.verdict for row in found}
+
+
+def test_this_computer_can_be_looked_at():
+    found = [row.what for row in machine_rows(load_profile("sim").realtime)]
+    assert len(found) == len(set(found)) == 7

@@ -1,0 +1,278 @@
+"""Twelve hours of rig time under the virtual clock: what grows, and is every tick accounted for?
+
+`rigd run chirp --fast --repeat N` is one supervisor with one control process. Whenever a session
+file is finished it is checked and deleted, and the memory and the descriptors of every process are
+noted.
+
+    python tests/endurance/run_campaign.py --hours 12
+"""
+
+import argparse
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rigd.session import read_session
+
+BIN = Path(sys.executable).parent
+RATE_HZ = 1000
+MODULES = {"rigd.engine.control": "control", "rigd.engine.recorder": "recorder"}
+
+_LOOK_S = 0.05
+WARM_UP = 0.2
+"""Part of the sessions that is left out: what is imported late, and what a heap settles to."""
+FLAT_KB = 2048
+"""Of growth over the whole campaign that is accepted: `rigd run` remembers what came of its
+sessions, some 3 kB each, to tell it at its end."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a process holds."""
+
+    resident_kb: int
+    """Its own and what it shares."""
+    private_kb: int
+    """Its own alone: what a leak would add to."""
+    descriptors: int
+    shared_kb: int
+    """Of shared memory behind its descriptors."""
+
+    @classmethod
+    def at(cls, pid: int) -> "Look | None":
+        """Look at a process, or return None if it has just ended."""
+        try:
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+            sizes = {line.split(":")[0]: int(line.split()[1]) for line in lines}
+            private_kb = sizes["Private_Clean"] + sizes["Private_Dirty"]
+            descriptors = list(Path(f"/proc/{pid}/fd").iterdir())
+            shared_kb = sum(map(_shared_kb, descriptors))
+        except (OSError, LookupError):
+            return None
+        return cls(sizes["Rss"], private_kb, len(descriptors), shared_kb)
+
+    @classmethod
+    def least(cls, looks: "list[Look]") -> "Look":
+        """Return the least of each: what is taken for a while only does not count."""
+        return cls(*map(min, zip(*map(astuple, looks), strict=True)))
+
+
+def _shared_kb(descriptor: Path) -> int:
+    """Return what lies in shared memory behind a descriptor in /proc."""
+    try:
+        shared = str(descriptor.readlink()).startswith("/dev/shm/")
+        return descriptor.stat().st_blocks // 2 if shared else 0
+    except OSError:
+        return 0  # closed meanwhile, as the one with which it was found
+
+
+def processes(supervisor: int) -> dict[str, int]:
+    """Return the processes of a rig by what they are."""
+    found = {"supervisor": supervisor}
+    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
+    for child in children:
+        try:
+            command = Path(f"/proc/{child}/cmdline").read_text().split("\0")
+        except OSError:
+            continue
+        for module, name in MODULES.items():
+            if module in command:
+                found[name] = int(child)
+    return found
+
+
+def check(path: Path) -> tuple[int, str]:
+    """Return the ticks of a session file, and what is wrong with it, or nothing."""
+    session = read_session(path)
+    outcome, ticks = session.outcome or {}, session.samples["tick"].astype(np.int64)
+    counts = {key: int(outcome[key]) for key in ("scheduled", "recorded", "missed", "lost")}
+    if outcome["outcome"] != "complete":
+        return len(ticks), f"{outcome['outcome']}: {outcome.get('reason')}"
+    if counts["scheduled"] != counts["recorded"] + counts["missed"] + counts["lost"]:
+        return len(ticks), f"the counts do not add up: {counts}"
+    if counts["recorded"] != len(ticks) or not np.array_equal(ticks, np.arange(len(ticks))):
+        return len(ticks), f"{len(ticks)} samples of {counts}"
+    return len(ticks), ""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """How a series of numbers, one a session, develops after the warm-up."""
+
+    first: float
+    """Median of the first third."""
+    last: float
+    """Median of the last third."""
+    slope: float
+    """Per session, of the straight line through the medians of blocks."""
+    uncertainty: float
+    """Of the slope, one standard deviation."""
+
+    @classmethod
+    def of(cls, values: list[int]) -> "Trend":
+        """Fit a line to the medians of ten blocks: single looks in mid-session scatter."""
+        kept = values[round(WARM_UP * len(values)) :]
+        third = max(1, len(kept) // 3)
+        blocks = [b for b in np.array_split(np.array(kept, float), 10) if len(b)]
+        medians = np.array([np.median(block) for block in blocks])
+        places = np.cumsum([len(block) for block in blocks]) - len(blocks[0]) / 2
+        slope, uncertainty = 0.0, float("inf")
+        if len(medians) > 2:
+            away = places - places.mean()
+            slope = float(away @ medians / (away @ away))
+            rest = medians - medians.mean() - slope * away
+            uncertainty = float(np.sqrt(rest @ rest / (len(rest) - 2) / (away @ away)))
+        first, last = statistics.median(kept[:third]), statistics.median(kept[-third:])
+        return cls(first, last, slope, uncertainty)
+
+    def grows(self, sessions: int) -> bool:
+        """Whether it grows by more than noise: beyond three deviations, and by what counts."""
+        growth = self.slope * sessions
+        return growth > FLAT_KB and self.slope > 3 * self.uncertainty
+
+
+class Campaign:
+    """One `rigd run --repeat`, and what was seen of it."""
+
+    def __init__(self, sessions: int, duration_s: float, folder: Path) -> None:
+        self.sessions = sessions
+        self.looks: dict[str, list[Look]] = {"supervisor": [], "control": [], "recorder": []}
+        """The least that each process held in the course of each session."""
+        self._fresh: dict[str, list[Look]] = {name: [] for name in self.looks}
+        self.complaints: list[str] = []
+        self.ticks = 0
+        self.files = 0
+        self._folder = folder
+        arguments = ["chirp", "--profile", "sim", "--fast", "--duration", duration_s, "--json"]
+        self._said = (folder / "said.txt").open("w+", encoding="utf-8")
+        self._process = subprocess.Popen(
+            [
+                *(BIN / "rigd", "run", *map(str, arguments)),
+                *("--repeat", str(sessions), "--output", str(folder / "sessions")),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._said,
+            env={**os.environ, "XDG_RUNTIME_DIR": str(folder)},
+        )
+
+    def follow(self) -> Iterator[int]:
+        """Attend to the files as they come; yields their number."""
+        while True:
+            ended = self._process.poll() is not None
+            if not ended:
+                self._look()
+            for path in sorted((self._folder / "sessions").glob("*.mcap")):
+                self._note()
+                self._take(path)
+                yield self.files
+            if ended:
+                break
+            time.sleep(_LOOK_S)
+        if self._process.returncode != 0:
+            said = Path(self._said.name).read_text("utf-8").strip().rsplit("\n", 1)[-1]
+            self.complaints.append(f"exit code {self._process.returncode}: {said}")
+        if self.files != self.sessions:
+            self.complaints.append(f"{self.files} files of {self.sessions}")
+
+    def close(self) -> None:
+        """End it, if it has not ended."""
+        self._process.terminate()
+        self._process.wait()
+        self._said.close()
+
+    def _look(self) -> None:
+        for name, pid in processes(self._process.pid).items():
+            look = Look.at(pid)
+            if look is not None:
+                self._fresh[name].append(look)
+
+    def _note(self) -> None:
+        for name, looks in self._fresh.items():
+            if looks and self.files < self.sessions - 1:  # in the last one they end
+                self.looks[name].append(Look.least(looks))
+            looks.clear()
+
+    def _take(self, path: Path) -> None:
+        ticks, wrong = check(path)
+        if wrong:
+            self.complaints.append(f"{path.name}: {wrong}")
+        self.ticks += ticks
+        self.files += 1
+        path.unlink()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=float, default=12.0, help="Of rig time.")
+    parser.add_argument("--duration", type=float, default=120.0, help="Of a sweep, s.")
+    given = parser.parse_args()
+    sessions = round(given.hours * 3600 / (given.duration + 16.0))
+    folder = Path(tempfile.mkdtemp(prefix="rigd-endure-"))
+    started_s = time.monotonic()
+    campaign = Campaign(sessions, given.duration, folder)
+    try:
+        for number in campaign.follow():
+            if number % max(1, sessions // 12) == 0:
+                print(_progress(campaign, time.monotonic() - started_s), flush=True)  # noqa: T201
+    finally:
+        campaign.close()
+        shutil.rmtree(folder, ignore_errors=True)
+    print(report(campaign))  # noqa: T201
+    for complaint in campaign.complaints:
+        print(f"WRONG {complaint}")  # noqa: T201
+    hours = campaign.ticks / RATE_HZ / 3600
+    took_s = time.monotonic() - started_s
+    print(f"{campaign.files} files, {hours:.2f} h of record in {took_s:.0f} s")  # noqa: T201
+    return 1 if campaign.complaints else 0
+
+
+def _progress(campaign: Campaign, passed_s: float) -> str:
+    latest = {name: looks[-1] for name, looks in campaign.looks.items() if looks}
+    sizes = ", ".join(
+        f"{name} {look.private_kb / 1024:.1f} MB {look.descriptors} fds"
+        for name, look in latest.items()
+    )
+    return f"{passed_s:5.0f} s  {campaign.files:4} sessions  {sizes}"
+
+
+def report(campaign: Campaign) -> str:
+    """Return the table of what each process holds, and note what grows."""
+    lines = [f"{'':22}  first third  last third  slope a session    a campaign"]
+    series = {
+        f"{name} {what}": [getattr(look, field) for look in looks]
+        for name, looks in campaign.looks.items()
+        for what, field in (
+            ("private, kB", "private_kb"),
+            ("resident, kB", "resident_kb"),
+            ("shared, kB", "shared_kb"),
+            ("descriptors", "descriptors"),
+        )
+    }
+    for name, values in series.items():
+        trend = Trend.of(values)
+        lines.append(
+            f"{name:22}  {trend.first:11.0f} {trend.last:11.0f}  {trend.slope:7.3f} ± "
+            f"{trend.uncertainty:5.3f}  {trend.slope * len(values):+10.1f}"
+        )
+        if name.endswith("descriptors"):
+            # One more or less for a moment is none that was forgotten.
+            early, late = min(values[: len(values) // 3]), min(values[-len(values) // 3 :])
+            if late > early:
+                campaign.complaints.append(f"{name} grow from {early} to {late}")
+        elif trend.grows(campaign.sessions):
+            campaign.complaints.append(f"{name} grows by {trend.slope:.1f} a session")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""A short campaign of ``run_campaign.py``'s kind, and that it would notice what grows."""
+
+import importlib.util
+import os
+import random
+import sys
+from pathlib import Path
+
+import pytest
+
+from rigd.engine.processes import CONTROL
+from rigd.engine.signals import StopRequest
+from rigd.excitation import hold
+from rigd.profile import load_profile
+from rigd.supervisor.crew import Crew
+from rigd.supervisor.orders import Order
+from rigd.supervisor.rig import Rig
+
+# Sessions share a core: one at a time.
+pytestmark = pytest.mark.xdist_group("realtime")
+
+COARSE_KB = 4096
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    spec = importlib.util.spec_from_file_location(
+        "run_campaign", Path(__file__).with_name("run_campaign.py")
+    )
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
+    profile = load_profile("sim")
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+    crew = Crew(live=False)
+    control = crew[CONTROL].pid
+    rig = Rig(profile, fast=True, crew=crew)
+    looks = []
+    try:
+        rig.connect()
+        for number in range(6):
+            path = tmp_path / f"{number}.mcap"
+            rig.run(Order(profile, excitation, path), StopRequest(), lambda *_: None)
+            assert campaign.check(path) == (1200, "")
+            looks.append([campaign.Look.at(pid) for pid in (os.getpid(), control)])
+    finally:
+        rig.disconnect()
+    for warm, last in zip(looks[1], looks[-1], strict=True):
+        assert last.descriptors == warm.descriptors
+        assert last.shared_kb == warm.shared_kb
+        assert last.private_kb - warm.private_kb < COARSE_KB
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_slow_leak_is_told_from_noise(campaign):
+    chooser = random.Random(1)
+    noise = [30_000 + round(chooser.gauss(0.0, 2_000.0)) for _ in range(300)]
+    leaking = [value + 20 * number for number, value in enumerate(noise)]
+    settled = [30_000 - 15_000 // (1 + number) for number in range(300)]
+    assert not campaign.Trend.of(noise).grows(300)
+    assert not campaign.Trend.of(settled).grows(300)
+    trend = campaign.Trend.of(leaking)
+    assert trend.grows(300)
+    assert trend.slope == pytest.approx(20.0, abs=5.0)

@@ -1,0 +1,274 @@
+"""The daemon's logic on a rig in this process: commands, states, control, and what goes wrong."""
+
+import pytest
+
+from rigd.devices.contracts import DeviceError
+from rigd.devices.registry import Reality
+from rigd.service.documents import Peer
+from rigd.service.service import CommandError
+from rigd.service.states import State
+
+SHORT = {
+    "excitation": "hold",
+    "parameters": {"duration_s": 0.3, "rest_s": 0.0, "ring_down_s": 0.0},
+}
+OTHER = Peer(2, 200, 0)
+
+
+def fail(drive):
+    raise DeviceError("The drive is gone.")
+
+
+def transitions(operated):
+    return [(e["from"], e["to"]) for e in operated.events if e["event"] == "state"]
+
+
+def test_a_session_goes_from_ready_over_running_to_ready(operated, tmp_path):
+    assert operated.state is State.READY
+    reply = operated.ask("start", **SHORT, notes={"operator": "Ada"})
+    assert reply["plan"]["record_s"] == 0.3
+    assert operated.state is State.READY
+    assert transitions(operated) == [("idle", "ready"), ("ready", "running"), ("running", "ready")]
+    (session,) = operated.last["sessions"]
+    assert session["outcome"] == "complete"
+    assert session["recorded"] == 300
+    assert session["path"].startswith(str(tmp_path / "out"))
+    assert not operated.last["failed"]
+    assert operated.world.highest_nm > 0.0
+    assert operated.world.drives[0].safe
+    assert operated.world.wrong == []
+
+
+def test_a_series_runs_on_one_connection_and_stops_at_the_first_that_fails(operated):
+    operated.ask("start", **SHORT, repeat=2)
+    assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "complete"]
+    assert len(operated.world.drives) == 1
+    operated.world.countdown, operated.world.then = 2700, fail
+    operated.ask("start", **SHORT, repeat=3)
+    assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "fault"]
+    assert operated.last["failed"]
+    assert operated.state is State.FAULT
+    assert "The drive is gone." in operated.service.status()["reason"]
+
+
+def test_a_stop_may_come_from_anybody_and_ends_the_series(operated):
+    def stop(drive):
+        reply = operated.meanwhile("stop")
+        assert reply == {"stopping": True}
+        assert operated.state is State.STOPPING
+
+    operated.world.countdown, operated.world.then = 1200, stop
+    operated.ask("start", **SHORT, repeat=5)
+    (session,) = operated.last["sessions"]
+    assert session["outcome"] == "stopped"
+    assert operated.last["stopped"]
+    assert not operated.last["failed"]
+    assert operated.state is State.READY
+    assert ("stopping", "ready") in transitions(operated)
+    assert operated.ask("stop", peer=OTHER) == {"stopping": False}
+
+
+def test_what_a_state_does_not_allow_is_refused(operated):
+    refused = []
+
+    def ask_everything(drive):
+        for command, fields in (("start", SHORT), ("tare", {}), ("zero", {}), ("reset", {})):
+            refused.append(operated.meanwhile(command, **fields))
+
+    operated.world.countdown, operated.world.then = 1200, ask_everything
+    operated.ask("start", **SHORT)
+    assert len(refused) == 4
+    assert all(isinstance(error, CommandError) for error in refused)
+    assert all("running" in str(error) for error in refused)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+    assert isinstance(operated.ask("reset"), CommandError)
+
+
+def test_control_belongs_to_one_client_until_it_leaves(operated):
+    operated.ask("tare")
+    refusal = operated.ask("start", peer=OTHER, **SHORT)
+    assert "controlled by process 100 of" in str(refusal)
+    assert operated.service.status()["controller"]["pid"] == 100
+    assert operated.ask("status", peer=OTHER)["state"] == "ready"
+    operated.service.release(OTHER)
+    assert isinstance(operated.ask("zero", peer=OTHER), CommandError)
+    operated.service.release(operated.peer)
+    assert "moved_rad" in operated.ask("zero", peer=OTHER)
+
+
+def test_a_client_that_leaves_stops_nothing(operated):
+    def leave(drive):
+        operated.service.release(operated.peer)
+
+    operated.world.countdown, operated.world.then = 1200, leave
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_tare_and_zero_without_torque(operated):
+    tare = operated.ask("tare")
+    assert set(tare["mean"]) == {"fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"}
+    assert operated.ask("zero")["moved_rad"] == pytest.approx(0.0, abs=1e-3)
+    assert operated.world.highest_nm == 0.0
+
+
+def test_only_reset_leaves_a_fault(operated):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    for command, fields in (("start", SHORT), ("tare", {}), ("zero", {})):
+        refusal = operated.ask(command, **fields)
+        assert "rigd reset" in str(refusal)
+    operated.watch()
+    assert operated.state is State.FAULT
+    operated.ask("reset")
+    assert operated.state is State.READY
+    assert transitions(operated)[-2:] == [("fault", "idle"), ("idle", "ready")]
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_a_limit_that_ends_a_session_is_a_fault_and_the_zero_survives_its_reset(operated):
+    def jump(drive):
+        drive.offset_rad = 0.4
+
+    operated.ask("zero")
+    operated.world.countdown, operated.world.then = 1200, jump
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert operated.rig.connected
+    operated.world.drives[0].offset_rad = 0.0
+    assert operated.ask("reset") == {"zero_lost": False}
+    assert transitions(operated)[-1] == ("fault", "ready")
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_a_zero_that_was_lost_has_to_be_set_before_the_next_session(operated):
+    operated.ask("zero")
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.ask("reset") == {"zero_lost": True}
+    assert "rigd zero" in str(operated.ask("start", **SHORT))
+    assert operated.service.status()["zero_lost"]
+    operated.ask("zero")
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_a_rig_that_cannot_be_connected_is_a_fault_until_it_can(operate):
+    operated = operate()
+    operated.world.absent = True
+    operated.open()
+    assert operated.state is State.FAULT
+    assert "does not answer" in str(operated.ask("reset"))
+    assert operated.state is State.FAULT
+    operated.world.absent = False
+    operated.ask("reset")
+    assert operated.state is State.READY
+
+
+def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    operated.moving = Reality.HARDWARE
+    assert "start it anew" in str(operated.ask("reset"))
+    assert operated.state is State.FAULT
+    assert len(operated.world.drives) == 1
+
+
+def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
+    operated.rig._crew.control.kill()
+    for _ in range(100):
+        operated.watch()
+        if operated.state is State.FAULT:
+            break
+    assert operated.state is State.FAULT
+    assert "killed by signal 9" in operated.service.status()["reason"]
+
+
+def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
+    refusal = operated.ask(
+        "start", excitation="step", parameters={"amplitude_rad": 3.0, "duration_s": 1.0}
+    )
+    assert refusal.wrong_use
+    assert "limits.angle_rad" in str(refusal)
+    assert operated.state is State.READY
+    assert operated.world.highest_nm == 0.0
+
+
+@pytest.mark.parametrize("name", ["missing.csv", "/dev/zero"])
+def test_only_plain_files_are_read(operated, tmp_path, name):
+    refusal = operated.ask("start", excitation="file", parameters={"path": str(tmp_path / name)})
+    assert refusal.wrong_use
+    assert name in str(refusal)
+
+
+def test_a_disk_without_room_for_a_file_is_refused(operated, tmp_path):
+    (tmp_path / "out").write_text("in the way")
+    refusal = operated.ask("start", **SHORT)
+    assert "cannot be made a folder" in str(refusal)
+    assert operated.state is State.READY
+
+
+def test_a_folder_that_cannot_be_written_any_more_ends_the_series_as_a_fault(operated, tmp_path):
+    def take_away(drive):
+        (tmp_path / "out").rename(tmp_path / "gone")
+        (tmp_path / "out").write_text("in the way")
+
+    operated.world.countdown, operated.world.then = 2500, take_away
+    operated.ask("start", **SHORT, repeat=2)
+    assert operated.last["failed"]
+    assert operated.world.drives[0].safe
+
+
+def test_what_nobody_foresaw_ends_with_everything_off(operated, monkeypatch):
+    def break_(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(operated.rig, "run", break_)
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert not operated.rig.connected
+    assert "ZeroDivisionError" in operated.last["reason"]
+
+
+def test_the_end_of_the_daemon_stops_a_session_safely(operated):
+    operated.world.countdown = 1200
+    operated.world.then = lambda drive: operated.loop.call_soon_threadsafe(close)
+    closed = []
+
+    def close():
+        closed.append(operated.loop.create_task(operated.service.close("it ends")))
+
+    operated.ask("start", **SHORT, repeat=3)
+    operated.loop.run_until_complete(closed[0])
+    (session,) = operated.last["sessions"]
+    assert session["outcome"] == "stopped"
+    assert operated.state is State.IDLE
+    assert not operated.rig.connected
+    assert operated.world.drives[0].safe
+    assert "shut down" in str(operated.ask("reset"))
+
+
+def test_status_tells_of_progress_processes_and_topics(operated):
+    seen = []
+
+    def look(drive):
+        operated.service.look()
+        seen.append(operated.service.status())
+
+    operated.world.countdown, operated.world.then = 1200, look
+    operated.ask("start", **SHORT)
+    (status,) = seen
+    assert status["state"] == "running"
+    assert status["progress"]["phase"] == "running"
+    assert 0 < status["progress"]["tick"] < status["progress"]["total"] == 300
+    assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
+        "control": "at work", "recorder": "at work", "supervisor": "at work",
+    }  # fmt: skip
+    assert [t["name"] for t in status["rig"]["topics"]][-1] == "/rig/sample"
+    assert [(h["from"], h["to"]) for h in status["history"]] == [
+        ("idle", "ready"), ("ready", "running"),
+    ]  # fmt: skip
+    assert any(event["event"] == "progress" for event in operated.events)
