@@ -1,6 +1,7 @@
 """The daemon's service on a rig whose processes are threads: everything else is the real thing."""
 
 import asyncio
+import contextlib
 import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,7 @@ from rigd.service import messages
 from rigd.service.documents import Peer
 from rigd.service.service import CommandError, Service
 from rigd.service.states import State
+from rigd.session import SessionError, SessionWriter
 from rigd.supervisor import rig as rig_module
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.rig import Rig
@@ -176,7 +178,7 @@ class ThreadChild:
         self.thread = threading.Thread(target=self.work, daemon=True)
 
     def work(self):
-        _current.parent = ThreadParent(self)
+        _current.parent, _current.writer = ThreadParent(self), None
         try:
             self.main()
         except (Died, SystemExit, EOFError):
@@ -184,6 +186,9 @@ class ThreadChild:
         finally:
             if self.killed and self.name == "control":
                 self.world.drives[-1].switch_off()  # its own watchdog
+            if self.killed and self.name == "recorder" and _current.writer is not None:
+                with contextlib.suppress(SessionError):
+                    _current.writer.abandon()  # a process's files are closed with it
             self.outbox.put(_ENDED)
 
     def start(self, job):
@@ -226,6 +231,11 @@ class ThreadChild:
             self.inbox.put(_ENDED)
             self.thread.join(30.0)
             assert not self.thread.is_alive()
+
+
+def open_writer(path):
+    _current.writer = SessionWriter(path)
+    return _current.writer
 
 
 def open_watched(rig):
@@ -327,6 +337,7 @@ def operate(profile, tmp_path, monkeypatch):
     for module in (control, recorder):
         monkeypatch.setattr(module, "Parent", lambda: _current.parent)
     monkeypatch.setattr(recorder, "signals", SimpleNamespace(ignore=lambda: None))
+    monkeypatch.setattr(recorder, "SessionWriter", open_writer)
     monkeypatch.setattr(control, "StopRequest", QuietStop)
     monkeypatch.setattr(control, "collect_no_garbage", lambda: "off")
     monkeypatch.setattr(control, "open_devices", open_watched)
