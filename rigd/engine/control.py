@@ -5,6 +5,7 @@ the supervisor orders, one after the other. A device that fails ends it: connect
 operator's decision.
 """
 
+import gc
 from collections.abc import Callable
 from dataclasses import asdict
 
@@ -82,6 +83,7 @@ def attend(
         devices.sensor.connect()
         devices.drive.connect()
         attendance = _Attendance(profile, devices, clock, channels, parent, stop, obtained)
+        channels.board[Word.PHASE] = Phase.OFF
         parent.send(
             connected=True,
             calibration=devices.sensor.calibration(),
@@ -134,10 +136,10 @@ class _Attendance:
         DeviceError, OSError
             If a device failed.
         """
-        self._board[Word.PHASE] = Phase.OFF
         while (message := self._await_order()) is not None:
             if "session" in message:
                 self._run_session(message["session"])
+                gc.collect()  # the torque is off: the only time for it
             elif "tare" in message:
                 self._answer(self._tare)
             elif "zero" in message:

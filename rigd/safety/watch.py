@@ -16,6 +16,9 @@ MISSED_WINDOW_S = 10.0
 REARM_S = 1.0
 """How long a channel has to stay clear of its limit before it is announced as near it again."""
 
+_UNSURE_TICKS = 3
+"""After missed ticks the next latches come unevenly, and no jump can be told from that."""
+
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _FORCES = 3
 _Reading = tuple[str, str, str, float, float, float]
@@ -83,6 +86,7 @@ class LimitWatch:
         "_step_warning",
         "_tare_warning_nm",
         "_time_constant_s",
+        "_unsure",
         "_warned",
         "_wrench_limits",
         "_wrench_warnings",
@@ -135,6 +139,7 @@ class LimitWatch:
         self._stale_angles = 0
         self._stale_wrenches = 0
         self._saturated = 0
+        self._unsure = 0
         self._missed_near = False
         self._slowly_near = False
         self.warning = False
@@ -194,6 +199,7 @@ class LimitWatch:
             self._before_that_rad = before
             self._previous_moved_rad = moved
             self._previous_elapsed = 1
+            self._unsure = 0
             self.warning = self._slowly_near
             return None
         return self._check_closely(reference_rad, angle_rad, wrench, angle_stale)
@@ -240,14 +246,20 @@ class LimitWatch:
             + abs(self._before_that_rad)
         )
         jump_rad = moved_rad - elapsed * before_rad
+        if elapsed > 1:
+            self._unsure = _UNSURE_TICKS
+        elif self._unsure:
+            self._unsure -= 1
         self._previous_angle_rad = angle_rad
         self._before_that_rad, self._previous_moved_rad = before_rad, moved_rad / elapsed
         self._previous_elapsed, self._elapsed = elapsed, 1
         limit_rad_s = self._limits.velocity_rad_s
-        return [
-            ("velocity", "", "", speed_rad_s, limit_rad_s, _part("velocity") * limit_rad_s),
-            ("encoder jump", "", "", jump_rad, possible_rad, _part("encoder jump") * possible_rad),
-        ]
+        near_rad_s = _part("velocity") * limit_rad_s
+        readings: list[_Reading] = [("velocity", "", "", speed_rad_s, limit_rad_s, near_rad_s)]
+        if not self._unsure:
+            near_rad = _part("encoder jump") * possible_rad
+            readings.append(("encoder jump", "", "", jump_rad, possible_rad, near_rad))
+        return readings
 
     def check_stale(
         self, angle_stale: bool, wrench_stale: bool, saturated: bool = False

@@ -30,6 +30,8 @@ MODULES = {"rigd.engine.control": "control", "rigd.engine.recorder": "recorder"}
 _LOOK_S = 0.05
 WARM_UP = 0.2
 """Part of the sessions that is left out: what is imported late, and what a heap settles to."""
+ENOUGH = 100
+"""Sessions from which on a trend is judged."""
 FLAT_KB = 2048
 """Of growth over the whole campaign that is accepted: `rigd run` remembers what came of its
 sessions, some 3 kB each, to tell it at its end."""
@@ -137,7 +139,7 @@ class Trend:
     def grows(self, sessions: int) -> bool:
         """Whether it grows by more than noise: beyond three deviations, and by what counts."""
         growth = self.slope * sessions
-        return growth > FLAT_KB and self.slope > 3 * self.uncertainty
+        return sessions >= ENOUGH and growth > FLAT_KB and self.slope > 3 * self.uncertainty
 
 
 class Campaign:
@@ -266,8 +268,9 @@ def report(campaign: Campaign) -> str:
         )
         if name.endswith("descriptors"):
             # One more or less for a moment is none that was forgotten.
-            early, late = min(values[: len(values) // 3]), min(values[-len(values) // 3 :])
-            if late > early:
+            warm = values[round(WARM_UP * len(values)) :]
+            early, late = min(warm[: len(warm) // 2 + 1]), min(warm[-len(warm) // 2 :])
+            if campaign.sessions >= ENOUGH and late > early:
                 campaign.complaints.append(f"{name} grow from {early} to {late}")
         elif trend.grows(campaign.sessions):
             campaign.complaints.append(f"{name} grows by {trend.slope:.1f} a session")

@@ -78,6 +78,19 @@ def test_late_ticks_are_no_jumps(speed_rad_s, frequency_hz, lateness, phase):
     assert follow(watch, limited) is None
 
 
+def test_uneven_latches_after_missed_ticks_are_no_jumps(watch):
+    # As seen on the wire: 24 ticks missed, then a latch too early and one that makes up for it.
+    follow(watch, (1.9e-3 * np.arange(5)).tolist())
+    watch.skip(24)
+    moved_rad = 1.9e-3 * np.array([29.0, 29.0, 31.05])
+    assert follow(watch, moved_rad.tolist()) is None
+    # A slip is found again soon after.
+    ordinary = moved_rad[-1] + 1.9e-3 * np.arange(1, 11)
+    ordinary[6:] += 0.01
+    tick, violation = follow(watch, ordinary.tolist())
+    assert (tick, violation.channel) == (6, "encoder's jump")
+
+
 def test_angles_that_are_missing_make_no_jump(watch):
     """Nine old angles in a row, while the motor goes from rest to 3 rad/s."""
     speeds_rad_s = np.minimum(np.arange(20) * 0.4, 3.0)
