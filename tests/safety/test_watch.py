@@ -86,7 +86,7 @@ def test_uneven_latches_after_missed_ticks_are_no_jumps(watch):
     assert follow(watch, moved_rad.tolist()) is None
     # A slip is found again soon after.
     ordinary = moved_rad[-1] + 1.9e-3 * np.arange(1, 11)
-    ordinary[6:] += 0.01
+    ordinary[6:] -= 0.0055  # 3.6 rad/s for a tick
     tick, violation = follow(watch, ordinary.tolist())
     assert (tick, violation.channel) == (6, "encoder's jump")
 
