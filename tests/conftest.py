@@ -1,6 +1,7 @@
 """Settings that must stand before numpy is imported, and the simulated rig as a process."""
 
 import atexit
+import contextlib
 import os
 import re
 import shutil
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,79 @@ def runtime_folder(monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+def rigd(tmp_path):
+    """Run `rigd` in an empty folder; returns the completed process."""
+
+    def run(*arguments, timeout=100):
+        return subprocess.run(
+            [RIGD, *map(str, arguments)],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+            env=os.environ | {"COLUMNS": "120"},
+        )
+
+    return run
+
+
+@pytest.fixture
+def start_rigd(tmp_path):
+    """Start `rigd` in an empty folder; it is killed if a test leaves it running."""
+    started = []
+
+    def start(*arguments, folder=tmp_path):
+        started.append(
+            subprocess.Popen(
+                [RIGD, *map(str, arguments)],
+                cwd=folder,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,  # a process group of its own, as in a terminal
+            )
+        )
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.kill()
+        # What it said helps where a test failed without asking.
+        sys.stdout.write("\n".join(process.communicate()))
+
+
+@dataclass(frozen=True)
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def rigd_here(tmp_path, monkeypatch):
+    """Run `rigd` in this process, as far as it comes without any other."""
+    from typer.testing import CliRunner
+
+    from rigd.cli.app import app
+    from rigd.engine.signals import StopRequest
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    no_crew = StopRequest(), contextlib.nullcontext()
+    for command in ("run", "identify"):
+        monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
+    monkeypatch.setattr("rigd.engine.signals.ignore", lambda **_: None)  # of the test runner
+
+    def run(*arguments):
+        done = CliRunner().invoke(app, list(map(str, arguments)))
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return Done(done.exit_code, done.stdout, done.stderr)
+
+    return run
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from rigd.engine.board import Phase
 from rigd.engine.processes import PROCESSES
 from rigd.planning import Plan
 from rigd.service.states import Transition
-from rigd.supervisor.rig import ProcessStatus, RigStatus
+from rigd.supervisor.status import ProcessStatus, RigStatus
 
 Document = dict[str, Any]
 

@@ -38,8 +38,9 @@ from rigd.service.documents import (
 )
 from rigd.service.states import State, StateMachine, Transition
 from rigd.supervisor.orders import Order, choose_path, make_room, what_is_kept
-from rigd.supervisor.rig import RigError, RigStatus
+from rigd.supervisor.rig import RigError
 from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult, Watcher
+from rigd.supervisor.status import RigStatus
 
 LOOK_S = 0.2
 """From one look at the rig to the next."""

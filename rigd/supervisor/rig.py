@@ -1,26 +1,23 @@
 """A rig as whoever runs sessions on it sees it: connect, run, tare, zero, status, disconnect."""
 
 import contextlib
-import os
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.resetting import reset_drive
-from rigd.engine.board import Phase, Stop, Word
+from rigd.engine.board import Stop, Word
 from rigd.engine.jobs import ControlJob
 from rigd.engine.process import ChildError, Message
-from rigd.engine.processes import CONTROL, PROCESSES, SUPERVISOR, Pulse
+from rigd.engine.processes import CONTROL, Pulse
 from rigd.engine.signals import StopRequest
-from rigd.engine.topics import TOPICS
 from rigd.profile import Profile
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.live_view import LiveView
 from rigd.supervisor.orders import Order
 from rigd.supervisor.session import Session, SessionResult, Watcher
+from rigd.supervisor.status import RigStatus, StatusWatch
 
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0
@@ -30,49 +27,6 @@ _ANSWER_PATIENCE_S = 10.0
 
 class RigError(Exception):
     """The rig cannot do what is asked, or is lost; the message is for the operator."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessStatus:
-    """How one process of the table is."""
-
-    name: str
-    pid: int
-    state: str
-    """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
-    still_s: float
-    """For how long it has shown no sign of work, as far as somebody looked."""
-
-
-@dataclass(frozen=True, slots=True)
-class TopicStatus:
-    """What came of one topic of the table."""
-
-    name: str
-    written: int
-    rate_hz: float | None
-    """Since the last look; None where there was none."""
-    expected_hz: float | None
-    """While a session is recorded."""
-    waiting: int
-    """Records that the recorder has yet to take."""
-
-
-@dataclass(frozen=True, slots=True)
-class RigStatus:
-    """A look at the board."""
-
-    phase: Phase
-    angle_rad: float
-    """From the rig's zero."""
-    coupling_torque_nm: float
-    torque_command_nm: float
-    tick: int
-    missed: int
-    late: int
-    lost: int
-    processes: tuple[ProcessStatus, ...]
-    topics: tuple[TopicStatus, ...]
 
 
 class Rig:
@@ -111,8 +65,7 @@ class Rig:
         self._zero_set = False
         self._pulse = Pulse()
         self._looking = threading.Lock()
-        self._pulses = {process: Pulse() for process in PROCESSES}
-        self._written: tuple[float, tuple[int, ...]] | None = None
+        self._statuses = StatusWatch(profile.rig.rate_hz)
         self.connected = False
         self.zero_lost = False
 
@@ -267,44 +220,13 @@ class Rig:
         """Return a look at the board, from any thread; None while there is none."""
         with self._looking:
             crew = self._crew
-            return None if crew is None or not crew.laid_out else self._look(crew)
-
-    def _look(self, crew: Crew) -> RigStatus:
-        channels = crew.channels
-        board, rate_hz = channels.board, self._profile.rig.rate_hz
-        now_s = time.monotonic()
-        written = tuple(ring.written for ring in channels.rings)
-        before_s, before = self._written or (now_s, written)
-        self._written = now_s, written
-        passed_s = now_s - before_s
-        return RigStatus(
-            phase=Phase(board[Word.PHASE]),
-            angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
-            coupling_torque_nm=board[Word.COUPLING_TORQUE_NNM] * 1e-9,
-            torque_command_nm=board[Word.TORQUE_COMMAND_NNM] * 1e-9,
-            tick=board[Word.SCHEDULED],
-            missed=board[Word.MISSED],
-            late=board[Word.LATE],
-            lost=board[Word.LOST],
-            processes=tuple(self._process_statuses(crew)),
-            topics=tuple(
-                TopicStatus(
-                    topic.name,
-                    ring.written,
-                    (ring.written - first) / passed_s if passed_s > 0.0 else None,
-                    topic.expected_hz(rate_hz),
-                    ring.waiting,
-                )
-                for topic, ring, first in zip(TOPICS, channels.rings, before, strict=True)
-            ),
-        )
+            return None if crew is None or not crew.laid_out else self._statuses.look(crew)
 
     def disconnect(self) -> None:
         """Disable the drive, close the devices, end the processes; harmless when repeated."""
         with self._looking:
             crew, self._crew = self._crew, None
             self.connected = False
-            self._written = None
         if crew is not None:
             crew.end()
 
@@ -354,23 +276,3 @@ class Rig:
         with contextlib.suppress(ChildError):
             self._crew.control.poll(_ANSWER_PATIENCE_S)
         self.disconnect()
-
-    def _process_statuses(self, crew: Crew) -> Iterator[ProcessStatus]:
-        board, now_s = crew.channels.board, time.monotonic()
-        for process in PROCESSES:
-            still_s = self._pulses[process].look(board[process.beat], now_s)
-            if process is SUPERVISOR:
-                yield ProcessStatus(process.name, os.getpid(), "at work", still_s)
-                continue
-            if process not in crew:
-                continue
-            child = crew[process]
-            if not child.running:
-                state = "ended"
-            elif not crew.has_job(process):
-                state = "waiting"
-            elif process.hung_after_s is not None and still_s > process.hung_after_s:
-                state = "hung"
-            else:
-                state = "at work"
-            yield ProcessStatus(process.name, child.pid, state, still_s)

@@ -1,5 +1,6 @@
 """From samples and the kernel's accounts to figures and a histogram."""
 
+import mmap
 import os
 from dataclasses import astuple
 from pathlib import Path
@@ -106,8 +107,8 @@ def test_usage_is_taken_between_looks_at_a_running_record():
     assert meter.cpu_percent is None
     meter.look(Phase.RUNNING)
     assert (meter.cpu_percent, meter.page_faults) == (None, None)
-    block = bytearray(16 << 20)
-    block[:: 1 << 12] = bytes(len(block) >> 12)
+    with mmap.mmap(-1, 16 << 20) as fresh:  # from the system, not from what was freed before
+        fresh[:: 1 << 12] = bytes(len(fresh) >> 12)
     meter.look(Phase.RUNNING)
     faults = meter.page_faults
     assert meter.cpu_percent is not None

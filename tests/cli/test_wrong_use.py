@@ -1,13 +1,6 @@
 """What an operator can get wrong: one or two sentences, an exit code, nothing broken."""
 
-import contextlib
-from dataclasses import dataclass
-
 import pytest
-from typer.testing import CliRunner
-
-from rigd.cli.app import app
-from rigd.engine.signals import StopRequest
 
 PROFILE_CHANGES = {
     "missing key": ("viscous_nm_s_per_rad = ", "# viscous_nm_s_per_rad = ", "viscous_nm_s_per_rad"),
@@ -30,31 +23,6 @@ PROFILE_CHANGES = {
     "no such drive": ('drive = "sim"', 'drive = "steam"', "steam"),
     "not TOML": ("[rig]", "[rig", "TOML"),
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Done:
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-@pytest.fixture
-def rigd_here(tmp_path, monkeypatch):
-    """Run `rigd` in this process, as far as it comes without any other."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "120")
-    no_crew = StopRequest(), contextlib.nullcontext()
-    for command in ("run", "identify"):
-        monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
-    monkeypatch.setattr("rigd.engine.signals.ignore", lambda **_: None)  # of the test runner
-
-    def run(*arguments):
-        done = CliRunner().invoke(app, list(map(str, arguments)))
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return Done(done.exit_code, done.stdout, done.stderr)
-
-    return run
 
 
 def assert_refused(done, code, *words):

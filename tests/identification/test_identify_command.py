@@ -92,8 +92,8 @@ def test_from_the_rig_to_lines_for_its_profile(rigd, tmp_path):
         (("--from", "nosuch.mcap", "--profile", "nosuch"), 2, "nosuch"),
     ],
 )
-def test_wrong_use(rigd, tmp_path, options, code, words):
-    done = rigd("identify", "motor", "--fast", *options)
+def test_wrong_use(rigd_here, tmp_path, options, code, words):
+    done = rigd_here("identify", "motor", "--fast", *options)
     text = done.stdout + done.stderr
     assert done.returncode == code, text
     assert words in text

@@ -51,15 +51,21 @@ def quiet_profile(write_profile):
 def run_order(tmp_path):
     """Run a short chirp on a profile, without the command line.
 
-    A fault is injected in the middle of the record, however long the start takes.
+    Faults are injected in the middle of the record, however long the start takes, one after the
+    other; the ticks before which this was are noted in `injected`.
     """
 
-    def run(profile, name: str, *, fast: bool, fault: str = "", **options) -> SessionResult:
+    def run(
+        profile, name: str, *, fast: bool, faults=(), injected: list | None = None, **options
+    ) -> SessionResult:
+        noted = [] if injected is None else injected
+
         def watch(progress: SessionProgress, _: list[Event]) -> None:
-            nonlocal fault
-            if fault and progress.phase == Phase.RUNNING and progress.tick > 200:
-                inject(profile.name, [fault])
-                fault = ""
+            if progress.phase != Phase.RUNNING or len(noted) == len(faults):
+                return
+            if progress.tick > (noted[-1] if noted else 0) + 200:
+                noted.append(progress.tick)
+                inject(profile.name, [faults[len(noted) - 1]])
 
         settings = {"duration_s": 2.0, "rest_s": 0.3, "ring_down_s": 0.5, "stop_hz": 20.0}
         excitation = chirp(rate_hz=profile.rig.rate_hz, **(settings | options))

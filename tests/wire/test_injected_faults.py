@@ -87,7 +87,7 @@ def test_a_fault_ends_in_a_drive_without_torque(
     simulator = start_simulator(profile, "--lock-step", "--log", log)
     # The record could go on for long, so that the fault comes before its end at any pace.
     options = CHIRP | {"duration_s": 60.0}
-    result = run_order(load(profile), "session", fast=True, fault=row.fault, **options)
+    result = run_order(load(profile), "session", fast=True, faults=[row.fault], **options)
     assert result.outcome == "fault"
     assert re.search(MESSAGES[row.name], result.reason), result.reason
     assert result.scheduled == result.recorded + result.missed + result.lost
@@ -114,20 +114,33 @@ def test_a_fault_ends_in_a_drive_without_torque(
     assert round((off["t_s"] - begun["t_s"]) * 1000) <= ticks
 
 
-@pytest.mark.parametrize("row", rows(BORNE), ids=named)
-def test_a_passing_fault_is_flagged_and_borne(
-    row, quiet_profile, start_simulator, run_order, load, tmp_path
+@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+def test_passing_faults_are_flagged_and_borne(
+    name, quiet_profile, start_simulator, run_order, load
 ):
-    profile = quiet_profile(row.profile)
+    """One after the other in one session: each is flagged up to the next, as its row says."""
+    profile = quiet_profile(name)
     start_simulator(profile, "--lock-step")
-    options = CHIRP | {"duration_s": 3.0}
-    result = run_order(load(profile), "session", fast=True, fault=row.fault, **options)
+    borne = [row for row in rows(BORNE) if row.profile == name]
+    injected = []
+    result = run_order(
+        load(profile),
+        "session",
+        fast=True,
+        faults=[row.fault for row in borne],
+        injected=injected,
+        **CHIRP | {"duration_s": 8.0},
+    )
     assert result.went_well, result.reason
+    assert len(injected) == len(borne)
     status = read_session(result.path).samples["status"]
     stale = status & (Status.ANGLE_STALE | Status.WRENCH_STALE)
-    if row.ticks:
-        flag = Status[row.last.upper().replace(" ", "_")]
-        assert 1 <= (status & flag != 0).sum() <= row.ticks
-        assert not (stale & ~int(flag)).any()
-    else:
-        assert not stale.any()
+    assert not stale[: injected[0]].any()
+    for row, first, end in zip(borne, injected, [*injected[1:], len(status)], strict=True):
+        here = stale[first:end]
+        if row.ticks:
+            flag = Status[row.last.upper().replace(" ", "_")]
+            assert 1 <= (here & flag != 0).sum() <= row.ticks, row.name
+            assert not (here & ~int(flag)).any(), row.name
+        else:
+            assert not here.any(), row.name

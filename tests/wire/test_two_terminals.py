@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,8 +10,6 @@ import numpy as np
 import pytest
 
 from rigd.session import Status, read_session, read_timings
-
-RIGD = Path(sys.executable).parent / "rigd"
 
 # Little torque: while the machine stands still it is held, and swings the motor out.
 CHIRP = ("--amplitude", "0.01", "--stop-hz", "8", "--duration", "3")
@@ -42,44 +38,18 @@ def _control_process(supervisor: int) -> int:
 
 
 @pytest.fixture
-def run_chirp(tmp_path):
+def run_chirp(rigd):
     def run(profile, *options):
-        arguments = ["run", "chirp", "--profile", profile, *CHIRP, "--rest", "0.2"]
-        arguments += ["--ring-down", "0.3", "--json", *options]
-        return subprocess.run(
-            [RIGD, *map(str, arguments)],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=100,
-            check=False,
-        )
+        lengths = ("--rest", "0.2", "--ring-down", "0.3")
+        return rigd("run", "chirp", "--profile", profile, *CHIRP, *lengths, "--json", *options)
 
     return run
 
 
 @pytest.fixture
-def start_chirp(tmp_path):
+def start_chirp(start_rigd):
     """Start the paper's chirp and leave it running."""
-    started = []
-
-    def start(profile):
-        started.append(
-            subprocess.Popen(
-                [RIGD, "run", "chirp", "--profile", str(profile), "--json"],
-                cwd=tmp_path,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,  # a process group of its own, as in a terminal
-            )
-        )
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+    return lambda profile: start_rigd("run", "chirp", "--profile", profile, "--json")
 
 
 def _followed(session) -> np.ndarray:

@@ -89,7 +89,9 @@ def test_a_bus_that_does_not_open_counts_no_user():
 def test_a_bus_is_used_by_one_program_at_a_time(runtime_folder):
     first, second = BusLock("can0", simulated=True), BusLock("can0", simulated=True)
     first.acquire()
-    with pytest.raises(DeviceError, match=rf"another rigd is using it \(rigd, process {os.getpid()}\)"):
+    with pytest.raises(
+        DeviceError, match=rf"another rigd is using it \(rigd, process {os.getpid()}\)"
+    ):
         second.acquire()
     other = BusLock("can1", simulated=True)
     other.acquire()

@@ -123,7 +123,7 @@ def bus(bench):
 def node(bus):
     network = canopen.Network(bus=bus)
     node = BaseNode402(NODE, master_dictionary())
-    for name in ("SWITCH_OPMODE", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE", "CHECK_TPDO"):
+    for name in ("SWITCH_OP_MODE", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE", "CHECK_TPDO"):
         setattr(node, f"TIMEOUT_{name}", 30.0)
     node.sdo.RESPONSE_TIMEOUT = 30.0
     network.add_node(node)
