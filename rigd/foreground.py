@@ -10,7 +10,6 @@ import typer
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
 from rigd.devices.registry import Reality, UnknownDeviceError, simulated_differently
-from rigd.engine.board import Phase
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, ExcitationError
@@ -21,17 +20,6 @@ from rigd.supervisor.lock import RigBusyError, RigLock
 from rigd.supervisor.orders import Order, choose_path, load_rig, make_room, what_is_kept
 from rigd.supervisor.rig import Rig, RigError
 from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult
-
-_PHASES = {
-    Phase.PREPARING: "preparing",
-    Phase.SETTLING: "settling",
-    Phase.WAITING: "waiting for the beam to rest",
-    Phase.TARING: "taring",
-    Phase.READY: "ready",
-    Phase.RUNNING: "recording",
-    Phase.RETURNING: "returning",
-    Phase.OFF: "drive off",
-}
 
 Tell = Callable[[str], None]
 
@@ -224,7 +212,7 @@ class _ProgressView:
                 )
         self._progress.update(
             self._task,
-            description=_PHASES[state.phase],
+            description=state.phase.words,
             completed=state.tick,
             counts=f"{state.missed} missed, {state.late} late" if state.missed else "",
         )

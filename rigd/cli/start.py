@@ -178,7 +178,7 @@ class _ProgressView:
 
     def update(self, progress: dict[str, Any]) -> None:
         """Show where the session is."""
-        from rigd.cli.status_view import PHASES
+        from rigd.engine.board import Phase
 
         number = f" {progress['session']}/{progress['repeat']}" if progress["repeat"] > 1 else ""
         left = progress["time_left_s"]
@@ -187,7 +187,7 @@ class _ProgressView:
             more += f"; {progress['missed']} missed, {progress['late']} late"
         self._progress.update(
             self._task,
-            description=PHASES.get(progress["phase"], progress["phase"]) + number,
+            description=Phase[progress["phase"].upper()].words + number,
             completed=progress["tick"],
             total=progress["total"],
             more=more,

@@ -9,17 +9,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-PHASES = {
-    "preparing": "preparing",
-    "settling": "settling",
-    "waiting": "waiting for the beam to rest",
-    "taring": "taring",
-    "ready": "ready",
-    "running": "recording",
-    "returning": "returning",
-    "off": "drive off",
-}
-"""What the operator reads for each phase of a session."""
+from rigd.engine.board import Phase
 
 _STYLES = {
     "idle": "dim",
@@ -89,7 +79,7 @@ def progress_text(progress: dict[str, Any]) -> str:
     left = progress["time_left_s"]
     time_left = "" if left is None else f", {left:.0f} s left"
     return (
-        f"{PHASES.get(progress['phase'], progress['phase'])}, {progress['percent']:.0f} %"
+        f"{Phase[progress['phase'].upper()].words}, {progress['percent']:.0f} %"
         f"{time_left}; {progress['missed']} missed, {progress['late']} late, "
         f"{progress['lost']} lost"
     )

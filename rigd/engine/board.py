@@ -29,6 +29,18 @@ class Phase(IntEnum):
     WAITING = 7
     """Until the beam is at rest, before the tare."""
 
+    @property
+    def words(self) -> str:
+        """What the operator reads."""
+        return _WORDS.get(self, self.name.lower())
+
+
+_WORDS = {
+    Phase.RUNNING: "recording",
+    Phase.OFF: "drive off",
+    Phase.WAITING: "waiting for the beam to rest",
+}
+
 
 class Stop(IntEnum):
     """Why the supervisor asks for a stop: the values of :attr:`Word.STOP`."""
