@@ -276,7 +276,9 @@ class Scene:
         return [*found, self.supervisor.pid] if victim == "all" else found
 
     def recording(self) -> bool:
-        return any(part.stat().st_size > 0 for part in self.sessions.glob("*.part"))
+        with contextlib.suppress(FileNotFoundError):  # it has got its name meanwhile
+            return any(part.stat().st_size > 0 for part in self.sessions.glob("*.part"))
+        return False
 
     @property
     def said(self) -> str:

@@ -129,7 +129,7 @@ def test_passing_faults_are_flagged_and_borne(
         fast=True,
         faults=[row.fault for row in borne],
         injected=injected,
-        **CHIRP | {"duration_s": 8.0},
+        **CHIRP | {"duration_s": 5.0},
     )
     assert result.went_well, result.reason
     assert len(injected) == len(borne)

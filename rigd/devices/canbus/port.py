@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # What the kernel keeps for a reader that is late: some 200 ms of a full bus.
 _RECEIVE_BUFFER = 212_992
+# As much as the system allows: a simulated rig that stands still is told by its silence.
+_SIMULATOR_SEND_BUFFER = 4_194_304
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
 
 
@@ -202,6 +204,7 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
     name = f"{settings.channel} ({settings.interface})"
     if simulator is not None and simulator.can_socket:
         link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER)
         try:
             link.connect(simulator.can_socket)
         except OSError as error:
