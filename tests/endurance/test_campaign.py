@@ -61,8 +61,12 @@ def test_a_slow_leak_is_told_from_noise(campaign):
     noise = [30_000 + round(chooser.gauss(0.0, 2_000.0)) for _ in range(300)]
     leaking = [value + 20 * number for number, value in enumerate(noise)]
     settled = [30_000 - 15_000 // (1 + number) for number in range(300)]
-    assert not campaign.Trend.of(noise).grows(300)
-    assert not campaign.Trend.of(settled).grows(300)
+    assert not campaign.Trend.of(noise).grows(300, campaign.FLAT_KB)
+    assert not campaign.Trend.of(settled).grows(300, campaign.FLAT_KB)
     trend = campaign.Trend.of(leaking)
-    assert trend.grows(300)
+    assert trend.grows(300, campaign.FLAT_KB)
     assert trend.slope == pytest.approx(20.0, abs=5.0)
+    descriptors = [16 + chooser.randrange(3) for _ in range(300)]
+    one_in_a_hundred = [value + number // 100 for number, value in enumerate(descriptors)]
+    assert not campaign.Trend.of(descriptors).grows(300, campaign.FLAT_DESCRIPTORS)
+    assert campaign.Trend.of(one_in_a_hundred).grows(300, campaign.FLAT_DESCRIPTORS)
