@@ -34,15 +34,16 @@ def serve(
     from rigd.devices.registry import UnknownDeviceError
     from rigd.planning import RefusedError
     from rigd.profile import ProfileError
-    from rigd.service.address import AddressError
+    from rigd.service.address import AddressError, UnknownGroupError
     from rigd.service.daemon import run_daemon
     from rigd.supervisor.lock import RigBusyError
-    from rigd.supervisor.orders import load_rig
+    from rigd.supervisor.orders import load_rig, make_folder
 
     try:
         rig_profile, _ = load_rig(profile, fast=fast)
+        make_folder(output)
         number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
-    except (ProfileError, UnknownDeviceError, RefusedError) as error:
+    except (ProfileError, UnknownDeviceError, UnknownGroupError, RefusedError) as error:
         fail(str(error), EXIT_WRONG_USE)
     except (RigBusyError, AddressError) as error:
         fail(str(error), EXIT_FAILED)

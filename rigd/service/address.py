@@ -1,8 +1,10 @@
 """Where the daemon of a rig listens, and how its socket is made and found."""
 
+import errno
 import grp
 import os
 import socket
+import stat
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +21,10 @@ class AddressError(Exception):
     """There can be no socket, or no daemon is found; the message is for the operator."""
 
 
+class UnknownGroupError(AddressError):
+    """There is no group of that name."""
+
+
 def socket_path(rig: str, folder: Path | None = None) -> Path:
     """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise."""
     plain = "".join(c if c.isalnum() else "-" for c in rig).strip("-")
@@ -33,21 +39,26 @@ def bind(path: Path, group: str | None) -> socket.socket:
     Parameters
     ----------
     path
-        Of the socket; its folder is made if it can be.
+        Of the socket. The user's own folder is made if it can be, one for a group has to be there.
     group
         Whose members may use it too.
 
     Raises
     ------
+    UnknownGroupError
+        If there is no such group.
     AddressError
-        If there is no such group, the socket cannot be made, or a living daemon has it.
+        If the socket cannot be made, its folder is closed to the group, or a living daemon has it.
     """
     number = None if group is None else _group_number(group)
     if answers(path):
         raise AddressError(f"Another daemon answers on {path}; see rigd status.")
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if number is None:
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        elif not _open_to(number, path.parent):
+            raise PermissionError(errno.EACCES, f"{path.parent} is closed to the group {group}")
         path.unlink(missing_ok=True)
         before = os.umask(0o177)
         try:
@@ -116,9 +127,18 @@ def _group_number(group: str) -> int:
     try:
         return grp.getgrnam(group).gr_gid
     except KeyError:
-        raise AddressError(
-            f"--group {group}: there is no such group; make it with groupadd {group}."
+        raise UnknownGroupError(
+            f"--group {group!r}: there is no such group; name one that exists, or have the "
+            "administrator make it with groupadd."
         ) from None
+
+
+def _open_to(group: int, folder: Path) -> bool:
+    """Whether the members of a group can reach what is in a folder."""
+    status = folder.stat()
+    return bool(
+        status.st_mode & stat.S_IXOTH or (status.st_gid == group and status.st_mode & stat.S_IXGRP)
+    )
 
 
 def _refused(path: Path, group: str | None, error: OSError) -> str:

@@ -12,6 +12,10 @@ Document = dict[str, Any]
 
 _ANSWER_PATIENCE_S = 60.0
 """Connecting the devices anew takes up to half of it."""
+_GONE = (
+    "The daemon is gone. A session that it ran is stopped, and its file kept; see the daemon's log "
+    "for why, and start it again with rigd serve."
+)
 
 
 class DaemonGoneError(Exception):
@@ -108,7 +112,7 @@ class Client:
         except OSError:
             # It may have said why before it left.
             self._raise_what_was_said()
-            raise DaemonGoneError("The daemon is gone.") from None
+            raise DaemonGoneError(_GONE) from None
 
     def event(self, timeout_s: float) -> Document | None:
         """Return the next event (or reply), or None if none comes in time.
@@ -131,7 +135,7 @@ class Client:
             except OSError:
                 data = b""
             if not data:
-                raise DaemonGoneError("The daemon is gone.")
+                raise DaemonGoneError(_GONE)
             self._pending += data
         line, self._pending = self._pending.split(b"\n", 1)
         try:

@@ -19,7 +19,8 @@ MOST_SESSIONS = 1000
 _LONGEST_PATH = 4096
 _SHOWN = 60
 
-Id = int | Annotated[str, Field(max_length=64)]
+_LONGEST_ID = 64
+Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
 class RequestError(Exception):
@@ -150,6 +151,8 @@ def _no_constant(name: str) -> NoReturn:
 
 def _first_complaint(error: ValidationError) -> str:
     first = error.errors(include_url=False, include_context=False)[0]
+    if first["loc"][1:2] == ("id",):  # one of two types, of which pydantic complains one by one
+        return f"id is a whole number or a text of at most {_LONGEST_ID} characters."
     where = ".".join(str(part)[:_SHOWN] for part in first["loc"][1:]) or "The request"
     return f"{where}: {first['msg']}."
 

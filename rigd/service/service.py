@@ -37,7 +37,7 @@ from rigd.service.documents import (
     transition_document,
 )
 from rigd.service.states import State, StateMachine, Transition
-from rigd.supervisor.orders import Order, choose_path, make_room, what_is_kept
+from rigd.supervisor.orders import NoRoomError, Order, choose_path, make_room, what_is_kept
 from rigd.supervisor.rig import RigError
 from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult, Watcher
 from rigd.supervisor.status import RigStatus
@@ -418,6 +418,8 @@ class Service:
             )
             plan = plan_session(profile, excitation, force=request.force)
             make_room(self._folder, excitation, profile.limits)
+        except NoRoomError as error:
+            raise CommandError(str(error)) from error
         except (ExcitationError, RefusedError, ControlDesignError, RealisationError) as error:
             raise CommandError(str(error), wrong_use=True) from error
         except MemoryError:
@@ -434,7 +436,7 @@ class Service:
             series.reason = str(error)
             if not isinstance(error, RefusedError):
                 kept = "" if series.path is None else f" {what_is_kept(series.path)}"
-                fault = f"{error} The drive is disabled.{kept}"
+                fault = series.reason = f"{error} The drive is disabled.{kept}"
         except Exception as error:
             # Nobody may be left to switch off: what cannot be explained ends with everything off.
             _log.exception("a session ended in a way that was not foreseen")

@@ -121,6 +121,8 @@ def recover(path: Path, on_progress: Callable[[float], None] | None = None) -> R
         If the file cannot be read, is still being recorded, or holds no sample before the damage;
         or if the new one cannot be written.
     """
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        raise SessionError(f"{path} is not a file. Give the path of a session file.")
     target = recovered_path(path)
     if is_being_written(path):
         raise SessionError(f"{path} is still being recorded. Wait for the end of the session.")

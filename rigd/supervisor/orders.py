@@ -3,6 +3,7 @@
 Shared by sessions in the foreground and by the daemon.
 """
 
+import os
 import shlex
 import shutil
 from dataclasses import dataclass, replace
@@ -19,6 +20,10 @@ from rigd.session.writer import PART_SUFFIX
 # Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.
 _BYTES_PER_TICK = 260
 _BYTES_SPARE = 1_000_000
+
+
+class NoRoomError(RefusedError):
+    """A session's file cannot be put where it is to go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,27 +80,43 @@ def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple
     return profile, moving
 
 
+def make_folder(folder: Path) -> None:
+    """Make the folder of the session files, unless it is there.
+
+    Raises
+    ------
+    NoRoomError
+        If it cannot be made, or nothing can be written into it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NoRoomError(
+            f"{folder} cannot be made a folder ({error.strerror}); choose another (--output)."
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise NoRoomError(
+            f"{folder}: you may not write there; have its owner open it, or choose another folder "
+            "(--output)."
+        )
+
+
 def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
     """Make the folder, and see that a session fits on its disk and leaves room there.
 
     Raises
     ------
-    RefusedError
-        If the folder cannot be made, or the disk is too full.
+    NoRoomError
+        If the folder cannot be made or written to, or the disk is too full.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        raise RefusedError(
-            f"--output {folder}: cannot be made a folder ({error.strerror}); choose another."
-        ) from error
+    make_folder(folder)
+    free = shutil.disk_usage(folder).free
     needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
     if free - needed < limits.disk_free_mb * 1e6:
-        raise RefusedError(
-            f"--output {folder}: {free / 1e6:.1f} MB are free on its disk, of which the session "
-            f"may take {needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB "
-            "have to be left; make room or choose another folder."
+        raise NoRoomError(
+            f"{folder}: {free / 1e6:.1f} MB are free on its disk, of which the session may take "
+            f"{needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB have to "
+            "be left; make room or choose another folder (--output)."
         )
 
 

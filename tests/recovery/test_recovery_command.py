@@ -1,6 +1,7 @@
 """`rigd recover`, and what `rigd info` and `analyze` say of the files."""
 
 import json
+import os
 
 import pytest
 from typer.testing import CliRunner
@@ -40,6 +41,16 @@ def test_a_document_and_nothing_else(run, torn, tmp_path):
         "error": f"{tmp_path / 'a.mcap'} exists and is not overwritten. "
         f"Move it away to recover {torn} again.",
     }
+
+
+def test_what_is_no_file_is_refused(run, tmp_path):
+    pipe = tmp_path / "pipe.mcap.part"
+    os.mkfifo(pipe)
+    for path in ("/", ".", tmp_path, pipe):
+        result = run(rigd, "recover", path)
+        assert result.exit_code == 1
+        assert "is not a file" in result.stderr
+        assert result.exception is None or isinstance(result.exception, SystemExit)
 
 
 def test_without_a_file_it_is_wrong_use(run):

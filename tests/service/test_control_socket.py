@@ -275,7 +275,15 @@ def test_the_socket_is_the_user_s_own(runtime_folder):
 
 def test_a_group_may_use_it_if_asked_for(runtime_folder):
     group = grp.getgrgid(os.getgid()).gr_name
-    path = socket_path("sim", runtime_folder / "common")
+    common = runtime_folder / "common"
+    path = socket_path("sim", common)
+    with pytest.raises(AddressError, match=f"install -d -o .* -g {group} .*{common}"):
+        bind(path, group)
+    assert not common.exists()  # it is the administrator's to make
+    common.mkdir(mode=0o700)
+    with pytest.raises(AddressError, match=f"closed to the group {group}"):
+        bind(path, group)
+    common.chmod(0o710)
     with bind(path, group):
         assert mode(path) == 0o660
         assert path.stat().st_gid == os.getgid()

@@ -110,6 +110,15 @@ def test_without_a_daemon_every_command_says_how_to_start_one(ask, rigd):
         assert "rigd serve --profile" in err
 
 
+def test_what_cannot_be_served_is_refused_at_once(ask, profile, tmp_path):
+    (tmp_path / "file").touch()
+    for options in (("--output", "file/out"), ("--group", "")):
+        code, out, err = ask("serve", "--profile", profile, *options)
+        assert (code, out) == (2, "")
+        assert options[0] in err
+        assert "Traceback" not in err
+
+
 def test_a_day_with_the_daemon(serve, ask, profile, tmp_path):
     daemon = serve("--fast")
     code, out, _ = ask("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2", "--json",
@@ -210,6 +219,7 @@ def test_a_killed_daemon_stops_the_rig_and_is_replaced(serve, rigd):
     _, err = client.communicate(timeout=60.0)
     assert client.returncode == 1
     assert "The daemon is gone." in err
+    assert "rigd serve" in err
     until(lambda: not Path(f"/proc/{control}").exists())
     assert socket_path("sim").exists()
     serve("--fast")

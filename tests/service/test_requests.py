@@ -55,6 +55,7 @@ def test_a_start_has_the_parameters_of_its_excitation():
         (b'{"command": "status", "more": 1}', "more"),
         (b'{"command": "status", "id": 1.5}', "id"),
         (b'{"command": "status", "id": true}', "id"),
+        (b'{"command": "status", "id": "' + b"x" * 65 + b'"}', "at most 64"),
     ],
 )
 def test_what_is_no_request_is_refused_by_name(line, named):

@@ -187,6 +187,15 @@ def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
     assert "killed by signal 9" in operated.service.status()["reason"]
 
 
+def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
+    operated.world.countdown = 3000
+    operated.world.then = lambda _: operated.rig._crew.recorder.kill()
+    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    assert operated.state is State.FAULT
+    for words in ("killed by signal 9", "drive is disabled", "rigd recover"):
+        assert words in operated.last["reason"]
+
+
 def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
     refusal = operated.ask(
         "start", excitation="step", parameters={"amplitude_rad": 3.0, "duration_s": 1.0}
@@ -208,6 +217,7 @@ def test_a_disk_without_room_for_a_file_is_refused(operated, tmp_path):
     (tmp_path / "out").write_text("in the way")
     refusal = operated.ask("start", **SHORT)
     assert "cannot be made a folder" in str(refusal)
+    assert not refusal.wrong_use  # the same request may succeed later
     assert operated.state is State.READY
 
 
