@@ -77,7 +77,7 @@ def _openable_profile(name: str) -> "Profile":
 
     profile = profile_named(name)
     try:
-        check_selection(profile.rig.devices)
+        check_selection(profile.rig.devices, profile.path)
     except UnknownDeviceError as error:
         fail(str(error), EXIT_WRONG_USE)
     return profile

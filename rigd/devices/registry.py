@@ -3,6 +3,7 @@
 import importlib
 from collections.abc import Callable
 from enum import Enum
+from pathlib import Path
 from types import ModuleType
 from typing import cast
 
@@ -37,8 +38,15 @@ class Reality(Enum):
         return self in (Reality.SIMULATED, Reality.LOCK_STEP)
 
 
-def check_selection(selection: Selection) -> None:
+def check_selection(selection: Selection, source: Path | None = None) -> None:
     """Refuse a selection of drivers that cannot be opened.
+
+    Parameters
+    ----------
+    selection
+        As a profile has it.
+    source
+        The profile's file, for the message.
 
     Raises
     ------
@@ -47,8 +55,9 @@ def check_selection(selection: Selection) -> None:
     """
     if selection not in _OPENERS:
         known = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
+        where = "" if source is None else f"{source}: "
         raise UnknownDeviceError(
-            f'devices: drive = "{selection.drive}" with sensor = "{selection.sensor}" is not a '
+            f'{where}devices: drive = "{selection.drive}" with sensor = "{selection.sensor}" is not a '
             f"known combination; choose {known}."
         )
 

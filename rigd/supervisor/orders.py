@@ -57,7 +57,7 @@ def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple
         If its devices cannot share their bus, or an option does not go with what would move.
     """
     profile = load_profile(name)
-    check_selection(profile.rig.devices)
+    check_selection(profile.rig.devices, profile.path)
     refusals = objections(profile.rig)
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))

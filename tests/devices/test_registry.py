@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -10,8 +11,8 @@ from rigd.devices.registry import UnknownDeviceError, check_selection
 
 
 def test_unknown_drivers_are_refused_with_what_there_is():
-    with pytest.raises(UnknownDeviceError, match=r'"steam".*choose drive = "sim"'):
-        check_selection(Selection(drive="steam", sensor="sim"))
+    with pytest.raises(UnknownDeviceError, match=r'a\.toml: .*"steam".*choose drive = "sim"'):
+        check_selection(Selection(drive="steam", sensor="sim"), Path("a.toml"))
 
 
 def test_the_simulation_is_not_imported_unless_a_profile_names_it():
