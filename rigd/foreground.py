@@ -17,7 +17,14 @@ from rigd.planning import Plan, RefusedError, plan_session
 from rigd.profile import Profile, ProfileError
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.lock import RigBusyError, RigLock
-from rigd.supervisor.orders import Order, choose_path, load_rig, make_room, what_is_kept
+from rigd.supervisor.orders import (
+    NoRoomError,
+    Order,
+    choose_path,
+    load_rig,
+    make_room,
+    what_is_kept,
+)
 from rigd.supervisor.rig import Rig, RigError
 from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult
 
@@ -118,6 +125,8 @@ def run_in_foreground(
                 _tell_result(tell, results[-1])
                 if not results[-1].went_well:
                     break
+    except NoRoomError as error:
+        raise ForegroundError(str(error), wrong_use=not results, results=results) from error
     except (
         ProfileError,
         UnknownDeviceError,

@@ -128,13 +128,15 @@ def run_sessions(
             quiet_stdout=as_json,
         )
     except ForegroundError as error:
-        if as_json and error.results:
+        if as_json and not error.wrong_use:
             _write_json(error.results)
         fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
     finally:
         ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
     if as_json:
         _write_json(results)
+    if any(result.fault for result in results):
+        raise typer.Exit(EXIT_FAILED)
     if stop.requested:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not all(result.went_well for result in results):

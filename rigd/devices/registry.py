@@ -57,7 +57,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
         known = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
         where = "" if source is None else f"{source}: "
         raise UnknownDeviceError(
-            f'{where}devices: drive = "{selection.drive}" with sensor = "{selection.sensor}" is not a '
+            f'{where}devices: drive = "{selection.drive}" with sensor = "{selection.sensor}" is no '
             f"known combination; choose {known}."
         )
 

@@ -223,13 +223,14 @@ class _Attendance:
         doubt = devices.drive.off_doubt
         if doubt:
             outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
-        failure = reason
+        failure, fault = reason, outcome == "fault"
         if recorded and reason:
             # What happens after the last tick does not make the record any less complete.
             outcome, reason = "complete", f"After the record: {reason}"
         self._parent.send(
             finished=outcome,
             reason=reason,
+            fault=fault,
             counts=asdict(procedure.counts),
             results=procedure.results,
             device_failed=device_failed,

@@ -275,8 +275,7 @@ class _Client(asyncio.Protocol):
         self._leave_if_done()
 
     def _leave_if_done(self) -> None:
-        done = not (self._tasks or self._lines or self._pump)
-        if self._ended and done:
+        if self._ended and not (self._tasks or self._lines):
             self.leave()
 
 

@@ -446,8 +446,8 @@ class Service:
             last = series.results[-1] if series.results else None
             if last is not None and not last.went_well:
                 series.reason = last.reason
-                if not (series.stop.requested or last.outcome == "stopped"):
-                    fault = last.reason or "the session failed"
+                if last.fault:
+                    fault = last.reason
         if not self._rig.connected:
             fault = fault or series.reason or "The connection to the devices is lost."
         series.running = False

@@ -46,6 +46,8 @@ class SessionResult:
     missed: int
     late: int
     lost: int
+    fault: bool
+    """Something failed, in the record or after it, whatever was asked for meanwhile."""
     live_dropped: int = 0
     """Samples that the live view did not get."""
 
@@ -197,7 +199,14 @@ class Session:
 
     def _understood(self, answer: Message) -> Message:
         if "ended" in answer:  # before the session began
-            return self._control_died(str(answer["ended"]))
+            finished = self._control_died(str(answer["ended"]))
+            if not answer["ended"]:  # the signal for a stop reached it between two sessions
+                finished |= {
+                    "finished": "stopped",
+                    "reason": "Stopped by the operator.",
+                    "fault": False,
+                }
+            return finished
         if "finished" in answer:
             self._control_at_work = False
             self.device_failed |= answer["device_failed"]
@@ -226,6 +235,7 @@ class Session:
         return {
             "finished": "complete" if whole else "fault",
             "reason": f"After the record: {reason}" if whole else reason,
+            "fault": True,
             "counts": {"scheduled": scheduled, "missed": missed, "late": late},
             "results": {},
         }
@@ -294,6 +304,7 @@ class Session:
             missed=counts["missed"],
             late=counts["late"],
             lost=counts.get("lost", 0),
+            fault=finished["fault"] or ended == "fault",
             live_dropped=self._board[Word.LIVE_DROPPED],
         )
 

@@ -219,7 +219,7 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
     os.kill(child_of(process.pid, "rigd.engine.control"), signal.SIGSTOP)
     to_one(process, signal.SIGINT)
     output, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
+    assert process.returncode == 1, errors  # a fault is one, whatever was asked for
     (session,) = json.loads(output)["sessions"]
     assert session["outcome"] == "fault"
     assert "was killed" in session["reason"]
@@ -279,6 +279,18 @@ def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, 
     assert len(sessions) == int(part.name.split(".")[0].rsplit("-")[-1]) - 1 >= 1
     assert {session["outcome"] for session in sessions} == {"complete"}
     assert part.name in errors
+
+
+def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
+    options = ("--json", "--duration", "1", "--rest", "0", "--repeat", "999", "--fast")
+    process = start_rigd("run", "hold", *options)
+    wait_for(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
+    (tmp_path / "sessions").rename(tmp_path / "moved")
+    (tmp_path / "sessions").write_text("in the way")
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 1, errors
+    assert len(json.loads(output)["sessions"]) >= 2
+    assert "Traceback" not in errors
 
 
 def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path):

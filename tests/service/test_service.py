@@ -187,6 +187,19 @@ def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
     assert "killed by signal 9" in operated.service.status()["reason"]
 
 
+def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
+    def stop_and_jump(drive):
+        operated.meanwhile("stop")
+        drive.offset_rad = 3.0
+
+    operated.world.countdown, operated.world.then = 3000, stop_and_jump
+    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    assert operated.last["stopped"]
+    assert operated.last["failed"]
+    assert operated.state is State.FAULT
+    assert operated.rig.connected  # it is not that which makes it a fault
+
+
 def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
     operated.world.countdown = 3000
     operated.world.then = lambda _: operated.rig._crew.recorder.kill()
