@@ -1,6 +1,7 @@
 """Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
 
 import contextlib
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,8 @@ from rigd.supervisor.orders import (
 )
 from rigd.supervisor.rig import Rig, RigError
 from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult
+
+_TERMINAL_PATIENCE_S = 2.0
 
 Tell = Callable[[str], None]
 
@@ -87,11 +90,10 @@ def run_in_foreground(
         If a session is refused (wrong use) or cannot be run.
     """
     tell: Tell = partial(_tell, err=quiet_stdout)
-    path: Path | None = None
     results: list[SessionResult] = []
     try:
-        with contextlib.ExitStack() as ending:
-            ending.enter_context(crew)
+        # The rig is given up last, when nobody has hold of the devices any more.
+        with contextlib.ExitStack() as reserved, crew:
             profile, moving = load_rig(profile_name, fast=fast, seed=seed)
             if prepare is not None:
                 profile = prepare(profile)
@@ -101,14 +103,16 @@ def run_in_foreground(
                     tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is Reality.SIMULATED)
             hardware = moving is Reality.HARDWARE
-            ending.enter_context(RigLock(profile.name, "rigd run", hardware=hardware, alone=alone))
+            reserved.enter_context(
+                RigLock(profile.name, "rigd run", hardware=hardware, alone=alone)
+            )
             excitation = build(profile.rig.rate_hz)
             plan = plan_session(profile, excitation, force=force)
             _tell_plan(tell, profile, excitation, plan)
             make_room(folder, excitation, profile.limits)
             rig = Rig(profile, fast=fast, crew=crew)
             if not stop.requested:
-                rig.connect()
+                rig.connect(moving)
             for number in range(1, repeat + 1):
                 if stop.requested:
                     break
@@ -138,9 +142,11 @@ def run_in_foreground(
         raise ForegroundError(str(error), wrong_use=True) from error
     except RigBusyError as error:
         raise ForegroundError(str(error), wrong_use=False) from error
-    except (SessionFailedError, RigError) as error:
-        kept = "" if path is None else f" The drive is disabled. {what_is_kept(path)}"
-        raise ForegroundError(f"{error}{kept}", wrong_use=False, results=results) from error
+    except SessionFailedError as error:
+        text = f"{error} The drive is disabled. {what_is_kept(error.path)}"
+        raise ForegroundError(text, wrong_use=False, results=results) from error
+    except RigError as error:
+        raise ForegroundError(str(error), wrong_use=False, results=results) from error
     return results
 
 
@@ -177,7 +183,11 @@ def _tell_result(tell: Tell, result: SessionResult) -> None:
 
 
 class _ProgressView:
-    """One line that says how far the session is and how long it still takes."""
+    """One line that says how far the session is and how long it still takes.
+
+    It is written by a thread of its own: a terminal that was stopped (Ctrl-S), or a pipe that
+    nobody reads, must not keep the supervisor from its session.
+    """
 
     def __init__(self, ticks: int) -> None:
         # Only now: the processes of the session are on their way.
@@ -196,19 +206,43 @@ class _ProgressView:
         )
         self._task = self._progress.add_task("preparing", total=ticks, counts="")
 
+        self._lock = threading.Lock()
+        self._state: SessionProgress | None = None
+        self._events: list[Event] = []
+        self._ended = False
+        self._changed = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+
     def __enter__(self) -> "_ProgressView":
-        with contextlib.suppress(OSError):
-            self._progress.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):
-            self._progress.stop()
+        self._ended = True
+        self._changed.set()
+        self._thread.join(_TERMINAL_PATIENCE_S)
 
     def update(self, state: SessionProgress, events: list[Event]) -> None:
-        """Show where the session is, and what it has to say."""
+        """Have it shown where the session is, and what it has to say."""
+        with self._lock:
+            self._state = state
+            self._events += events
+        self._changed.set()
+
+    def _work(self) -> None:
         with contextlib.suppress(OSError):
-            self._show(state, events)
+            self._progress.start()
+        while not self._ended:
+            self._changed.wait()
+            self._changed.clear()
+            with self._lock:
+                state, events = self._state, self._events
+                self._events = []
+            if state is not None:
+                with contextlib.suppress(OSError):
+                    self._show(state, events)
+        with contextlib.suppress(OSError):
+            self._progress.stop()
 
     def _show(self, state: SessionProgress, events: list[Event]) -> None:
         for event in events:

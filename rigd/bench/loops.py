@@ -18,6 +18,7 @@ from rigd.devices.parameters import Selection
 from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.jobs import SessionJob
 from rigd.engine.process import ChildError
+from rigd.engine.reference import put_reference
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
@@ -134,7 +135,8 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
         meter = UsageMeter(crew.control.pid)
         board[Word.STOP] = Stop.NO
         board[Word.GO] = 1
-        crew.control.send_object("session", SessionJob(profile, excitation))
+        reference = put_reference(channels.reference_fd, excitation.reference_rad)
+        crew.control.send_object("session", SessionJob(profile, reference))
         blocks = []
         finished = None
         while finished is None or "finished" not in finished:

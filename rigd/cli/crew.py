@@ -15,7 +15,7 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.engine.process import SINGLE_THREADED
+    from rigd.engine.process import SINGLE_THREADED, ChildError
     from rigd.engine.signals import StopRequest
     from rigd.supervisor.crew import Crew
 
@@ -30,3 +30,5 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
             "of open files and of shared memory (/dev/shm).",
             EXIT_FAILED,
         )
+    except ChildError as error:
+        fail(str(error), EXIT_FAILED)

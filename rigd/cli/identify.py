@@ -132,7 +132,7 @@ def _run_sessions(
             quiet_stdout=quiet_stdout,
             prepare=note_and_prepare,
         )
-        if stop.requested:
+        if stop.requested and not any(result.fault for result in results):
             raise typer.Exit(EXIT_INTERRUPTED)
         path = results[0].path if results else None
         if path is None or not results[0].went_well:

@@ -1,7 +1,9 @@
 """A file that one program holds at a time: the kernel takes it off a program that dies."""
 
+import errno
 import fcntl
 import os
+import stat
 from contextlib import suppress
 from pathlib import Path
 
@@ -46,13 +48,12 @@ class HeldFile:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         fd = self._open()
         try:
-            fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-        except OSError:
-            said = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
+            _lock(fd, alone=alone)
+            os.ftruncate(fd, 0)
+            os.pwrite(fd, f"{holder}, process {os.getpid()}".encode(), 0)
+        except BaseException:
             os.close(fd)
-            raise HeldError(said) from None
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{holder}, process {os.getpid()}".encode(), 0)
+            raise
         self._fd = fd
 
     def release(self) -> None:
@@ -67,4 +68,17 @@ class HeldFile:
             fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
             os.fchmod(fd, 0o666)  # whatever the umask: the next holder may be another user
             return fd
-        return os.open(self.path, os.O_RDWR | os.O_CLOEXEC)
+        # In a folder that others may write to the name may be a link to anything.
+        fd = os.open(self.path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise OSError(errno.EINVAL, f"{self.path.name} there is no plain file")
+        return fd
+
+
+def _lock(fd: int, *, alone: bool) -> None:
+    try:
+        fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except OSError:
+        said = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
+        raise HeldError(said) from None

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import cast
 
-from rigd.devices.contracts import Devices
+from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters, Selection
 from rigd.devices.simulator import differences, find_simulator
 
@@ -101,19 +101,33 @@ def simulator() -> ModuleType:
     return importlib.import_module("rigd.sim.wire.simulate")
 
 
-def open_devices(rig: RigParameters) -> Devices:
+def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:
     """Make the drivers that a profile names; nothing is connected yet.
+
+    Parameters
+    ----------
+    rig
+        As a profile has it.
+    moving
+        What the operator was told would move, if that was told before.
 
     Raises
     ------
     UnknownDeviceError
         If the profile names drivers that do not exist.
     DeviceError
-        If the profile contradicts what these drivers can do.
+        If the profile contradicts what these drivers can do, or something else would move now.
     """
     check_selection(rig.devices)
     module, name = _OPENERS[rig.devices]
     opener = cast(
         "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
     )
-    return opener(rig)
+    devices = opener(rig)
+    if moving is not None and devices.simulated is (moving is Reality.HARDWARE):
+        found = "a simulated rig" if devices.simulated else Reality.HARDWARE.value
+        raise DeviceError(
+            f"{moving.value.capitalize()} was to move, and now it would be {found}: rigd simulate "
+            "was started or ended in between. Nothing was sent; start again."
+        )
+    return devices

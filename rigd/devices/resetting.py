@@ -3,7 +3,7 @@
 from typing import Protocol, runtime_checkable
 
 from rigd.devices.parameters import RigParameters
-from rigd.devices.registry import open_devices
+from rigd.devices.registry import Reality, open_devices
 
 
 @runtime_checkable
@@ -14,8 +14,13 @@ class ResettableDrive(Protocol):
         """Reset a fault without enabling the drive; return what it was, or None."""
 
 
-def reset_drive(rig: RigParameters) -> str:
+def reset_drive(rig: RigParameters, moving: Reality | None = None) -> str:
     """Reset the drive of a rig, and let go of it.
+
+    Parameters
+    ----------
+    rig, moving
+        See :func:`rigd.devices.registry.open_devices`.
 
     Returns
     -------
@@ -27,7 +32,7 @@ def reset_drive(rig: RigParameters) -> str:
     DeviceError
         If the drive does not answer, or the fault stands.
     """
-    drive = open_devices(rig).drive
+    drive = open_devices(rig, moving).drive
     if not isinstance(drive, ResettableDrive):
         return "The drive is simulated in each session anew: there is no fault to reset."
     try:

@@ -7,7 +7,7 @@ from rigd.engine.board import Board, Stop, Word
 from rigd.engine.ring import Ring, RingSpec
 from rigd.engine.topics import TOPICS
 
-DESCRIPTORS = len(TOPICS) + 1
+DESCRIPTORS = len(TOPICS) + 2
 """Of shared memory, for :func:`create_channels`."""
 
 
@@ -29,6 +29,8 @@ class Channels:
     timings: Ring
     samples: Ring
     board: Board
+    reference_fd: int = -1
+    """Where the supervisor places the reference of a session."""
 
     @property
     def rings(self) -> tuple[Ring, ...]:
@@ -59,12 +61,12 @@ class Channels:
 
 def create_channels(rate_hz: float, fds: Sequence[int]) -> Channels:
     """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory."""
-    *for_rings, for_board = fds
+    *for_rings, for_board, for_reference = fds
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz), fd)
         for topic, fd in zip(TOPICS, for_rings, strict=True)
     ]
-    return _together(rings, Board.create(for_board))
+    return _together(rings, Board.create(for_board), for_reference)
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
@@ -72,6 +74,6 @@ def attach_channels(specs: ChannelSpecs) -> Channels:
     return _together([Ring(spec) for spec in specs.rings], Board(specs.board_fd))
 
 
-def _together(rings: Sequence[Ring], board: Board) -> Channels:
+def _together(rings: Sequence[Ring], board: Board, reference_fd: int = -1) -> Channels:
     events, controls, timings, samples = rings
-    return Channels(events, controls, timings, samples, board)
+    return Channels(events, controls, timings, samples, board, reference_fd)

@@ -22,6 +22,7 @@ from rigd.engine.metronome import Metronome
 from rigd.engine.procedure import Procedure, SessionEnd, show
 from rigd.engine.process import Message, Parent
 from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
+from rigd.engine.reference import map_reference
 from rigd.engine.rest import AXES, Rest, observe_rest
 from rigd.engine.signals import StopRequest
 from rigd.engine.watch import make_watch
@@ -47,7 +48,7 @@ def main() -> None:
     else:
         obtained = {"clock": "real"} | obtain(priority=realtime.priority, cpu=realtime.cpu)
     try:
-        devices = open_devices(job.profile.rig)
+        devices = open_devices(job.profile.rig, job.moving)
     except DeviceError as error:
         parent.send(ended=str(error))
         return
@@ -190,7 +191,7 @@ class _Attendance:
         cycle = self._cycle = self._make_cycle(job.profile)
         procedure = Procedure(
             job.profile,
-            job.excitation,
+            map_reference(job.reference),
             cycle,
             self._clock,
             self._metronome,

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigd.devices.registry import Reality
 from rigd.engine.channels import ChannelSpecs
-from rigd.excitation import Excitation
+from rigd.engine.reference import ReferenceSpec
 from rigd.profile import Profile
 
 
@@ -13,6 +14,8 @@ class ControlJob:
     """The rig to attend to."""
 
     profile: Profile
+    moving: Reality | None
+    """What the operator was told would move, and nothing else may; None: nothing was told."""
     channels: ChannelSpecs
     fast: bool
     """Under the virtual clock."""
@@ -24,7 +27,8 @@ class SessionJob:
 
     profile: Profile
     """The rig's; its controller and limits may be others."""
-    excitation: Excitation
+    reference: ReferenceSpec
+    """Angles relative to the one at the start."""
 
 
 @dataclass(frozen=True, slots=True)

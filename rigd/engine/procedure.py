@@ -5,6 +5,7 @@ through the same cycle and leaves its results in the metadata.
 """
 
 import time
+from collections.abc import Sequence
 from math import inf, isfinite
 
 import numpy as np
@@ -21,7 +22,6 @@ from rigd.engine.realtime import page_faults
 from rigd.engine.rest import Rest, observe_rest
 from rigd.engine.sample_log import SampleLog
 from rigd.engine.signals import StopRequest
-from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.safety import LOOK_EVERY
 
@@ -69,8 +69,10 @@ class Procedure:
 
     Parameters
     ----------
-    profile, excitation
-        What the operator chose; the excitation's reference is relative to the angle at the start.
+    profile
+        What the operator chose.
+    reference_rad
+        Angle a tick, relative to the one at the start.
     cycle, clock, metronome
         What a tick does, and when.
     channels
@@ -84,7 +86,7 @@ class Procedure:
     def __init__(
         self,
         profile: Profile,
-        excitation: Excitation,
+        reference_rad: Sequence[float],
         cycle: Cycle,
         clock: Clock,
         metronome: Metronome,
@@ -93,7 +95,6 @@ class Procedure:
         stop: StopRequest,
     ) -> None:
         self._profile = profile
-        self._excitation = excitation
         self._cycle = cycle
         self._clock = clock
         self._channels = channels
@@ -108,8 +109,7 @@ class Procedure:
         self._supervisor_beat = -1
         late_ns = int(profile.realtime.late_us * 1000)
         self._log = SampleLog(cycle, self._metronome, clock, channels, late_ns)
-        # Made a list now: of a long session that takes many periods.
-        self._relative_reference: list[float] = excitation.reference_rad.tolist()
+        self._relative_reference = reference_rad
         self._start_angle_rad = 0.0
         self._rest_spread_nm = 0.0
         self._recording = False
@@ -130,6 +130,7 @@ class Procedure:
         SessionEnd
             If the rig does not come to rest in time, or stands outside the limits.
         """
+        self._cycle.watch.reset(0.0)  # what the last session left counts no more
         rest = self._wait_for_rest()
         self._start_angle_rad = float(np.mean(rest.angles_rad))
         limit_rad = self._profile.limits.angle_rad
@@ -288,7 +289,7 @@ class Procedure:
     def go_back(self) -> None:
         """Return to the start angle on a minimum-jerk path."""
         self._board[Word.PHASE] = Phase.RETURNING
-        distance_rad = float(self._excitation.reference_rad[-1])
+        distance_rad = self._relative_reference[-1]
         n = round(self._profile.session.return_s * self._rate_hz)
         u = np.arange(1, n + 1) / n
         path = self._start_angle_rad + distance_rad * (1 - u**3 * (10 - 15 * u + 6 * u**2))

@@ -26,6 +26,7 @@ SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL
 and would disturb the loop."""
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
+_KILLED_GRACE_S = 2.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 Message = dict[str, Any]
@@ -46,19 +47,30 @@ class Child:
         Run as ``python -m module``; it starts importing at once and waits for its job.
     fds
         Descriptors it inherits.
+
+    Raises
+    ------
+    ChildError
+        If the system does not start it.
     """
 
     def __init__(self, name: str, module: str, fds: Sequence[int]) -> None:
         self.name = name
-        with held_back():
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", module, str(os.getpid())],
-                bufsize=0,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                pass_fds=fds,
-                env=os.environ | SINGLE_THREADED,
-            )
+        try:
+            with held_back():
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", module, str(os.getpid())],
+                    bufsize=0,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    pass_fds=fds,
+                    env=os.environ | SINGLE_THREADED,
+                )
+        except OSError as error:
+            raise ChildError(
+                f"The {name} process cannot be started ({error.strerror}); see what else this "
+                "computer runs, and its limits (ulimit -a)."
+            ) from None
         os.set_blocking(self._stdin_fd, False)
         self._lines = LineReader(self._stdout_fd)
 
@@ -114,7 +126,9 @@ class Child:
         self._process.kill()
 
     def stop(self, grace_s: float) -> None:
-        """End it: close its input and wait; then terminate; then kill."""
+        """End it: close its input and wait; then terminate; then kill. Harmless when repeated."""
+        if self._process.stdout is None or self._process.stdout.closed:
+            return
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it was gone already
                 self._process.stdin.close()
@@ -125,9 +139,11 @@ class Child:
                 break
             except subprocess.TimeoutExpired:
                 end()
-        self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        with contextlib.suppress(
+            subprocess.TimeoutExpired
+        ):  # stuck in a call, on a disk that hangs
+            self._process.wait(_KILLED_GRACE_S)
+        self._process.stdout.close()
 
     def _falls_silent(self, patience_s: float) -> bool:
         """Wait until its output ends, which is noticed at once; waiting for a process polls."""
@@ -202,13 +218,15 @@ class LineReader:
         EOFError
             If the other end is gone before they are there.
         """
-        while len(self._pending) < size:
-            data = os.read(self._fd, 1 << 20)
+        pieces, left = [self._pending[:size]], size - len(self._pending)
+        self._pending = self._pending[size:]
+        while left > 0:
+            data = os.read(self._fd, left)
             if not data:
                 raise EOFError
-            self._pending += data
-        data, self._pending = self._pending[:size], self._pending[size:]
-        return data
+            pieces.append(data)
+            left -= len(data)
+        return b"".join(pieces)
 
 
 class Parent:

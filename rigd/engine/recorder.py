@@ -20,7 +20,7 @@ from rigd.engine.events import read_events
 from rigd.engine.jobs import RecorderJob
 from rigd.engine.process import Message, Parent
 from rigd.engine.topics import CONTROL, EVENT, SAMPLE, TIMING, TOPICS, Topic
-from rigd.session import SessionError, SessionWriter
+from rigd.session import SessionError, SessionExistsError, SessionWriter
 from rigd.session.format import SAMPLE_SIZE
 
 _BLOCK = 250
@@ -38,7 +38,7 @@ def main() -> None:
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
-        parent.send(error=str(error))
+        parent.send(error=str(error), taken=isinstance(error, SessionExistsError))
         raise SystemExit(1) from None
     _show_free_space(channels.board, job.path.parent)
     parent.send(opened=str(job.path))
@@ -186,6 +186,7 @@ class Recorder:
     def finish_orphaned(self) -> None:
         """Close what there is once the loop has stopped, the supervisor being gone."""
         board = self._channels.board
+        self.transfer()  # the whole record may still be in the rings
         deadline = time.monotonic() + _ORPHAN_PATIENCE_S
         while board[Word.PHASE] != Phase.OFF and time.monotonic() < deadline:
             if self.transfer():

@@ -1,13 +1,18 @@
 """A reference from a CSV file."""
 
 import csv
+import os
+import stat
 from math import isfinite
 from pathlib import Path
+from typing import Final, TextIO
 
 import numpy as np
 
 from rigd.excitation.options import ExcitationError, within_a_turn
 from rigd.excitation.record import Excitation, assemble, check_ticks, lay_out_segments
+
+MOST_BYTES: Final = 256_000_000
 
 
 def from_csv(
@@ -55,9 +60,19 @@ def from_csv(
     return assemble("file", parameters, rate_hz, segments, sweep)
 
 
+def _opened(path: Path) -> TextIO:
+    """Open a plain file; a pipe that nobody writes to is not waited for."""
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
+        os.close(fd)
+        raise ExcitationError(f"{path}: is not a file of at most {MOST_BYTES / 1e6:g} MB.")
+    return open(fd, newline="", encoding="utf-8-sig")  # noqa: PTH123 - a descriptor has no path
+
+
 def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with _opened(path) as file:
             rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error

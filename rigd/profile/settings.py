@@ -64,7 +64,8 @@ class RealtimeSettings:
 class RigSection:
     """What is of the rig as a whole."""
 
-    rate_hz: Annotated[float, Gt(0), Le(20_000)]
+    rate_hz: Annotated[float, Ge(100), Le(20_000)]
+    """Slower loops look too seldom at who else is at work."""
 
 
 SECTIONS: dict[str, type] = {

@@ -2,8 +2,8 @@
 
 import asyncio
 import logging
+import os
 import signal
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
@@ -12,6 +12,8 @@ from pathlib import Path
 from rigd.devices.registry import Reality, reality, simulated_differently
 from rigd.profile import Profile
 from rigd.service.address import COMMON, bind, socket_path
+from rigd.service.documents import look_up_user
+from rigd.service.log import NAME, Log
 from rigd.service.server import Server
 from rigd.service.service import Service
 from rigd.supervisor.lock import RigLock
@@ -19,7 +21,7 @@ from rigd.supervisor.rig import Rig
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
-_log = logging.getLogger("rigd.serve")
+_log = logging.getLogger(NAME)
 
 
 def run_daemon(
@@ -50,9 +52,10 @@ def run_daemon(
     AddressError
         If there can be no socket.
     """
-    _log_to_standard_error()
     moving = reality(profile.rig)
     with ExitStack() as ending:
+        ending.enter_context(Log())
+        look_up_user(os.getuid())
         ending.enter_context(
             RigLock(profile.name, "rigd serve", hardware=moving is Reality.HARDWARE)
         )
@@ -101,11 +104,3 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     await asyncio.gather(opening, attending, return_exceptions=True)
     await server.close()
     return asked.result()
-
-
-def _log_to_standard_error() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    logging.raiseExceptions = False  # a terminal that is gone must not end anything
-    _log.addHandler(handler)
-    _log.setLevel(logging.INFO)

@@ -16,6 +16,17 @@ from rigd.supervisor.status import ProcessStatus, RigStatus
 Document = dict[str, Any]
 
 
+_USERS: dict[int, str] = {}
+"""Names by number."""
+
+
+def look_up_user(uid: int) -> None:
+    """Find out the name of a user, which may take its time, for :class:`Peer`."""
+    if uid not in _USERS:
+        with suppress(KeyError):
+            _USERS[uid] = pwd.getpwuid(uid).pw_name
+
+
 @dataclass(frozen=True, slots=True)
 class Peer:
     """A client, as the kernel knows it."""
@@ -27,10 +38,8 @@ class Peer:
 
     @property
     def user(self) -> str:
-        """Its user's name, if it has one."""
-        with suppress(KeyError):
-            return pwd.getpwuid(self.uid).pw_name
-        return str(self.uid)
+        """Its user's name, as far as that was looked up."""
+        return _USERS.get(self.uid, str(self.uid))
 
     def __str__(self) -> str:
         return f"process {self.pid} of {self.user}"

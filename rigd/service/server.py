@@ -12,12 +12,14 @@ import logging
 import os
 import socket
 import struct
+import threading
 import time
 from collections import deque
 from contextlib import suppress
 from typing import cast
 
-from rigd.service.documents import Document, Peer
+from rigd.service.documents import Document, Peer, look_up_user
+from rigd.service.log import NAME
 from rigd.service.messages import LONGEST_LINE, AnyRequest, Id, RequestError, parse_request
 from rigd.service.service import CommandError, Service
 
@@ -33,7 +35,7 @@ _MOST_WAITING_LINES = 64
 _FAREWELL_S = 1.0
 _CREDENTIALS = struct.Struct("3i")
 
-_log = logging.getLogger("rigd.serve")
+_log = logging.getLogger(NAME)
 
 
 class Server:
@@ -115,6 +117,8 @@ class Server:
         except OSError:
             link.close()
             return
+        # Not waited for: the user data base may be on a network.
+        threading.Thread(target=look_up_user, args=(uid,), daemon=True).start()
         assert self._service is not None
         client = _Client(self, self._service, Peer(self._count, pid, uid))
         self._clients.add(client)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -36,23 +37,33 @@ from rigd.service.documents import (
     rig_document,
     transition_document,
 )
+from rigd.service.log import NAME
 from rigd.service.states import State, StateMachine, Transition
 from rigd.supervisor.orders import NoRoomError, Order, choose_path, make_room, what_is_kept
 from rigd.supervisor.rig import RigError
-from rigd.supervisor.session import SessionFailedError, SessionProgress, SessionResult, Watcher
+from rigd.supervisor.session import (
+    SessionFailedError,
+    SessionProgress,
+    SessionResult,
+    Watcher,
+    always,
+)
 from rigd.supervisor.status import RigStatus
 
 LOOK_S = 0.2
 """From one look at the rig to the next."""
+_DEAF_S = 1.5
+"""Without a look for so long the event loop is stuck, and hears no stop."""
 _RATE_LOOKS = 10
 """Over as many of them a rate is measured."""
-_LARGEST_CSV = 256_000_000
 _TOLD_LEVELS = ("info", "warning", "error", "fatal")
+
+_SHUTTING_DOWN = "The daemon is being shut down."
 
 Publish = Callable[[Document], None]
 T = TypeVar("T")
 
-_log = logging.getLogger("rigd.serve")
+_log = logging.getLogger(NAME)
 
 
 class RigControl(Protocol):
@@ -61,10 +72,16 @@ class RigControl(Protocol):
     connected: bool
     zero_lost: bool
 
-    def connect(self, *, reset_fault: bool = False) -> None:
+    def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
         """Connect the devices."""
 
-    def run(self, order: Order, stop: StopRequest, watcher: Watcher) -> SessionResult:
+    def run(
+        self,
+        order: Order,
+        stop: StopRequest,
+        watcher: Watcher,
+        listens: Callable[[], bool] = always,
+    ) -> SessionResult:
         """Run one session."""
 
     def show(self, order: Order) -> str:
@@ -183,6 +200,7 @@ class Service:
         self._series: Series | None = None
         self._task: asyncio.Task[None] | None = None
         self._count = 0
+        self._listened_s = inf
         self._look: RigStatus | None = None
         self._written: deque[tuple[float, dict[str, int]]] = deque(maxlen=_RATE_LOOKS + 1)
         self.controller: Peer | None = None
@@ -206,6 +224,7 @@ class Service:
         """Watch over the rig, until cancelled."""
         while True:
             await asyncio.sleep(LOOK_S)
+            self._listened_s = time.monotonic()
             self.look()
             # Not waited for: another look is due while the second thread is busy.
             await self.watch()
@@ -320,7 +339,7 @@ class Service:
 
     def _check(self, command: str) -> None:
         if self._closing:
-            raise CommandError("The daemon is being shut down.")
+            raise CommandError(_SHUTTING_DOWN)
         refusal = self._states.refusal(command)
         if refusal:
             raise CommandError(refusal)
@@ -344,7 +363,7 @@ class Service:
             refusal = self._states.refusal("start")
             if refusal:
                 raise CommandError(refusal)
-        except CommandError as error:
+        except Exception as error:
             series.running, series.failed, series.reason = False, True, str(error)
             raise
         finally:
@@ -380,6 +399,8 @@ class Service:
                 else:
                     self._states.move(State.READY, "reset by the operator")
                     return {"zero_lost": self._rig.zero_lost}
+            if self._closing:
+                raise CommandError(_SHUTTING_DOWN)
             self._states.move(State.IDLE, "reset by the operator")
             await self._connect(reset_fault=True)
         finally:
@@ -395,10 +416,19 @@ class Service:
                     "when the daemon was started; stop the daemon and start it anew if that is "
                     "meant."
                 )
-            await self._call(partial(self._rig.connect, reset_fault=reset_fault))
+            await self._call(partial(self._rig.connect, moving, reset_fault=reset_fault))
         except RigError as error:
             self._states.move(State.FAULT, str(error))
             raise CommandError(str(error)) from None
+        except Exception as error:
+            _log.exception("the rig could not be connected, in a way that was not foreseen")
+            await self._let_go()
+            reason = f"The rig could not be connected, in an unforeseen way ({error!r})."
+            self._states.move(State.FAULT, reason)
+            raise CommandError(reason) from None
+        if self._closing:
+            await self._call(self._rig.disconnect)
+            raise CommandError(_SHUTTING_DOWN)
         self._states.move(State.READY, f"{moving.value} is connected")
 
     # Series
@@ -406,13 +436,7 @@ class Service:
     def _plan(self, request: messages.Start) -> tuple[Excitation, Plan]:
         """Make the excitation and see that it may be run; in the second thread."""
         profile = self._profile
-        path = request.parameters.get("path")
         try:
-            if path is not None and not _readable(path):
-                raise ExcitationError(
-                    f"{path}: is not a file of at most {_LARGEST_CSV / 1e6:g} MB that the daemon "
-                    "can read."
-                )
             excitation = make_excitation(
                 request.excitation, request.parameters, profile.rig.rate_hz
             )
@@ -435,13 +459,13 @@ class Service:
         except (RefusedError, RigError, SessionFailedError) as error:
             series.reason = str(error)
             if not isinstance(error, RefusedError):
-                kept = "" if series.path is None else f" {what_is_kept(series.path)}"
-                fault = series.reason = f"{error} The drive is disabled.{kept}"
+                path = error.path if isinstance(error, SessionFailedError) else None
+                fault = series.reason = f"{error} The drive is disabled. {what_is_kept(path)}"
         except Exception as error:
             # Nobody may be left to switch off: what cannot be explained ends with everything off.
             _log.exception("a session ended in a way that was not foreseen")
-            await self._call(self._rig.disconnect)
             fault = series.reason = f"The session failed in an unforeseen way ({error!r})."
+            await self._let_go()
         else:
             last = series.results[-1] if series.results else None
             if last is not None and not last.went_well:
@@ -454,6 +478,13 @@ class Service:
         series.failed = bool(fault or (series.reason and not series.stop.requested))
         self._states.move(*_after(series, fault))
         self._publish({"event": "series", **series.as_document()})
+
+    async def _let_go(self) -> None:
+        """Disconnect the rig, and go on whatever that leads to."""
+        try:
+            await self._call(self._rig.disconnect)
+        except Exception:
+            _log.exception("the rig could not be let go")
 
     def _run_series(
         self, series: Series, excitation: Excitation, loop: asyncio.AbstractEventLoop
@@ -475,6 +506,8 @@ class Service:
         for number in range(1, request.repeat + 1):
             if series.stop.requested:
                 return
+            if not self._listens():
+                raise RigError("The daemon hears nobody: no further session is begun.")
             make_room(self._folder, excitation, self._profile.limits)
             numbered = number if request.repeat > 1 else None
             path = choose_path(self._folder, excitation.kind, numbered)
@@ -485,11 +518,18 @@ class Service:
             order = Order(self._profile, excitation, path, tuple(notes.items()))
             if self._live:
                 tell("info", self._rig.show(order))
-            result = self._rig.run(order, series.stop, watcher)
+            result = self._rig.run(order, series.stop, watcher, self._listens)
             series.results.append(result)
             publish({"event": "session", "number": number, **result.as_dict()})
             if not result.went_well:
                 return
+
+    def _listens(self) -> bool:
+        """Whether somebody who asks for a stop is heard; asked from the second thread.
+
+        A session whose operator cannot be heard gets no sign of life any more, and ends.
+        """
+        return time.monotonic() - self._listened_s < _DEAF_S
 
     # Telling
 
@@ -530,11 +570,3 @@ def _after(series: Series, fault: str) -> tuple[State, str]:
     if series.reason:
         return State.READY, series.reason
     return State.READY, f"{series.request.excitation} is complete"
-
-
-def _readable(path: Path) -> bool:
-    """Whether it is a plain file of a size that can be read: no pipe that nobody writes to."""
-    try:
-        return path.is_file() and path.stat().st_size <= _LARGEST_CSV
-    except (OSError, ValueError):
-        return False

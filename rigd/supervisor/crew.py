@@ -4,18 +4,19 @@ This module is quick to import, so that the processes can be started before anyt
 import what they need while the supervisor reads the profile and plans.
 """
 
+import contextlib
 import os
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rigd.engine.process import Child
+from rigd.engine.process import Child, ChildError
 from rigd.engine.processes import CONTROL, LIVE, PROCESSES, RECORDER, Process
 from rigd.engine.ring import shared_memory_fd
 
 if TYPE_CHECKING:
     from rigd.engine.channels import Channels
 
-_DESCRIPTORS = 5
+_DESCRIPTORS = 6
 
 
 class Crew:
@@ -28,6 +29,13 @@ class Crew:
     live
         Start the live publisher too.
 
+    Raises
+    ------
+    ChildError
+        If a process cannot be started.
+    OSError
+        If there is no shared memory.
+
     Attributes
     ----------
     live
@@ -36,12 +44,18 @@ class Crew:
 
     def __init__(self, *, live: bool) -> None:
         self.live = live
-        self._fds = [shared_memory_fd() for _ in range(_DESCRIPTORS)]
+        self._fds: list[int] = []
         self._channels: Channels | None = None
         self._used: set[Process] = set()
         self._children: dict[Process, Child] = {}
-        for process in (CONTROL, RECORDER, LIVE) if live else (CONTROL, RECORDER):
-            self._start(process)
+        try:
+            while len(self._fds) < _DESCRIPTORS:
+                self._fds.append(shared_memory_fd())
+            for process in (CONTROL, RECORDER, LIVE) if live else (CONTROL, RECORDER):
+                self._start(process)
+        except (OSError, ChildError):
+            self.end()
+            raise
 
     def __getitem__(self, process: Process) -> Child:
         return self._children[process]
@@ -60,16 +74,24 @@ class Crew:
         return self._children[RECORDER]
 
     def fresh(self, process: Process) -> Child:
-        """Return a process that has had no job yet, in place of the one that has."""
+        """Return a process that has had no job yet, in place of the one that has.
+
+        Raises
+        ------
+        ChildError
+            If it cannot be started.
+        """
         if process in self._used:
-            self._children[process].stop(process.grace_s)
+            if process in self._children:
+                self._children.pop(process).stop(process.grace_s)
             self._start(process)
         self._used.add(process)
         return self._children[process]
 
     def replace(self, process: Process) -> Child:
-        """Kill a process and start another in its place."""
-        self._children[process].kill()
+        """Kill a process and start another in its place; raises as `fresh` does."""
+        if process in self._children:
+            self._children[process].kill()
         return self.fresh(process)
 
     def has_job(self, process: Process) -> bool:
@@ -118,9 +140,10 @@ class Crew:
         """End all processes and give the memory back; harmless when repeated."""
         if self._channels is not None:
             self._channels.ask_to_stop()
-        for process in PROCESSES:
-            if process in self._children:
-                self._children.pop(process).stop(process.grace_s)
+        with contextlib.ExitStack() as ending:  # which goes on whatever becomes of one of them
+            for process in reversed(PROCESSES):
+                if process in self._children:
+                    ending.callback(self._children.pop(process).stop, process.grace_s)
         if self._channels is not None:
             self._channels.close()
             self._channels = None

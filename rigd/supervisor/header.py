@@ -71,4 +71,7 @@ def _metadata(order: Order, connected: Message, tare: Message) -> dict[str, str]
 
 
 def _text(value: float | str) -> str:
-    return value if isinstance(value, str) else repr(value)
+    # A file's name may be no text; nothing of it may keep the session from being written.
+    return (
+        value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
+    )

@@ -5,7 +5,7 @@ import time
 from rigd.engine.board import Word
 from rigd.engine.channels import Channels
 from rigd.engine.events import Event, Level
-from rigd.engine.process import Child, ChildError
+from rigd.engine.process import ChildError
 from rigd.engine.processes import LIVE, Pulse
 from rigd.engine.topics import SAMPLE, TOPICS
 from rigd.live.job import LiveJob
@@ -39,8 +39,8 @@ class LiveView:
 
     def start(self) -> str:
         """Start it and return the address of the view, or why there is none."""
-        child = self._crew.fresh(LIVE)
         try:
+            child = self._crew.fresh(LIVE)
             child.start(self._job)
             answer = child.poll(_PATIENCE_S) or {"error": "it does not answer."}
         except ChildError as error:
@@ -80,8 +80,8 @@ class LiveView:
             self._lost = True
             return [_event("warning", f"{why} It is not started again; the session goes on.")]
         self._pulse, self._shown = Pulse(), False
-        child: Child = self._crew.replace(LIVE)
         try:
+            child = self._crew.replace(LIVE)
             child.start(self._job)
         except ChildError as error:
             self._lost = True

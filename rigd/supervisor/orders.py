@@ -110,7 +110,13 @@ def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
         If the folder cannot be made or written to, or the disk is too full.
     """
     make_folder(folder)
-    free = shutil.disk_usage(folder).free
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise NoRoomError(
+            f"{folder}: how much room there is cannot be told ({error.strerror}); see whether its "
+            "disk is there."
+        ) from error
     needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
     if free - needed < limits.disk_free_mb * 1e6:
         raise NoRoomError(
@@ -128,19 +134,38 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
     if number is not None:
         stem += f"-{number:02d}"
-    path, extra = folder / f"{stem}.mcap", 1
+    path = folder / f"{stem}.mcap"
     while path.exists() or path.with_name(path.name + PART_SUFFIX).exists():
-        extra += 1
-        path = folder / f"{stem}_{extra}.mcap"
+        path = another_path(path)
     return path
 
 
-def what_is_kept(path: Path) -> str:
-    """Say what there is of a session that failed, once its processes have ended."""
+def another_path(path: Path) -> Path:
+    """Name a session file in place of one whose name somebody else took: X.mcap, X_2.mcap, …."""
+    stem, _, number = path.stem.rpartition("_")
+    if stem and number.isdecimal():
+        return path.with_name(f"{stem}_{int(number) + 1}{path.suffix}")
+    return path.with_name(f"{path.stem}_2{path.suffix}")
+
+
+def what_is_kept(path: Path | None) -> str:
+    """Say what there is of a session that failed, once its processes have ended.
+
+    Parameters
+    ----------
+    path
+        The file that was begun for it, if any.
+    """
+    if path is None:
+        return "There is no file of it."
     part = path.with_name(path.name + PART_SUFFIX)
-    if part.exists():
+    try:
+        kept, whole = part.exists(), path.exists()
+    except OSError as error:
+        return f"Its folder {path.parent} cannot be looked into ({error.strerror})."
+    if kept:
         return (
             f"What was recorded is in {part}; rigd recover {shlex.quote(str(part))} makes a clean "
             "file of it."
         )
-    return f"Its file is {path}." if path.exists() else f"There is no {path.name} in {path.parent}."
+    return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."

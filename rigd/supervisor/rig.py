@@ -3,9 +3,11 @@
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rigd.devices.contracts import DeviceError
+from rigd.devices.registry import Reality
 from rigd.devices.resetting import reset_drive
 from rigd.engine.board import Stop, Word
 from rigd.engine.jobs import ControlJob
@@ -16,7 +18,7 @@ from rigd.profile import Profile
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.live_view import LiveView
 from rigd.supervisor.orders import Order
-from rigd.supervisor.session import Session, SessionResult, Watcher
+from rigd.supervisor.session import Session, SessionResult, Watcher, always
 from rigd.supervisor.status import RigStatus, StatusWatch
 
 _POLL_S = 0.05
@@ -74,11 +76,13 @@ class Rig:
         """Whether no motor moves; known once connected."""
         return bool(self._told.get("simulated", False))
 
-    def connect(self, *, reset_fault: bool = False) -> None:
+    def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
 
         Parameters
         ----------
+        moving
+            What the operator was told would move: anything else is refused.
         reset_fault
             Reset a fault of the drive first: the operator's decision.
 
@@ -89,27 +93,28 @@ class Rig:
         """
         if self.connected:
             self.disconnect()
-        crew = self._crew = self._crew or Crew(live=self._live)
         try:
+            crew = self._crew = self._crew or Crew(live=self._live)
             if reset_fault:
-                reset_drive(self._profile.rig)
-            crew.lay_out(self._profile.rig.rate_hz)
-            crew.fresh(CONTROL).start(ControlJob(self._profile, crew.channels.specs, self._fast))
+                self._reset_fault(moving)
+            _lay_out(crew, self._profile.rig.rate_hz)
+            job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
+            crew.fresh(CONTROL).start(job)
             self._told = self._ask(_CONNECT_PATIENCE_S)
-        except OSError as error:
-            self.disconnect()
-            raise RigError(
-                "There is not enough shared memory for the processes of a session "
-                f"({error.strerror}); free some in /dev/shm."
-            ) from error
-        except (RigError, DeviceError, ChildError) as error:
+        except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
         self.connected = True
         self.zero_lost |= self._zero_set
         self._zero_set = False
 
-    def run(self, order: Order, stop: StopRequest, watcher: Watcher) -> SessionResult:
+    def run(
+        self,
+        order: Order,
+        stop: StopRequest,
+        watcher: Watcher,
+        listens: Callable[[], bool] = always,
+    ) -> SessionResult:
         """Run one session.
 
         Parameters
@@ -118,8 +123,8 @@ class Rig:
             What to run.
         stop
             The operator's, which ends it.
-        watcher
-            See :data:`rigd.supervisor.session.Watcher`.
+        watcher, listens
+            See :class:`rigd.supervisor.session.Session`.
 
         Raises
         ------
@@ -140,7 +145,7 @@ class Rig:
         board[Word.LIVE_DROPPED] = 0
         crew.channels.clear()
         view, self._view = self._view, None
-        session = Session(order, crew, self._told, view, watcher)
+        session = Session(order, crew, self._told, view, watcher, listens)
         try:
             return session.run(stop)
         finally:
@@ -230,6 +235,12 @@ class Rig:
         if crew is not None:
             crew.end()
 
+    def _reset_fault(self, moving: Reality | None) -> None:
+        try:
+            reset_drive(self._profile.rig, moving)
+        except (DeviceError, OSError) as error:
+            raise RigError(str(error)) from None
+
     def _require(self) -> Crew:
         if self._crew is None or not self.connected:
             raise RigError("The rig is not connected.")
@@ -276,3 +287,13 @@ class Rig:
         with contextlib.suppress(ChildError):
             self._crew.control.poll(_ANSWER_PATIENCE_S)
         self.disconnect()
+
+
+def _lay_out(crew: Crew, rate_hz: float) -> None:
+    try:
+        crew.lay_out(rate_hz)
+    except OSError as error:
+        raise RigError(
+            "There is not enough shared memory for the processes of a session "
+            f"({error.strerror}); free some in /dev/shm."
+        ) from error

@@ -7,7 +7,7 @@ has the file closed with the outcome.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigd.engine.board import Phase, Stop, Word
@@ -15,22 +15,36 @@ from rigd.engine.events import Event, read_events
 from rigd.engine.jobs import RecorderJob, SessionJob
 from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import CONTROL, RECORDER, Pulse
+from rigd.engine.reference import put_reference
 from rigd.engine.ring import Observer
 from rigd.engine.signals import StopRequest
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.header import file_header
 from rigd.supervisor.live_view import LiveView
-from rigd.supervisor.orders import Order
+from rigd.supervisor.orders import Order, another_path
 
 _POLL_S = 0.05
 _PATIENCE_S = 5.0
 _SLOW_PATIENCE_S = 30.0
 """For enabling a drive and for switching it off, which may take its time."""
+_MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
 
 class SessionFailedError(Exception):
-    """A session could not be run or ended; the message says why, in the operator's words."""
+    """A session could not be run or ended; the message says why, in the operator's words.
+
+    Attributes
+    ----------
+    path
+        Its file, if one was begun.
+    """
+
+    path: Path | None = None
+
+
+class _NameTakenError(SessionFailedError):
+    """The file is there already, and is somebody else's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +112,9 @@ class Session:
         The view to keep up, or None.
     watcher
         Called some twenty times a second with the progress and the events since the last call.
+    listens
+        Whether a stop would be heard. Where it would not, the control process is to take this one
+        for hung.
 
     Attributes
     ----------
@@ -112,6 +129,7 @@ class Session:
         connected: Message,
         live: LiveView | None,
         watcher: Watcher,
+        listens: Callable[[], bool],
     ) -> None:
         self._order = order
         self._crew = crew
@@ -120,10 +138,12 @@ class Session:
         self._board = crew.channels.board
         self._events = Observer(crew.channels.events)
         self._watcher = watcher
+        self._listens = listens
         self._virtual = connected["realtime"]["clock"] == "virtual"
         self._pulse = Pulse()
         self._recorder_lost: str | None = None
         self._control_at_work = False
+        self._opened: Path | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
@@ -144,7 +164,9 @@ class Session:
             if self._control_at_work:
                 self._board[Word.STOP] = Stop.NO_RECORDER
                 self._listen_to_control()
-            raise SessionFailedError(self._recorder_lost) from None
+            failure = SessionFailedError(self._recorder_lost)
+            failure.path = self._opened
+            raise failure from None
         finally:
             stop.on_request = _nothing
 
@@ -152,11 +174,20 @@ class Session:
         self._board[Word.STOP] = Stop.OPERATOR
 
     def _run(self) -> SessionResult:
-        order, crew = self._order, self._crew
-        crew.fresh(RECORDER).start(RecorderJob(order.path, crew.channels.specs))
-        self._ask_recorder("opened")
+        crew = self._crew
+        try:
+            reference = put_reference(
+                crew.channels.reference_fd, self._order.excitation.reference_rad
+            )
+        except OSError as error:
+            raise SessionFailedError(
+                f"There is not enough shared memory for a session of this length "
+                f"({error.strerror}); free some in /dev/shm."
+            ) from None
+        self._open_file()
+        order = self._order
         self._control_at_work = True
-        crew.control.send_object("session", SessionJob(order.profile, order.excitation))
+        crew.control.send_object("session", SessionJob(order.profile, reference))
         answer = self._listen_to_control()
         if "ready" in answer:
             crew.recorder.send(begin=file_header(order, self._connected, answer["ready"]))
@@ -166,6 +197,22 @@ class Session:
         if self._recorder_lost is not None:
             raise SessionFailedError(self._recorder_lost)
         return self._close(answer)
+
+    def _open_file(self) -> None:
+        """Have the file made, under another name if somebody else has just taken the one chosen."""
+        crew = self._crew
+        for _ in range(_MOST_NAMES):
+            job = RecorderJob(self._order.path, crew.channels.specs)
+            crew.fresh(RECORDER).start(job)
+            try:
+                self._ask_recorder("opened")
+            except _NameTakenError as error:
+                taken = error
+                self._order = replace(self._order, path=another_path(self._order.path))
+            else:
+                self._opened = self._order.path
+                return
+        raise taken
 
     def _listen_to_control(self) -> Message:
         """Wait for the control process's next message, watching everybody meanwhile."""
@@ -259,14 +306,16 @@ class Session:
                 f"The recorder process does not answer within {patience_s:g} s."
             )
         if "error" in message:
-            raise SessionFailedError(message["error"])
+            failed = _NameTakenError if message.get("taken") else SessionFailedError
+            raise failed(message["error"])
         if expected not in message:
             raise SessionFailedError(f"The recorder process answers {message}.")
         return message
 
     def _report(self) -> None:
         board = self._board
-        board.beat(Word.SUPERVISOR_BEAT)
+        if self._listens():
+            board.beat(Word.SUPERVISOR_BEAT)
         events = read_events(self._events.take(16))
         if self._live is not None:
             events += self._live.attend()
@@ -307,6 +356,11 @@ class Session:
             fault=finished["fault"] or ended == "fault",
             live_dropped=self._board[Word.LIVE_DROPPED],
         )
+
+
+def always() -> bool:
+    """Answer for somebody whose stop comes as a signal."""
+    return True
 
 
 def _nothing() -> None:

@@ -53,8 +53,7 @@ def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcom
     board[Word.START_UTC_NS] = 10**18
     board[Word.SCHEDULED] = ticks
     board[Word.PHASE] = Phase.OFF
-    recorder.transfer()
-    recorder.finish_orphaned()
+    recorder.finish_orphaned()  # which finds all of it in the rings
     session = read_session(tmp_path / "alone.mcap")
     assert len(session.samples) == ticks
     assert session.outcome["outcome"] == outcome

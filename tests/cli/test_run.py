@@ -4,6 +4,9 @@ import contextlib
 import json
 import os
 import signal
+import subprocess
+import sys
+import termios
 import time
 from pathlib import Path
 
@@ -12,6 +15,7 @@ import pytest
 
 from rigd.session import Status, read_controls, read_session
 
+RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "2", "--rest", "0.2", "--ring-down", "0.3", "--stop-hz", "10")
 
 
@@ -291,6 +295,58 @@ def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
     assert process.returncode == 1, errors
     assert len(json.loads(output)["sessions"]) >= 2
     assert "Traceback" not in errors
+
+
+def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path):
+    options = ("hold", "--duration", "1", "--fast", "--json")
+    processes = [start_rigd("run", *options) for _ in range(4)]
+    paths = set()
+    for process in processes:
+        output, errors = process.communicate(timeout=60)
+        assert process.returncode == 0, errors
+        paths.add(json.loads(output)["sessions"][0]["path"])
+    assert len(paths) == 4
+    assert {f"sessions/{path.name}" for path in tmp_path.glob("sessions/*")} == paths
+
+
+def test_a_file_s_name_that_is_no_text_is_written_as_well_as_it_can_be(rigd, tmp_path):
+    name = os.fsdecode(b"f\xff.csv")
+    (tmp_path / name).write_text("angle_rad\n" + "0.0\n" * 100)
+    done = subprocess.run(
+        [RIGD, "run", "file", name, "--fast", "--json"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    path = tmp_path / the_session(done)["path"]
+    assert read_session(path).metadata["file"] == r"f\udcff.csv"
+
+
+def test_closed_descriptors_are_no_obstacle(tmp_path):
+    done = subprocess.run(
+        ["sh", "-c", f"exec {RIGD} run hold --duration 1 --fast --output out <&- >&- 2>&-"],
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert len(list(tmp_path.glob("out/*.mcap"))) == 1
+
+
+def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_path):
+    master, slave = os.openpty()
+    process = subprocess.Popen(
+        [RIGD, "run", "hold", "--duration", "5", "--rest", "0", "--profile", patient, "--json"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=slave, text=True,
+    )  # fmt: skip
+    try:
+        recorded(tmp_path, 1000)
+        termios.tcflow(slave, termios.TCOOFF)  # Ctrl-S
+        wait_for(lambda: list(tmp_path.glob("sessions/*.mcap")))
+    finally:
+        termios.tcflow(slave, termios.TCOON)
+    output, _ = process.communicate(timeout=60)
+    os.close(master)
+    os.close(slave)
+    (session,) = json.loads(output)["sessions"]
+    assert session["outcome"] == "complete", session
 
 
 def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path):

@@ -1,6 +1,8 @@
 """Excitations: shape, length to the tick, and refusals."""
 
 import math
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -133,6 +135,14 @@ def test_bad_csv_files_are_refused_with_their_line(tmp_path, text, complaint):
     with pytest.raises(ExcitationError) as caught:
         from_csv(path, rate_hz=1000.0)
     assert complaint in str(caught.value)
+
+
+def test_only_plain_files_are_read(tmp_path):
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    for path in (pipe, tmp_path, Path("/dev/zero")):
+        with pytest.raises(ExcitationError, match="is not a file"):  # and nobody waits
+            from_csv(path, rate_hz=1000.0)
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", None])

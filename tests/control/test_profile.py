@@ -151,6 +151,12 @@ def test_a_wrong_unit_says_which_is_meant(refuse):
     )
 
 
+def test_a_loop_too_slow_to_be_watched_is_refused(refuse):
+    [line] = refuse(("rate_hz = { value = 1000.0", "rate_hz = { value = 20.0"))
+    assert "rig.rate_hz" in line
+    assert "100" in line
+
+
 def test_a_missing_key_is_named_with_its_unit(refuse):
     [line] = refuse((INERTIA, ""))
     assert line.startswith("motor.inertia_kg_m2 is missing")

@@ -43,6 +43,16 @@ def test_only_where_nothing_waits_for_the_clock_may_time_be_skipped():
     assert {each for each in Reality if each.any_clock} == {Reality.SIMULATED, Reality.LOCK_STEP}
 
 
+def test_what_moves_is_what_was_said_to_move(rig, stand_in):
+    assert not open_devices(rig, Reality.HARDWARE).simulated
+    with pytest.raises(DeviceError, match="was to move, and now it would be the hardware"):
+        open_devices(rig, Reality.SIMULATOR)
+    stand_in(rig.name, can_socket="/nowhere")
+    assert open_devices(rig, Reality.SIMULATOR).simulated
+    with pytest.raises(DeviceError, match="hardware was to move"):
+        open_devices(rig, Reality.HARDWARE)
+
+
 def test_devices_say_whether_they_are_simulated(rig, stand_in):
     assert not open_devices(rig).simulated
     stand_in(rig.name, can_socket="/nowhere")

@@ -13,6 +13,7 @@ from rigd.engine.clocks import VirtualClock
 from rigd.engine.control import attend
 from rigd.engine.events import read_events
 from rigd.engine.jobs import SessionJob
+from rigd.engine.reference import put_reference
 from rigd.engine.ring import shared_memory_fd
 from rigd.engine.signals import StopRequest
 from rigd.excitation import chirp
@@ -147,7 +148,13 @@ class Session:
         self.board[Word.GO] = 1
 
     def run(self):
-        return self.obey({"session": SessionJob(self.profile, self.excitation)})
+        return self.obey(self.order())
+
+    def order(self, excitation=None):
+        """Order a session: this one's, or one with another excitation."""
+        reference_rad = (excitation or self.excitation).reference_rad
+        reference = put_reference(shared_memory_fd(), reference_rad)
+        return {"session": SessionJob(self.profile, reference)}
 
     def obey(self, *orders):
         """Attend to the rig from connecting to closing, with these orders in between."""

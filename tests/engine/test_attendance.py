@@ -8,7 +8,6 @@ import pytest
 from rigd.devices.contracts import DeviceError
 from rigd.engine.board import Phase, Word
 from rigd.engine.clocks import SuspendWatch, VirtualClock
-from rigd.engine.jobs import SessionJob
 from rigd.excitation import hold, step
 from rigd.session.format import Status
 
@@ -22,7 +21,7 @@ class FakeRealClock(VirtualClock):
 def short(session, **options):
     rate_hz = session.profile.rig.rate_hz
     excitation = hold(rate_hz=rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
-    return {"session": SessionJob(session.profile, options.get("excitation", excitation))}
+    return session.order(options.get("excitation", excitation))
 
 
 def test_sessions_follow_each_other_on_one_connection(make_session):
@@ -136,6 +135,29 @@ def test_a_sensor_that_is_silent_between_sessions_is_told(make_session):
     (ended,) = session.parent.said("ended")
     assert "A new angle has not come for 1 s" in ended["ended"]
     session.assert_safe()
+
+
+def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session):
+    session = make_session()
+    most = session.profile.limits.stale_ticks_in_a_row
+    tare = round(session.profile.session.tare_s * session.profile.rig.rate_hz)
+    ends = []
+
+    def stale(drive):
+        """In the middle of the first record for long enough to end it; once in the next tare."""
+        ended = len(session.parent.said("finished"))
+        if ended and not ends:
+            ends.append(drive.reads)
+        return (not ended and drive.reads > tare + 900) or (
+            bool(ends) and drive.reads == ends[0] + 5
+        )
+
+    type(session.drive).angle_stale = property(stale)
+    session.obey(short(session), short(session))
+    first, second = session.parent.said("finished")
+    assert first["finished"] == "fault"
+    assert f"exceeds {most}" in first["reason"].replace(" of", "") or "stale" in first["reason"]
+    assert (second["finished"], second["reason"]) == ("complete", "")
 
 
 def test_a_device_that_fails_in_a_session_ends_the_attendance_after_it(make_session):

@@ -11,7 +11,6 @@ from rigd.control import close_loop
 from rigd.devices.contracts import Devices
 from rigd.engine.board import Word
 from rigd.engine.clocks import VirtualClock
-from rigd.engine.jobs import SessionJob
 from rigd.engine.watch import make_watch
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
@@ -250,7 +249,7 @@ def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
 ):
     session = make_session()
     sensor(session, wrong_from=10_001, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
-    job = {"session": SessionJob(session.profile, session.excitation)}
+    job = session.order()
     session.obey(*[job, *([{"tare": True}] if operator_tares else []), job])
     session.assert_safe()
     first, second = session.parent.said("finished")
@@ -295,7 +294,7 @@ def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session)
     heat_nm2 = float((commanded**2).sum()) / 1000 / 1e4  # over 10 000 s nothing cools down
     session = make_session()
     motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)
-    job = {"session": SessionJob(session.profile, session.excitation)}
+    job = session.order()
     session.obey(job, job)
     first, second = session.parent.said("finished")
     assert (first["finished"], first["reason"]) == ("complete", "")

@@ -238,7 +238,7 @@ def open_writer(path):
     return _current.writer
 
 
-def open_watched(rig):
+def open_watched(rig, moving):
     return ThreadCrew.world.open_devices(rig)
 
 

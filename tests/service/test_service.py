@@ -1,9 +1,13 @@
 """The daemon's logic on a rig in this process: commands, states, control, and what goes wrong."""
 
+import asyncio
+
 import pytest
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.registry import Reality
+from rigd.engine.board import Word
+from rigd.engine.process import ChildError
 from rigd.service.documents import Peer
 from rigd.service.service import CommandError
 from rigd.service.states import State
@@ -254,6 +258,70 @@ def test_what_nobody_foresaw_ends_with_everything_off(operated, monkeypatch):
     assert operated.state is State.FAULT
     assert not operated.rig.connected
     assert "ZeroDivisionError" in operated.last["reason"]
+
+
+def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate, monkeypatch):
+    def break_(*_, **__):
+        raise ZeroDivisionError
+
+    operated = operate()
+    with monkeypatch.context() as broken:
+        broken.setattr(operated.rig, "connect", break_)
+        operated.open()
+        assert operated.state is State.FAULT
+        assert "ZeroDivisionError" in str(operated.ask("reset"))
+    assert operated.state is State.FAULT
+    operated.ask("reset")
+    assert operated.state is State.READY
+
+
+def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
+    assert operated.ask("start", **SHORT)["series"] == 1
+    crew = operated.rig._crew
+    with monkeypatch.context() as broken:
+        broken.setattr(type(crew), "_start", refuse_to_start)
+        operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert "cannot be started" in operated.last["reason"]
+    operated.ask("reset")
+    operated.ask("start", **SHORT)
+    assert operated.state is State.READY
+
+
+def refuse_to_start(*_):
+    raise ChildError("The recorder process cannot be started.")
+
+
+def test_a_reset_does_not_connect_what_is_being_closed(operated):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+
+    async def both():
+        reset = asyncio.ensure_future(operated.handle("reset"))
+        await asyncio.sleep(0)
+        await operated.service.close("it ends")
+        return await reset
+
+    refusal = operated.loop.run_until_complete(both())
+    assert "shut down" in str(refusal)
+    assert not operated.rig.connected
+
+
+def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, monkeypatch):
+    heard = iter([True, True, False])
+    monkeypatch.setattr(operated.service, "_listens", lambda: next(heard, False))
+    beats = []
+    operated.world.countdown = 1200
+    operated.world.then = lambda _: beats.append(board(operated)[Word.SUPERVISOR_BEAT])
+    operated.ask("start", **SHORT, repeat=2)
+    assert board(operated)[Word.SUPERVISOR_BEAT] == beats[0]
+    assert len(operated.last["sessions"]) == 1
+    assert "hears nobody" in operated.last["reason"]
+
+
+def board(operated):
+    return operated.rig._crew.channels.board
 
 
 def test_the_end_of_the_daemon_stops_a_session_safely(operated):

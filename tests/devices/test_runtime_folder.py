@@ -1,0 +1,54 @@
+"""What is found in a folder that everybody may write to is not trusted."""
+
+import os
+import stat
+import tempfile
+
+import pytest
+
+from rigd.devices.held_file import HeldFile
+from rigd.devices.simulator import runtime_folder
+
+
+@pytest.fixture
+def common(monkeypatch, tmp_path):
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.parametrize("taken_by", ["nobody", "a file", "a link", "another user"])
+def test_without_one_of_its_own_a_user_gets_one_that_nobody_else_can_enter(
+    common, monkeypatch, taken_by
+):
+    name = common / f"rigd-{os.getuid()}"
+    if taken_by == "a file":
+        name.touch()
+    elif taken_by == "a link":
+        (common / "elsewhere").mkdir()
+        name.symlink_to(common / "elsewhere")
+    elif taken_by == "another user":
+        if os.getuid():
+            pytest.skip("only root can give a folder away")
+        name.mkdir()
+        os.chown(name, 12345, 12345)
+    folder = runtime_folder()
+    assert folder == runtime_folder()  # whoever looks finds the same
+    assert (folder == name) is (taken_by == "nobody")
+    assert stat.S_IMODE(folder.lstat().st_mode) == 0o700
+    assert folder.lstat().st_uid == os.getuid()
+
+
+def test_a_lock_follows_no_link(runtime_folder):
+    held = HeldFile("rig-a", everybody=False)
+    held.path.parent.mkdir(parents=True)
+    precious = runtime_folder / "precious"
+    precious.write_text("precious")
+    held.path.symlink_to(precious)
+    with pytest.raises(OSError, match="symbolic links"):
+        held.acquire("rigd run")
+    assert precious.read_text() == "precious"
+    held.path.unlink()
+    os.mkfifo(held.path)
+    with pytest.raises(OSError, match="no plain file"):
+        held.acquire("rigd run")

@@ -1,0 +1,54 @@
+"""Processes and what they are sent: no message is long, and nothing that fails is fatal."""
+
+import errno
+import os
+import subprocess
+
+import numpy as np
+import pytest
+
+from rigd.engine.jobs import SessionJob
+from rigd.engine.process import Child, ChildError, packed_object
+from rigd.engine.reference import map_reference, put_reference
+from rigd.engine.ring import shared_memory_fd
+from rigd.excitation.record import MAX_TICKS
+from rigd.profile import load_profile
+
+PIPE_BYTES = 65_536
+
+
+@pytest.fixture
+def memory():
+    fd = shared_memory_fd()
+    yield fd
+    os.close(fd)
+
+
+def test_a_reference_is_found_where_it_was_placed(memory):
+    for ticks in (1000, 10, 3000):  # each session has its own
+        reference_rad = np.random.default_rng(ticks).standard_normal(ticks)
+        found = map_reference(put_reference(memory, reference_rad))
+        assert len(found) == ticks
+        assert type(found[0]) is float
+        assert np.array_equal(np.array(found), reference_rad)
+
+
+def test_a_loop_takes_the_longest_session_without_waiting_for_its_bytes(memory):
+    job = SessionJob(load_profile("sim"), put_reference(memory, np.zeros(MAX_TICKS)))
+    assert len(packed_object("session", job)) < PIPE_BYTES
+
+
+def test_a_process_may_be_stopped_twice():
+    child = Child("recorder", "rigd.engine.recorder", [])
+    child.stop(5.0)
+    child.stop(5.0)
+    assert not child.running
+
+
+def test_a_process_that_the_system_does_not_start_is_told(monkeypatch):
+    def refuse(*_, **__):
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    with pytest.raises(ChildError, match=r"recorder process cannot be started .*ulimit"):
+        Child("recorder", "rigd.engine.recorder", [])
