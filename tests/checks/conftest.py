@@ -134,7 +134,7 @@ class StandIns:
         self.drive = StandInDrive(self.calls)
         self.sensor = StandInSensor(self.calls)
 
-    def open(self, rig):
+    def open(self, rig, moving=None):
         self.calls.append("open")
         return Devices(drive=self.drive, sensor=self.sensor, simulated=False)
 

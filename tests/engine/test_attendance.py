@@ -137,9 +137,8 @@ def test_a_sensor_that_is_silent_between_sessions_is_told(make_session):
     session.assert_safe()
 
 
-def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session):
+def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monkeypatch):
     session = make_session()
-    most = session.profile.limits.stale_ticks_in_a_row
     tare = round(session.profile.session.tare_s * session.profile.rig.rate_hz)
     ends = []
 
@@ -152,11 +151,11 @@ def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session):
             bool(ends) and drive.reads == ends[0] + 5
         )
 
-    type(session.drive).angle_stale = property(stale)
+    monkeypatch.setattr(type(session.drive), "angle_stale", property(stale))
     session.obey(short(session), short(session))
     first, second = session.parent.said("finished")
     assert first["finished"] == "fault"
-    assert f"exceeds {most}" in first["reason"].replace(" of", "") or "stale" in first["reason"]
+    assert "angle" in first["reason"]
     assert (second["finished"], second["reason"]) == ("complete", "")
 
 
