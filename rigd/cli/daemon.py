@@ -1,6 +1,7 @@
 """``rigd status``, ``stop``, ``tare`` and ``zero``: what is asked of a running daemon."""
 
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,6 +64,12 @@ def status(
     if watch:
         if as_json:
             fail("--watch and --json do not go together; ask for one.", EXIT_WRONG_USE)
+        if not sys.stdout.isatty():
+            fail(
+                "--watch goes on in place on a terminal, and there is none; ask for the status "
+                "again and again, or watch the daemon's socket.",
+                EXIT_WRONG_USE,
+            )
         _watch(profile)
         return
     with daemon_of(profile) as client:

@@ -110,6 +110,12 @@ def test_without_a_daemon_every_command_says_how_to_start_one(ask, rigd):
         assert "rigd serve --profile" in err
 
 
+def test_watching_needs_a_terminal(ask):
+    code, out, err = ask("status", "--watch")
+    assert (code, out) == (2, "")
+    assert "terminal" in err
+
+
 def test_what_cannot_be_served_is_refused_at_once(ask, profile, tmp_path):
     (tmp_path / "file").touch()
     for options in (("--output", "file/out"), ("--group", "")):
