@@ -18,7 +18,8 @@ _STYLES = {
     "stopping": "yellow",
     "fault": "bold red",
 }
-_SHOWN_TRANSITIONS = 8
+_SHOWN_TRANSITIONS = 4
+_BUSY_PERCENT = 80.0
 
 
 def print_status(told: dict[str, Any]) -> None:
@@ -42,13 +43,17 @@ def status_table(told: dict[str, Any]) -> RenderableType:
     parts: list[RenderableType] = [head]
     rig = told["rig"]
     if rig is not None:
-        parts += [_processes(rig["processes"]), _topics(rig["topics"], told["state"])]
+        recording = told["state"] in ("running", "stopping")
+        beside = Table.grid(padding=(0, 3, 0, 0))
+        beside.add_row(_signals(rig), _processes(rig["processes"]))
+        beside.add_row(_health(rig), _topics(rig["topics"], recording=recording))
+        parts.append(beside)
     parts.append(_history(told["history"]))
     return Group(*parts)
 
 
 def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
-    daemon, series, progress, rig = (told[name] for name in ("daemon", "series", "progress", "rig"))
+    daemon, series, progress = (told[name] for name in ("daemon", "series", "progress"))
     yield "rig", Text(f"{daemon['profile']} ({daemon['moving']}), daemon {daemon['pid']}")
     doing = f" ({told['doing']})" if told["doing"] else ""
     state = Text(f"{told['state']}{doing}", style=_STYLES.get(told["state"], ""))
@@ -67,10 +72,6 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
         yield "series", Text(_series(series))
     if progress is not None:
         yield "session", Text(progress_text(progress))
-    if rig is not None:
-        yield "angle", Text(f"{rig['angle_rad']:+.5f} rad")
-        yield "coupling torque", Text(f"{rig['coupling_torque_nm']:+.4f} N·m")
-        yield "torque command", Text(f"{rig['torque_command_nm']:+.4f} N·m")
     yield "output", Text(daemon["output"])
 
 
@@ -95,11 +96,83 @@ def _series(series: dict[str, Any]) -> str:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0), title_justify="left")
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title_justify="left")
     table.add_column(title, no_wrap=True)
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     return table
+
+
+def _signals(rig: dict[str, Any]) -> Table:
+    """Tell what is measured now, and the largest magnitudes of the record."""
+    table = _table("signal", "now", "peak")
+    known = rig["signals"] or {}
+    for name, unit, digits, now, peak in (
+        ("angle", "rad", 5, rig["angle_rad"], None),
+        (
+            "tracking error",
+            "rad",
+            5,
+            known.get("tracking_error_rad"),
+            known.get("peak_tracking_error_rad"),
+        ),
+        (
+            "coupling torque",
+            "N·m",
+            4,
+            rig["coupling_torque_nm"],
+            known.get("peak_coupling_torque_nm"),
+        ),
+        (
+            "torque command",
+            "N·m",
+            4,
+            rig["torque_command_nm"],
+            known.get("peak_torque_command_nm"),
+        ),
+    ):
+        table.add_row(
+            name,
+            "" if now is None else f"{now:+.{digits}f} {unit}",
+            "" if peak is None else f"{peak:.{digits}f} {unit}",
+        )
+    return table
+
+
+def _health(rig: dict[str, Any]) -> Table:
+    """Tell how well loop, recorder, bus and view are doing, in colour what is not well."""
+    table = _table("health", "")
+    for name, text, style in _health_rows(rig):
+        table.add_row(name, Text(text, style=style))
+    return table
+
+
+def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    health, signals = rig["health"], rig["signals"]
+    if signals is not None:
+        # What is expected of the samples is the loop's rate.
+        expected_hz = max(topic["expected_hz"] or 0.0 for topic in rig["topics"])
+        slow = signals["rate_hz"] < 0.999 * expected_hz
+        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if slow else ""
+        late = f"{signals['lateness_p50_us']:.0f}, 99 %: {signals['lateness_p99_us']:.0f} µs"
+        yield "lateness, median", late, ""
+        yield "work of a tick, 99 %", f"{signals['work_p99_us']:.0f} µs", ""
+    lost = f"{health['missed']}, {health['late']}, {health['lost']}"
+    bad = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
+    yield "missed, late, lost", lost, bad
+    if health["bus_load_percent"] is not None:
+        load = health["bus_load_percent"]
+        yield "bus load", f"{load:.1f} %", "yellow" if load > _BUSY_PERCENT else ""
+    if health["bus_errors"] is not None:
+        errors = health["bus_errors"]
+        yield "bus errors", str(errors), "yellow" if errors else ""
+    if health["sensor_status"] is not None:
+        status = health["sensor_status"]
+        yield "sensor", f"status {status:#06x}" if status else "well", "red" if status else ""
+    if health["disk_free_mb"] is not None:
+        yield "free on the disk", f"{1e-3 * health['disk_free_mb']:.1f} GB", ""
+    if health["view_dropped"]:
+        yield "not shown live", f"{health['view_dropped']} samples", "yellow"
 
 
 def _processes(processes: list[dict[str, Any]]) -> Table:
@@ -117,10 +190,9 @@ def _processes(processes: list[dict[str, Any]]) -> Table:
     return table
 
 
-def _topics(topics: list[dict[str, Any]], state: str) -> Table:
+def _topics(topics: list[dict[str, Any]], *, recording: bool) -> Table:
     table = _table("topic", "records", "rate", "expected", "waiting")
     for topic in topics:
-        recording = state in ("running", "stopping")
         table.add_row(
             topic["name"],
             str(topic["written"]),

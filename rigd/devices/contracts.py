@@ -38,6 +38,28 @@ def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class LineHealth:
+    """What happened on a device's line since it was connected; None is what is not known.
+
+    Attributes
+    ----------
+    bits
+        Of all frames sent and received, without those that are stuffed in between.
+    bit_rate_bit_s
+        Of the line.
+    errors
+        Disturbed, damaged and missing messages.
+    status
+        Status word of the device; 0: all is well.
+    """
+
+    bits: int | None = None
+    bit_rate_bit_s: float | None = None
+    errors: int | None = None
+    status: int | None = None
+
+
 class Drive(Protocol):
     """A torque-controlled drive with a position encoder, at the output shaft of its gear."""
 
@@ -82,6 +104,9 @@ class Drive(Protocol):
             The torque as it was sent: what the drive's steps and limits make of it.
         """
 
+    def health(self) -> LineHealth:
+        """Tell how its line is doing; quick enough for the loop, now and then."""
+
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises."""
 
@@ -116,6 +141,9 @@ class WrenchSensor(Protocol):
 
     def read_wrench(self) -> Wrench:
         """Return the wrench that was asked for."""
+
+    def health(self) -> LineHealth:
+        """Tell how its line and the sensor are doing; quick enough for the loop, now and then."""
 
     def close(self) -> None:
         """Release the line."""

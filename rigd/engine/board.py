@@ -70,6 +70,12 @@ class Word(IntEnum):
     COUPLING_TORQUE_NNM = 10
     TORQUE_COMMAND_NNM = 11
     CONTROL_BEAT = 12
+    BUS_LOAD_PPM = 17
+    """Of the busiest line, as measured; -1: there is none, or it is not known. Likewise:"""
+    BUS_ERRORS = 18
+    """On all lines, since the devices were connected."""
+    SENSOR_STATUS = 19
+    """Status word; 0: all is well."""
     # Written by the recorder
     RECORDER_BEAT = 13
     DISK_FREE_MB = 14

@@ -16,10 +16,11 @@ from rigd.engine.board import Phase, Word
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.clocks import Clock, RealClock, VirtualClock
 from rigd.engine.cycle import Cycle
+from rigd.engine.display import Display
 from rigd.engine.events import Event, write_event
 from rigd.engine.jobs import ControlJob, SessionJob
 from rigd.engine.metronome import Metronome
-from rigd.engine.procedure import Procedure, SessionEnd, show
+from rigd.engine.procedure import Procedure, SessionEnd
 from rigd.engine.process import Message, Parent
 from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine.reference import map_reference
@@ -127,6 +128,7 @@ class _Attendance:
         self._zero_rad = 0.0
         self._silent = 0
         self._watch = make_watch(profile)
+        self._display = Display(channels.board, devices)
         self._cycle = self._make_cycle(profile)
 
     def serve(self) -> None:
@@ -152,7 +154,7 @@ class _Attendance:
         Virtual time stands still meanwhile.
         """
         while not self._stop.requested:
-            show(self._board, self._cycle)
+            self._show()
             try:
                 message = self._parent.poll(_STANDSTILL_POLL_S if self._clock.virtual else 0.0)
             except EOFError:
@@ -196,6 +198,7 @@ class _Attendance:
             self._clock,
             self._metronome,
             self._channels,
+            self._display,
             self._parent,
             self._stop,
         )
@@ -220,7 +223,7 @@ class _Attendance:
             devices.drive.disable()
             cycle.torque_off()
             board[Word.PHASE] = Phase.OFF
-            show(board, cycle)
+            self._show()
         doubt = devices.drive.off_doubt
         if doubt:
             outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
@@ -277,8 +280,11 @@ class _Attendance:
         self._zero_rad += moved_rad
         self._cycle.zero_rad = self._zero_rad
         self._cycle.angle_rad = 0.0
-        show(self._board, self._cycle)
+        self._show()
         return {"moved_rad": moved_rad}
+
+    def _show(self) -> None:
+        self._display.show(self._cycle, self._metronome.due_ns)
 
     def _rest(self, duration_s: float) -> Rest:
         rig = self._profile.rig
@@ -293,7 +299,7 @@ class _Attendance:
 
     def _check_reading(self) -> None:
         if self._metronome.tick % LOOK_EVERY == 0:
-            show(self._board, self._cycle)
+            self._show()
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")
         silent = self._cycle.check_stale()

@@ -6,15 +6,16 @@ through the same cycle and leaves its results in the metadata.
 
 import time
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import inf
 
 import numpy as np
 
 from rigd.devices.contracts import DeviceError
-from rigd.engine.board import Board, Phase, Stop, Word
+from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.channels import Channels
 from rigd.engine.clocks import SUSPENDED_S, Clock, SuspendWatch
 from rigd.engine.cycle import Cycle
+from rigd.engine.display import Display
 from rigd.engine.events import Event, Level, write_event
 from rigd.engine.metronome import Metronome
 from rigd.engine.process import Parent
@@ -32,18 +33,6 @@ _SUPERVISOR_PATIENCE_S = 2.0
 """Of time that this process has run itself: a computer that stands still is nobody's fault."""
 _SWINGING = 2.0
 """Spread of the torque after a session, over that before it, from which on the beam is swinging."""
-
-
-def show(board: Board, cycle: Cycle) -> None:
-    """Show on the board that the control process is at work, and what it reads."""
-    board.beat(Word.CONTROL_BEAT)
-    for word, value in (
-        (Word.ANGLE_NRAD, cycle.angle_rad),
-        (Word.COUPLING_TORQUE_NNM, cycle.coupling_torque_nm),
-        (Word.TORQUE_COMMAND_NNM, cycle.torque_command_nm),
-    ):
-        if isfinite(value):
-            board[word] = round(value * 1e9)
 
 
 class SessionEnd(Exception):
@@ -77,6 +66,8 @@ class Procedure:
         What a tick does, and when.
     channels
         Where samples, the controller's terms and events go.
+    display
+        Where the readings are shown.
     parent
         The supervisor.
     stop
@@ -91,9 +82,11 @@ class Procedure:
         clock: Clock,
         metronome: Metronome,
         channels: Channels,
+        display: Display,
         parent: Parent,
         stop: StopRequest,
     ) -> None:
+        self._display = display
         self._profile = profile
         self._cycle = cycle
         self._clock = clock
@@ -219,7 +212,7 @@ class Procedure:
                     "fault", f"The supervisor did not start the record within {_GO_PATIENCE_S:g} s."
                 )
             if self._clock.virtual:
-                show(self._board, self._cycle)
+                self._display.show(self._cycle, self._metronome.due_ns)
                 self._check_stop()
                 time.sleep(_GO_POLL_S)
             else:
@@ -384,7 +377,7 @@ class Procedure:
 
     def _look(self) -> SessionEnd | None:
         """Show that this process is at work and what it reads; see whether the others are."""
-        show(self._board, self._cycle)
+        self._display.show(self._cycle, self._metronome.due_ns)
         violation = self._cycle.look(
             self._metronome.due_ns,
             # Under the virtual clock the loop waits for the recorder.

@@ -5,6 +5,7 @@ import pwd
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from math import isfinite
 from typing import Any
 
 from rigd.engine.board import Phase
@@ -80,6 +81,17 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
         "angle_rad": look.angle_rad,
         "coupling_torque_nm": look.coupling_torque_nm,
         "torque_command_nm": look.torque_command_nm,
+        "signals": None if look.signals is None else _finite(asdict(look.signals)),
+        "health": {
+            "missed": look.missed,
+            "late": look.late,
+            "lost": look.lost,
+            "bus_load_percent": look.bus_load_percent,
+            "bus_errors": look.bus_errors,
+            "sensor_status": look.sensor_status,
+            "disk_free_mb": look.disk_free_mb,
+            "view_dropped": look.view_dropped,
+        },
         "processes": [
             asdict(process) | {"state": _state(process, look.phase)} for process in look.processes
         ],
@@ -94,6 +106,11 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
             for topic in look.topics
         ],
     }
+
+
+def _finite(values: Mapping[str, float]) -> Document:
+    """Return numbers as JSON can have them."""
+    return {name: value if isfinite(value) else None for name, value in values.items()}
 
 
 def _state(process: ProcessStatus, phase: Phase) -> str:

@@ -12,7 +12,7 @@ from operator import mul
 
 import numpy as np
 
-from rigd.devices.contracts import DeviceError, Devices, Wrench, wired_stop_dropped
+from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
 from rigd.sim.plant import SimulatedPlant
 
@@ -118,6 +118,10 @@ class SimulatedDrive:
         self._plant.command(torque_nm)
         return torque_nm
 
+    def health(self) -> LineHealth:
+        """Tell that there is no line."""
+        return LineHealth()
+
     def disable(self) -> None:
         """Zero the torque, and let no command through."""
         self._plant.disable()
@@ -212,6 +216,10 @@ class SimulatedSensor:
             sum(map(mul, self._weights, axis)) for axis in zip(*self.records, strict=True)
         )
         return fx, fy, fz, tx, ty, tz
+
+    def health(self) -> LineHealth:
+        """Tell that there is no line, and that all is well."""
+        return LineHealth(status=0)
 
     def sample(self) -> None:
         """Take a reading into the filter."""

@@ -9,6 +9,7 @@ from rigd.engine.board import Phase, Word
 from rigd.engine.processes import PROCESSES, SUPERVISOR, Pulse
 from rigd.engine.topics import TOPICS
 from rigd.supervisor.crew import Crew
+from rigd.supervisor.signal_watch import SignalStatus, SignalWatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,15 @@ class RigStatus:
     missed: int
     late: int
     lost: int
+    bus_load_percent: float | None
+    """Of the busiest line; None where there is none. Likewise:"""
+    bus_errors: int | None
+    sensor_status: int | None
+    disk_free_mb: int | None
+    view_dropped: int
+    """Samples that the live view did not get."""
+    signals: SignalStatus | None
+    """Of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
     topics: tuple[TopicStatus, ...]
 
@@ -67,6 +77,7 @@ class StatusWatch:
         self._rate_hz = rate_hz
         self._pulses = {process: Pulse() for process in PROCESSES}
         self._written: tuple[float, tuple[int, ...]] | None = None
+        self._signals = SignalWatch(rate_hz)
 
     def look(self, crew: Crew) -> RigStatus:
         """Return how it stands now."""
@@ -80,6 +91,12 @@ class StatusWatch:
             missed=board[Word.MISSED],
             late=board[Word.LATE],
             lost=board[Word.LOST],
+            bus_load_percent=None if (ppm := board[Word.BUS_LOAD_PPM]) < 0 else ppm * 1e-4,
+            bus_errors=_known(board[Word.BUS_ERRORS]),
+            sensor_status=_known(board[Word.SENSOR_STATUS]),
+            disk_free_mb=board[Word.DISK_FREE_MB] or None,
+            view_dropped=board[Word.LIVE_DROPPED],
+            signals=self._signals.look(crew.channels.samples),
             processes=tuple(self._processes(crew)),
             topics=tuple(self._topics(crew)),
         )
@@ -115,3 +132,7 @@ class StatusWatch:
             else:
                 state = "at work"
             yield ProcessStatus(process.name, child.pid, state, still_s)
+
+
+def _known(word: int) -> int | None:
+    return None if word < 0 else word

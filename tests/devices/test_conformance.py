@@ -63,3 +63,16 @@ def test_disabling_and_closing_work_in_every_state(devices):
     devices.drive.close()
     devices.drive.close()
     devices.sensor.close()
+
+
+def test_the_lines_tell_how_they_are(devices):
+    assert devices.drive.health().bits in (None, 0)
+    connect(devices)
+    before = devices.drive.health(), devices.sensor.health()
+    run(devices, 0, 100)
+    after = devices.drive.health(), devices.sensor.health()
+    for then, now in zip(before, after, strict=True):
+        assert (now.bits is None) is (then.bits is None)
+        assert now.bits is None or (now.bits > then.bits and now.bit_rate_bit_s > 0)
+        assert not now.errors
+    assert after[1].status == 0

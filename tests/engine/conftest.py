@@ -74,6 +74,9 @@ class WatchedDrive:
         self.torques.append(torque_nm)
         return self.inner.command(torque_nm)
 
+    def health(self):
+        return self.inner.health()
+
     def disable(self):
         self.inner.disable()
         self.enabled = False

@@ -87,6 +87,9 @@ class WatchedDrive:
         self.world.highest_nm = max(self.world.highest_nm, abs(self.torque_nm))
         return self.torque_nm
 
+    def health(self):
+        return self.inner.health()
+
     def disable(self):
         if not self.dead:
             self.switch_off()

@@ -8,6 +8,7 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.registry import Reality
 from rigd.engine.board import Word
 from rigd.engine.process import ChildError
+from rigd.service import messages
 from rigd.service.documents import Peer
 from rigd.service.service import CommandError
 from rigd.service.states import State
@@ -332,7 +333,7 @@ def test_the_end_of_the_daemon_stops_a_session_safely(operated):
     def close():
         closed.append(operated.loop.create_task(operated.service.close("it ends")))
 
-    operated.ask("start", **SHORT, repeat=3)
+    operated.ask("start", excitation="hold", parameters={"duration_s": 60.0}, repeat=3)
     operated.loop.run_until_complete(closed[0])
     (session,) = operated.last["sessions"]
     assert session["outcome"] == "stopped"
@@ -349,12 +350,19 @@ def test_status_tells_of_progress_processes_and_topics(operated):
         operated.service.look()
         seen.append(operated.service.status())
 
+    operated.service.look()  # from now on it sees the samples
     operated.world.countdown, operated.world.then = 1200, look
     operated.ask("start", **SHORT)
     (status,) = seen
     assert status["state"] == "running"
     assert status["progress"]["phase"] == "running"
     assert 0 < status["progress"]["tick"] < status["progress"]["total"] == 300
+    signals, health = status["rig"]["signals"], status["rig"]["health"]
+    assert signals["rate_hz"] == 1000.0
+    assert signals["peak_torque_command_nm"] >= abs(status["rig"]["torque_command_nm"])
+    assert (health["missed"], health["lost"], health["bus_load_percent"]) == (0, 0, None)
+    assert health["sensor_status"] == 0
+    messages.json.dumps(status, allow_nan=False)
     assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
         "control": "at work", "recorder": "at work", "supervisor": "at work",
     }  # fmt: skip

@@ -10,7 +10,7 @@ from rigd.devices.ati.netcanoem import REPLY_LENGTHS, identifier
 from rigd.devices.ati.polling import Answer, GaugePolls
 from rigd.devices.ati.status import CAN_BAD_CALIBRATION, CAN_BUS_ERROR, CAN_CRITICAL, can_status
 from rigd.devices.canbus import CanExchange, CanLink
-from rigd.devices.contracts import DeviceError, Wrench
+from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
@@ -71,6 +71,7 @@ class AtiCanSensor:
         self._calibration: Calibration | None = None
         self._firmware: tuple[int, int, int] = (0, 0, 0)
         self._status: list[str] = []
+        self._status_word = 0
         self._convert = wrench_function(((0.0,) * 6,) * 6)
         self._previous: Answer | None = None
         self._previous_ns = 0
@@ -178,6 +179,11 @@ class AtiCanSensor:
         self.wrench_time_ns = sent_ns
         return self._evaluate(answer)
 
+    def health(self) -> LineHealth:
+        """Tell what went wrong between this computer and the sensor, and its status word."""
+        errors = self.missing_replies + self.bus_errors
+        return LineHealth(errors=errors, status=self._status_word)
+
     def measure(self, duration_s: float) -> dict[str, float]:
         """Poll back to back for a while, between `connect` and the first tick.
 
@@ -236,6 +242,7 @@ class AtiCanSensor:
     def _evaluate(self, answer: Answer) -> Wrench:
         status, g0, g2, g4 = netcanoem.read_gauges(answer[0])
         g1, g3, g5 = netcanoem.read_gauges_rest(answer[1])
+        self._status_word = status
         if status:
             self._judge(status)
         limit = self._limit

@@ -16,7 +16,7 @@ from rigd.devices.ati.serial_line import SerialLine
 from rigd.devices.ati.serial_setup import SILENCE_S, SerialSetup
 from rigd.devices.ati.status import SERIAL_CRITICAL, serial_status
 from rigd.devices.ati.stream import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
-from rigd.devices.contracts import DeviceError, Wrench
+from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
 from rigd.devices.simulator import SimulatorAddress
 
@@ -28,6 +28,7 @@ _IDLE_NS = 20_000_000
 _STEADY_TICKS = 3
 """Ticks that bring their own records after which what is still missing counts as lost."""
 
+_BITS_PER_BYTE = RECORD_BITS // RECORD_SIZE
 _RECORD = np.dtype([("gauges", ">i2", 6), ("check", "u1")])
 
 
@@ -89,6 +90,7 @@ class AtiSerialSensor:
         self._unpackers: dict[int, Callable[[bytes], tuple[int, ...]]] = {}
         self.stream = RecordStream()
         self.status: list[str] = []
+        self._status_word = 0
         self._errors_in_a_row = 0
         self._arrived = 0
         self._arrived_ns = 0
@@ -210,6 +212,15 @@ class AtiSerialSensor:
         self._due = complete
         return False
 
+    def health(self) -> LineHealth:
+        """Tell how the line is doing, and the status word that was read before the stream."""
+        return LineHealth(
+            bits=self._arrived * _BITS_PER_BYTE,
+            bit_rate_bit_s=self._settings.baud,
+            errors=self.stream.checksum_errors,
+            status=self._status_word,
+        )
+
     def measure(self, duration_s: float) -> dict[str, float]:
         """Watch the stream for a while, between `connect` and the first tick.
 
@@ -324,7 +335,7 @@ class AtiSerialSensor:
             )
 
     def _check_status(self, setup: SerialSetup) -> None:
-        word = setup.read_status()
+        word = self._status_word = setup.read_status()
         self.status = serial_status(word)
         if word & SERIAL_CRITICAL:
             raise DeviceError(

@@ -3,7 +3,8 @@
 import time
 from collections.abc import Callable
 
-from rigd.devices.canbus.frame import BUS_OFF, ERROR_FLAG, ERROR_MASK, read_head
+from rigd.devices.canbus.frame import BUS_OFF, ERROR_FLAG, ERROR_MASK, LENGTH_AT, read_head
+from rigd.devices.canbus.load import FRAME_BITS
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.contracts import DeviceError
 
@@ -28,17 +29,23 @@ class CanExchange:
     ----------
     error_frames : int
         How often the controller reported a disturbance.
-    send
-        The port's, unchanged.
+    bits : int
+        Of all frames sent and received, nothing stuffed.
     """
 
     def __init__(self, port: CanPort) -> None:
         self.port = port
-        self.send = port.send
+        self.bits = 0
+        self._send = port.send
         self._receive = port.receive
         self._handlers: dict[int, Handler] = {}
         self.error_frames = 0
         self._bus_off = ""
+
+    def send(self, frame: bytes) -> None:
+        """Send a frame of the kernel's ``struct can_frame``; raises as the port does."""
+        self._send(frame)
+        self.bits += FRAME_BITS + 8 * frame[LENGTH_AT]
 
     def subscribe(self, can_id: int, handler: Handler) -> None:
         """Have a handler called with the data of each frame of this identifier.
@@ -74,6 +81,7 @@ class CanExchange:
             can_id, length = read_head(raw)
             handler = handlers.get(can_id)
             if handler is not None:
+                self.bits += FRAME_BITS + 8 * length
                 handler(raw[8 : 8 + length])
             elif can_id & ERROR_FLAG:
                 self._note_error(can_id & ERROR_MASK, raw[8:16])

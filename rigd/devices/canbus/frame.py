@@ -21,6 +21,8 @@ BUS_OFF = 0x40
 _FRAME = Struct("=IB3x8s")
 BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
 """What the kernel reports then."""
+LENGTH_AT = 4
+"""Where the number of data bytes stands in a raw frame."""
 read_head = Struct("=IB").unpack_from
 """Identifier with flags, and length, from raw frame."""
 

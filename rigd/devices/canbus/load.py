@@ -14,7 +14,7 @@ REQUEST_LENGTH = 0
 REPLY_LENGTHS = (8, 6)
 """Of an ATI sensor to one request: status and gauges 0, 2, 4; gauges 1, 3, 5."""
 
-_FRAME_BITS = 47
+FRAME_BITS = 47
 """Of a frame with an 11-bit identifier and no data: start, identifier, control, checksum,
 acknowledgement, end, and the pause of 3 bits before the next frame."""
 _STUFFED_BITS = 34
@@ -56,7 +56,7 @@ def frame_bits(length: int) -> int:
     length
         Bytes of data, 0 to 8.
     """
-    return _FRAME_BITS + 8 * length
+    return FRAME_BITS + 8 * length
 
 
 def worst_frame_bits(length: int) -> int:

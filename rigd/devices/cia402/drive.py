@@ -26,7 +26,7 @@ from rigd.devices.cia402.states import (
 )
 from rigd.devices.cia402.switching import step_up, switch_off
 from rigd.devices.cia402.values import torque_limit_per_mille
-from rigd.devices.contracts import DeviceError, wired_stop_dropped
+from rigd.devices.contracts import DeviceError, LineHealth, wired_stop_dropped
 from rigd.devices.parameters import RigParameters
 
 _HALF_TURN = 1 << 31
@@ -60,8 +60,10 @@ class Cia402Drive:
     def __init__(self, rig: RigParameters, link: CanLink) -> None:
         assert rig.cia402 is not None
         assert rig.acquisition is not None
+        assert rig.can is not None
         settings = rig.cia402
         self._rig = rig
+        self._bit_rate_bit_s = rig.can.bitrate_bit_s
         self._link = link
         self._name = f"Drive (CANopen node {settings.node_id})"
         self._frames = NodeFrames(settings.node_id, settings.host_node_id)
@@ -242,6 +244,13 @@ class Cia402Drive:
         self._following.command(sent)
         send(self._frames.rpdo(ENABLE_OPERATION, sent))
         return sent / self._per_mille_per_nm
+
+    def health(self) -> LineHealth:
+        """Tell how the bus is doing, as far as its frames are sent or received here."""
+        if self._node is None:
+            return LineHealth()
+        exchange = self._node.exchange
+        return LineHealth(exchange.bits, self._bit_rate_bit_s, exchange.error_frames)
 
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises.

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rigd.devices.canbus.load import bus_load
 from rigd.devices.registry import open_devices
 from rigd.devices.simulator import find_simulator
 from rigd.profile import load_profile
@@ -98,6 +99,43 @@ def over_the_wire(rig, ticks):
         drive.close()
         sensor.close()
     return readings
+
+
+def loads(rig, ticks):
+    """Part of the time that each line is busy, from what was sent and received on it."""
+    devices = open_devices(rig)
+    drive, sensor = devices.drive, devices.sensor
+    try:
+        drive.connect()
+        sensor.connect()
+        before = [line.health().bits or 0 for line in (drive, sensor)]
+        for tick in range(ticks):
+            drive.latch(tick * PERIOD_NS)
+            sensor.request(tick * PERIOD_NS)
+            drive.read_angle()
+            sensor.read_wrench()
+            drive.command(0.0)
+        after = [line.health() for line in (drive, sensor)]
+    finally:
+        drive.close()
+        sensor.close()
+    return [
+        None if now.bits is None else (now.bits - then) / now.bit_rate_bit_s / (ticks * 1e-3)
+        for then, now in zip(before, after, strict=True)
+    ]
+
+
+def test_the_load_that_is_measured_is_the_one_that_was_computed(simulated_profile):
+    rig = simulated_profile("antenna_can", {})
+    bus, none = loads(rig, 500)
+    assert none is None  # the sensor is on the same bus
+    assert bus == pytest.approx(bus_load(rig).plain, rel=0.02)
+
+
+def test_the_load_of_a_serial_line_is_what_it_streams(simulated_profile):
+    rig = simulated_profile("antenna_serial", {})
+    _, line = loads(rig, 500)
+    assert line == pytest.approx(rig.ati_serial.stream_hz * 143 / rig.ati_serial.baud, rel=0.02)
 
 
 def bare(rig, ticks):
