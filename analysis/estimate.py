@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.settings import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS
 from rigd.spectral import (
+    PAPER_OVERLAP_FRACTION,
+    PAPER_SEGMENTS,
     FrequencyResponse,
     SpectralError,
     fft_response,
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.record import Record
-    from analysis.settings import Segmentation, WelchSettings
+    from analysis.settings import WelchSettings
+    from rigd.spectral import Segmentation
 
 
 class EstimateError(ValueError):

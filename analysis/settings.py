@@ -5,26 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rigd.spectral import PAPER_NFFT, PAPER_OVERLAP, PAPER_SEGMENT_LENGTH
+from rigd.spectral import (
+    PAPER_NFFT,
+    PAPER_OVERLAP,
+    PAPER_OVERLAP_FRACTION,
+    PAPER_RATE_HZ,
+    PAPER_SEGMENT_LENGTH,
+    Segmentation,
+)
 
 if TYPE_CHECKING:
     from rigd.spectral import Estimator
 
-PAPER_RATE_HZ: Final = 1000.0
-PAPER_SEGMENTS: Final = 8
-PAPER_OVERLAP_FRACTION: Final = 0.15
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
 PAPER_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
 PAPER_WEIGHTINGS: Final = ("const", "omega")
-
-
-@dataclass(frozen=True, slots=True)
-class Segmentation:
-    """Lengths of Welch's segments, their overlap and their transform, all in samples."""
-
-    segment_length: int
-    overlap: int
-    nfft: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.record import Record
-    from analysis.settings import Segmentation, WelchSettings
+    from analysis.settings import WelchSettings
     from rigd.beam import Beam, Mode
-    from rigd.spectral import FrequencyResponse
+    from rigd.spectral import FrequencyResponse, Segmentation
 
 MODES: Final = 3
 

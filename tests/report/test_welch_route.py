@@ -5,9 +5,10 @@ import pytest
 
 from analysis.estimate import EstimateError, SettingsError
 from analysis.record import load_record
-from analysis.settings import Segmentation, WelchSettings
+from analysis.settings import WelchSettings
 from analysis.welch_route import analyse
 from rigd.beam import transfer
+from rigd.spectral import Segmentation
 
 
 def test_the_paper_s_settings_and_grid(paper_analysis):

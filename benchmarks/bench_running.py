@@ -1,0 +1,66 @@
+"""What the running frequency response and spectrogram cost while a sweep of 120 s comes in.
+
+Peers: Welch's estimate of all that has come, computed anew each time; scipy.signal.spectrogram.
+"""
+
+import time
+
+import numpy as np
+import scipy.signal
+from timing import least_s
+
+from rigd.excitation import chirp
+from rigd.spectral import RunningResponse, RunningSpectrogram, welch_response
+
+RATE_HZ = 1000.0
+LAST_HZ = 60.0
+BLOCK = 50
+"""Samples at a time: 20 blocks a second."""
+BETWEEN_ESTIMATES = 500
+REPEATS = 15
+
+
+def main() -> None:
+    """Print times and ratios."""
+    excitation = chirp(rate_hz=RATE_HZ)
+    reference = excitation.reference_rad[slice(*excitation.segments["sweep"])]
+    rng = np.random.default_rng(1)
+    angle = reference + 2e-5 * rng.normal(size=reference.size)
+    torque = np.gradient(np.gradient(angle)) + 1e-6 * rng.normal(size=reference.size)
+    ticks = np.arange(reference.size)
+
+    running = RunningResponse(RATE_HZ, ticks.size, last_hz=LAST_HZ)
+    spectrogram = RunningSpectrogram(RATE_HZ, last_hz=LAST_HZ)
+    fed, estimated, shown = [], [], []
+    for first in range(0, ticks.size, BLOCK):
+        part = slice(first, first + BLOCK)
+        start = time.perf_counter()
+        running.feed(ticks[part], reference[part], angle[part], torque[part])
+        fed.append(time.perf_counter() - start)
+        start = time.perf_counter()
+        spectrogram.feed(ticks[part], torque[part])
+        shown.append(time.perf_counter() - start)
+        if first % BETWEEN_ESTIMATES == 0:
+            start = time.perf_counter()
+            running.estimate()
+            estimated.append(time.perf_counter() - start)
+    sweep_s = ticks.size / RATE_HZ
+
+    estimate = np.median(estimated)
+    anew = least_s(lambda: welch_response(angle, torque, RATE_HZ), REPEATS)
+    options = {"fs": RATE_HZ, "nperseg": 1000, "noverlap": 750, "nfft": 4000, "detrend": False}
+    peer = least_s(lambda: scipy.signal.spectrogram(torque, **options), 3)
+    print(f"A sweep of {sweep_s:g} s in blocks of {BLOCK}, an estimate every {BETWEEN_ESTIMATES}")
+    print(f"  RunningResponse.feed       {1e6 * np.median(fed):7.1f} µs (median)")
+    print(f"    with a segment complete  {1e3 * max(fed):7.1f} ms (most)")
+    print(f"  RunningResponse.estimate   {1e3 * estimate:7.1f} ms (median)")
+    print(f"  welch_response anew        {1e3 * anew:7.1f} ms   ratio {anew / estimate:.1f}")
+    print(f"  RunningSpectrogram.feed    {1e6 * np.median(shown):7.1f} µs (median)")
+    print(f"  whole spectrogram          {1e3 * sum(shown):7.1f} ms")
+    print(f"  scipy's, not cut at 60 Hz  {1e3 * peer:7.1f} ms   ratio {peer / sum(shown):.1f}")
+    share = 100 * (sum(fed) + sum(estimated) + sum(shown)) / sweep_s
+    print(f"  all of it                  {share:7.2f} % of a core")
+
+
+if __name__ == "__main__":
+    main()
