@@ -1,6 +1,7 @@
 """Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
 
 from rigd.beam.coupled import CoupledModel, couple, propagator
+from rigd.beam.deflection import DeflectionFilter
 from rigd.beam.modes import (
     Mode,
     clamped_free_eigenvalues,
@@ -20,6 +21,7 @@ __all__ = [
     "Beam",
     "CoupledModel",
     "Damping",
+    "DeflectionFilter",
     "Mode",
     "Realisation",
     "RealisationError",

@@ -375,7 +375,7 @@ def wait_for(condition, timeout_s=60.0):
 def child_of(pid, module):
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            command = (folder / "cmdline").read_bytes().decode()
+            command = (folder / "cmdline").read_bytes().decode(errors="replace")
             parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
         except OSError:
             continue  # it has ended meanwhile
