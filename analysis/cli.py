@@ -112,6 +112,13 @@ def analyze(
         Path | None,
         typer.Option(metavar="FILE", help="New file for all results as JSON; - for stdout."),
     ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT.rrd",
+            help="New file with the session and its fits for Rerun's viewer; of one session file.",
+        ),
+    ] = None,
 ) -> None:
     """Identify the damping of a slewing beam from recorded sessions.
 
@@ -126,7 +133,9 @@ def analyze(
         to_stdout = json is not None and str(json) == "-"
         if json is not None and not to_stdout:
             check_new_file(json, "--json")
-        code = _run(files, settings, report, json)
+        if rerun is not None:
+            _check_rerun(rerun, files)
+        code = _run(files, settings, report, json, rerun)
     except OutputExistsError as error:
         _complain(str(error))
         code = 2
@@ -140,7 +149,11 @@ def analyze(
 
 
 def _run(
-    files: Sequence[Path], settings: WelchSettings, report: Path | None, json: Path | None
+    files: Sequence[Path],
+    settings: WelchSettings,
+    report: Path | None,
+    json: Path | None,
+    rerun: Path | None,
 ) -> int:
     """Analyse the files one after the other and return the exit code."""
     from rich.console import Console
@@ -150,7 +163,7 @@ def _run(
     from analysis.report.tables import analysis_tables, summary_table
 
     folders = report_folders(files, report)
-    analyses, errors, code = _analyse_all(files, folders, settings)
+    analyses, errors, code = _analyse_all(files, folders, settings, rerun)
     if not analyses:
         return code
     to_stdout = json is not None and str(json) == "-"
@@ -165,6 +178,8 @@ def _run(
     for file, folder in zip(files, folders, strict=True):
         if str(file) not in errors:
             _say(console, f"Report of {file}: {folder}")
+    if rerun is not None:
+        _say(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
     if json is not None:
         text = document_text(document(analyses, errors))
         if to_stdout:
@@ -176,7 +191,7 @@ def _run(
 
 
 def _analyse_all(
-    files: Sequence[Path], folders: Sequence[Path], settings: WelchSettings
+    files: Sequence[Path], folders: Sequence[Path], settings: WelchSettings, rerun: Path | None
 ) -> tuple[list[WelchAnalysis], dict[str, str], int]:
     """Analyse and report every file; return results, message by failed file, and exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -198,7 +213,8 @@ def _analyse_all(
         transient=True,
         disable=not terminal.is_terminal,
     ) as progress:
-        task = progress.add_task("", total=len(files) * _steps(settings))
+        steps = _steps(settings, rerun)
+        task = progress.add_task("", total=len(files) * steps)
         for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
 
             def on_step(done: str, name: str = file.name) -> None:
@@ -206,23 +222,28 @@ def _analyse_all(
                 progress.update(task, advance=weight, description=f"{name}: {done}")
 
             try:
-                analyses.append(_analyse_file(file, folder, settings, on_step))
+                analyses.append(_analyse_file(file, folder, settings, rerun, on_step))
             except (SessionError, RecordError, EstimateError, OutputError) as error:
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)
                 errors[str(file)] = str(error)
-                progress.update(task, completed=number * _steps(settings))
+                progress.update(task, completed=number * steps)
                 terminal.print(f"Error: {error}", markup=False, highlight=False, soft_wrap=True)
     return analyses, errors, code
 
 
-def _steps(settings: WelchSettings) -> int:
+def _steps(settings: WelchSettings, rerun: Path | None) -> int:
     from analysis.report.write import FIGURES
 
-    return 2 + len(settings.types) + _FIGURE_STEPS * len(FIGURES)
+    pictures = len(FIGURES) + (rerun is not None)
+    return 2 + len(settings.types) + _FIGURE_STEPS * pictures
 
 
 def _analyse_file(
-    file: Path, folder: Path, settings: WelchSettings, on_step: Callable[[str], None]
+    file: Path,
+    folder: Path,
+    settings: WelchSettings,
+    rerun: Path | None,
+    on_step: Callable[[str], None],
 ) -> WelchAnalysis:
     from analysis.record import load_record
     from analysis.report.folder import new_folder
@@ -234,7 +255,22 @@ def _analyse_file(
     analysis = analyse(record, settings, on_step)
     with new_folder(folder) as part:
         write_report(analysis, part, on_step)
+    if rerun is not None:
+        from analysis.report.rerun_file import write_rerun_file
+
+        write_rerun_file(analysis, rerun)
+        on_step("figure for Rerun")
     return analysis
+
+
+def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
+    from analysis.report.rerun_file import check_rerun_file
+
+    if len(files) > 1:
+        raise typer.BadParameter(
+            f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
+        )
+    check_rerun_file(rerun)
 
 
 def _settings(

@@ -111,6 +111,7 @@ def run_in_foreground(
             _tell_plan(tell, profile, excitation, plan)
             make_room(folder, excitation, profile.limits)
             rig = Rig(profile, fast=fast, crew=crew)
+            told_where = ""
             if not stop.requested:
                 rig.connect(moving)
             for number in range(1, repeat + 1):
@@ -122,8 +123,9 @@ def run_in_foreground(
                 if repeat > 1:
                     given["series"] = f"{number} of {repeat}"
                 order = Order(profile, excitation, path, tuple(given.items()))
-                if live:
-                    tell(rig.show(order))
+                if live and (where := rig.show(order)) != told_where:
+                    tell(where)
+                    told_where = where
                 with _ProgressView(excitation.reference_rad.size) as view:
                     results.append(rig.run(order, stop, view.update))
                 _tell_result(tell, results[-1])

@@ -13,7 +13,9 @@ from rigd.cli.daemon import status, stop, tare, zero
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
+from rigd.cli.live import live
 from rigd.cli.recover import recover
+from rigd.cli.replay import replay
 from rigd.cli.run import run_app, start_app
 from rigd.cli.serve import serve
 from rigd.cli.simulate import inject, simulate
@@ -31,12 +33,14 @@ app.command()(check)
 app.add_typer(run_app, name="run")
 app.command()(serve)
 app.add_typer(start_app, name="start")
+app.command()(live)
 app.command()(status)
 app.command()(stop)
 app.command()(tare)
 app.command()(zero)
 app.command()(reset)
 app.command()(info)
+app.command()(replay)
 app.command()(recover)
 app.add_typer(identify_app, name="identify")
 app.command()(bench)

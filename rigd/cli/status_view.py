@@ -72,6 +72,9 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
         yield "series", Text(_series(series))
     if progress is not None:
         yield "session", Text(progress_text(progress))
+    rig = told["rig"]
+    if rig is not None and rig["live_view"] is not None:
+        yield "live view", Text(rig["live_view"]["url"])
     yield "output", Text(daemon["output"])
 
 

@@ -71,7 +71,7 @@ class Word(IntEnum):
     TORQUE_COMMAND_NNM = 11
     CONTROL_BEAT = 12
     BUS_LOAD_PPM = 17
-    """Of the busiest line, as measured; -1: there is none, or it is not known. Likewise:"""
+    """Of the busiest line, as measured, or UNKNOWN. Likewise:"""
     BUS_ERRORS = 18
     """On all lines, since the devices were connected."""
     SENSOR_STATUS = 19
@@ -83,6 +83,10 @@ class Word(IntEnum):
     # Written by the live publisher
     LIVE_DROPPED = 15
     LIVE_BEAT = 16
+
+
+UNKNOWN = -1
+"""Of a line that there is not, or that does not tell."""
 
 
 class Board:
@@ -104,6 +108,10 @@ class Board:
 
     def __setitem__(self, word: Word, value: int) -> None:
         self._words[word] = value
+
+    def known(self, word: Word) -> int | None:
+        """Return a word, or None if it says that this is not known."""
+        return None if (value := self._words[word]) == UNKNOWN else value
 
     def word(self, word: Word) -> "memoryview[int]":
         """Return a view of one word, the quickest way to it: ``view[0]``."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from rigd.engine.board import Board, Stop, Word
 from rigd.engine.ring import Ring, RingSpec
-from rigd.engine.topics import TOPICS
+from rigd.engine.topics import BUFFERED_S, TOPICS
 
 DESCRIPTORS = len(TOPICS) + 2
 """Of shared memory, for :func:`create_channels`."""
@@ -59,11 +59,11 @@ class Channels:
         self.board.close()
 
 
-def create_channels(rate_hz: float, fds: Sequence[int]) -> Channels:
+def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:
     """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory."""
     *for_rings, for_board, for_reference = fds
     rings = [
-        Ring.create(topic.record_size, topic.capacity(rate_hz), fd)
+        Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
         for topic, fd in zip(TOPICS, for_rings, strict=True)
     ]
     return _together(rings, Board.create(for_board), for_reference)

@@ -3,10 +3,8 @@
 from math import isfinite
 
 from rigd.devices.contracts import Devices, LineHealth
-from rigd.engine.board import Board, Word
+from rigd.engine.board import UNKNOWN, Board, Word
 from rigd.engine.cycle import Cycle
-
-UNKNOWN = -1
 
 
 class Display:

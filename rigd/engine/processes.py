@@ -54,7 +54,7 @@ LIVE = Process(
     Word.LIVE_BEAT,
     hung_after_s=5.0,
     grace_s=2.0,
-    for_one_session=True,
+    for_one_session=False,
     loss="it is started again, the session goes on",
 )
 SUPERVISOR = Process(

@@ -109,16 +109,28 @@ class Ring:
 class Observer:
     """A reader that never holds the producer up: what was overwritten before it came is counted.
 
+    Parameters
+    ----------
+    ring
+        Of which it sees the records from now on.
+    first
+        Number of the first record to see, counted since the ring was made, if not from now on.
+
     Attributes
     ----------
     dropped
         Records that were overwritten before they were read.
     """
 
-    def __init__(self, ring: Ring) -> None:
+    def __init__(self, ring: Ring, first: int | None = None) -> None:
         self._ring = ring
-        self._cursor = ring.written
+        self._cursor = ring.written if first is None else first
         self.dropped = 0
+
+    @property
+    def next(self) -> int:
+        """Number of the next record, counted like `first`."""
+        return self._cursor
 
     def take(self, most: int) -> bytes:
         """Copy out up to ``most`` of the records not yet seen, oldest first."""

@@ -12,6 +12,8 @@ from rigd.session.format import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 BUFFERED_S = 16.0
 """What the rings hold, so that no stall of a disk loses a sample."""
+HURRIED_BUFFERED_S = 160.0
+"""The same under the virtual clock, where a session passes in a second and the live view lags."""
 _EVENTS = 256
 
 
@@ -32,18 +34,18 @@ class Topic:
     ages_only: bool = False
     """Not under the virtual clock, where no reading has an age."""
 
-    def capacity(self, rate_hz: float) -> int:
+    def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
         """Return how many records its ring holds."""
-        return ceil(rate_hz * BUFFERED_S / self.every) if self.every else _EVENTS
+        return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:
         """Return the records a second of a recorded session; None where there is no saying."""
         return rate_hz / self.every if self.every else None
 
 
-EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=False)
+EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
 CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
-TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=False, ages_only=True)
+TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True, ages_only=True)
 SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
 
 TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)

@@ -1,123 +1,187 @@
 """The way from the publisher to the viewers, which never blocks and heals by itself.
 
 With its server absent or frozen the SDK first buffers without telling, and then blocks for ever.
-Therefore every block is flushed with a time limit, and nothing more is handed to the SDK until
-everything before it has left: what waits in the SDK is never more than one block.
+Therefore whatever is sent is flushed with a time limit, and nothing more is handed to the SDK until
+everything before it has left: what waits in the SDK is never more than what was sent at once.
 """
 
 import contextlib
 import threading
-import time
-import uuid
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy.typing as npt
-
-from rigd.live.server import Ports, Server, ServerError
-from rigd.view import APPLICATION_ID, blueprint, send_samples
+from rigd.live.outlet import Outlet
+from rigd.view import APPLICATION_ID
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-_START_S = 8.0
-_RESTART_S = 1.0
-_FLUSH_S = 0.2
+    from rigd.view.picture import Drawing
+
+_PATIENCE_S: Final = 0.2
+_STALLED_PATIENCE_S: Final = 0.02
+"""Once it stalls, the session must not be kept waiting again and again."""
+_MOST_STALLED_LOOKS: Final = 200
+"""Then the server is killed; at 20 a second, as the publisher looks, after 10 s."""
 
 
 class Feed:
-    """A Rerun server and the stream of samples into it, each replaced when it fails.
+    """The recording of one session after the other, sent to the server there is.
 
     Parameters
     ----------
-    name
-        Of the recording.
+    outlet
+        Whose server passes it on.
 
-    Raises
-    ------
-    ServerError
-        If the server does not start.
+    Attributes
+    ----------
+    connections
+        How often a connection began, with the frame of what is shown.
+    stalled
+        The server does not take what was sent.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._recording_id = uuid.uuid4()
+    def __init__(self, outlet: Outlet) -> None:
+        self._outlet = outlet
+        self._recording_id = ""
+        self._frame: Callable[[], Iterable[Drawing]] = tuple
         self._stream: RecordingStream | None = None
-        self._stalled = False
-        self._started = time.monotonic()
-        self._server = Server(Ports())
-        import rerun  # noqa: F401 - half a second, spent while the server starts
+        self._server: int | None = None
+        self._laid_out: int | None = None
+        self._stalled_looks = 0
+        self._breaking: list[threading.Thread] = []
+        self.connections = 0
+        self.stalled = False
 
-        while (ports := self._server.ports) is None:
-            if not self._server.running:
-                raise ServerError(f"The Rerun server ended: {self._server.last_words}.")
-            if time.monotonic() - self._started > _START_S:
-                self._server.kill()
-                raise ServerError(f"The Rerun server does not answer: {self._server.last_words}.")
-            time.sleep(0.01)
-        self._ports = ports
-        self._connect()
+    def begin(self, recording_id: str, frame: "Callable[[], Iterable[Drawing]]") -> None:
+        """Send to a recording of its own from now on.
 
-    @property
-    def url(self) -> str:
-        """What to open in a browser."""
-        return self._ports.viewer_url
+        Parameters
+        ----------
+        recording_id
+            Viewers show the latest that comes with another one.
+        frame
+            Asked for what each new connection needs first.
+        """
+        self._recording_id, self._frame = recording_id, frame
 
-    def offer(self, samples: npt.NDArray[Any]) -> bool:
-        """Send samples (n,) unless they would have to wait; say whether they were sent."""
-        if not self._server.running:
-            self._restart()
-        if self._stream is None and self._server.ports is not None:
-            self._connect()
-        if self._stalled:
-            self._flush()
-        if self._stream is None or self._stalled:
+    def ready(self) -> bool:
+        """Connect if need be; say whether something can be sent without waiting."""
+        if not self._outlet.attend():
+            self._discard()
             return False
-        send_samples(self._stream, samples)
-        # If that stalls they wait in the SDK, and are sent when the server goes on.
-        self._flush()
+        assert self._outlet.address is not None
+        if self._server != self._outlet.address.server:
+            self._discard()
+        if self.stalled and not self._goes_on():
+            return False
+        if self._stream is not None and self._stream.get_recording_id() != self._recording_id:
+            self._close()
+        if self._stream is None and self._recording_id and self._outlet.answers():
+            self._connect()
+        return self._stream is not None and not self.stalled
+
+    def send(self, drawings: "Iterable[Drawing]") -> bool:
+        """Send drawings, when ready; say whether they are on their way.
+
+        If the server stalls they wait in the SDK, and are sent when it goes on.
+        """
+        if self._stream is None:
+            return False
+        for draw in drawings:
+            draw(self._stream)
+        self._flush(_PATIENCE_S)
         return self._stream is not None
 
-    def close(self) -> None:
-        """End the server; the stream is left to the end of the process.
+    def _goes_on(self) -> bool:
+        """Whether the server goes on after having stalled; one that never does is ended."""
+        self._flush(_STALLED_PATIENCE_S)
+        if self.stalled:
+            self._stalled_looks += 1
+            if self._stalled_looks > _MOST_STALLED_LOOKS:
+                self._outlet.kill_server()
+        # Where the connection broke instead, it is to be seen first what became of the server.
+        return self._stream is not None and not self.stalled
 
-        Closing a stream whose server does not answer takes seconds or for ever.
-        """
-        self._server.kill()
-
-    def _flush(self) -> None:
+    def _flush(self, patience_s: float) -> None:
         """Wait a moment for the SDK to have sent everything; notice if it stalls or is cut off."""
-        if self._stream is None:
-            return
+        assert self._stream is not None
         try:
-            self._stream.flush(timeout_sec=_FLUSH_S)
+            self._stream.flush(timeout_sec=patience_s)
         except RuntimeError as error:
             if "timed out" in str(error):
-                self._stalled = True
+                self.stalled = True
             else:
                 # The connection is broken, and a stream never connects a second time.
                 self._discard()
         else:
-            self._stalled = False
+            self.stalled = False
+            self._stalled_looks = 0
+
+    def _close(self) -> None:
+        """End a stream that has sent everything."""
+        assert self._stream is not None
+        # Forgetting a stream waits for all that are being let go, and others wait for it.
+        forget = not any(thread.is_alive() for thread in self._breaking)
+        _in_background(_let_go, [self._stream], forget)
+        self._stream = None
 
     def _discard(self) -> None:
-        # Up to 10 s in which it tries to reach its server once more; not for us to wait.
+        """Let go of a stream whose server is gone or another one."""
         if self._stream is not None:
-            threading.Thread(target=self._stream.disconnect, daemon=True).start()
+            # For up to 10 s it tries to reach its server once more; not for us to wait.
+            self._breaking = [thread for thread in self._breaking if thread.is_alive()]
+            self._breaking.append(_in_background(_let_go, [self._stream], False))
         self._stream = None
-        self._stalled = False
-
-    def _restart(self) -> None:
-        self._discard()
-        if time.monotonic() - self._started > _RESTART_S:
-            self._started = time.monotonic()
-            with contextlib.suppress(ServerError):  # to be tried again
-                self._server = Server(self._ports)
+        self.stalled = False
+        self._stalled_looks = 0
 
     def _connect(self) -> None:
         import rerun as rr
 
-        stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._recording_id)
-        stream.connect_grpc(self._ports.proxy_url)
-        stream.send_recording_name(self._name)
-        stream.send_blueprint(blueprint())
+        address = self._outlet.address
+        assert address is not None
+        self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._recording_id)
+        stream.connect_grpc(address.proxy_url)
+        self._server = address.server
+        self.connections += 1
+        laid_out = self._laid_out == self._server
+        target: Any = _LaidOut(stream) if laid_out else stream
+        for draw in self._frame():
+            draw(target)
+        self._flush(_PATIENCE_S)
+        if self._stream is not None:
+            self._laid_out = self._server
+
+
+class _LaidOut:
+    """A stream to viewers that have their layout already.
+
+    What the operator has moved since stays where it was moved. (Each blueprint that is sent also
+    costs the SDK 2 MB and two threads that it does not give back.)
+    """
+
+    def __init__(self, stream: "RecordingStream") -> None:
         self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the stream has
+        return getattr(self._stream, name)
+
+    def send_blueprint(self, *_: object, **__: object) -> None:
+        """Leave the layout as it is."""
+
+
+def _in_background(function: Callable[..., None], *arguments: object) -> threading.Thread:
+    thread = threading.Thread(target=function, args=arguments, daemon=True)
+    thread.start()
+    return thread
+
+
+def _let_go(streams: "list[RecordingStream]", forget: bool) -> None:
+    """End a stream to which nothing else refers; `forget`: have the SDK give back what it took."""
+    from rerun_bindings import flush_and_cleanup_orphaned_recordings
+
+    with contextlib.suppress(RuntimeError):
+        streams.pop().disconnect()
+        if forget:
+            flush_and_cleanup_orphaned_recordings()

@@ -1,30 +1,45 @@
-"""What the publisher is told at its start."""
+"""What the publisher is told: at its start, and of each session."""
 
 from dataclasses import dataclass
 
-from rigd.engine.ring import RingSpec
+from rigd.engine.channels import ChannelSpecs
+from rigd.view.subject import Subject
 
 
 @dataclass(frozen=True, slots=True)
 class LiveJob:
-    """What the publisher is to show.
+    """The rig whose sessions are shown.
 
     Attributes
     ----------
-    samples
-        The ring of samples, by an inherited descriptor.
-    board_fd
-        Inherited descriptor of the board, where the publisher counts what it dropped.
-    name
-        Of the session; Rerun shows it as the name of the recording.
-    rate_hz
-        Samples a second.
+    rig
+        The profile's name, by which the view is found.
+    channels
+        The shared memory of the rig's processes.
     linger_s
-        How long the view stays open after the end of the session.
+        How long the view stays open after the last session.
     """
 
-    samples: RingSpec
-    board_fd: int
-    name: str
-    rate_hz: float
+    rig: str
+    channels: ChannelSpecs
     linger_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSession:
+    """A session to show.
+
+    Attributes
+    ----------
+    subject
+        What its picture is of.
+    recording_id
+        By which viewers tell it from others; the same for a publisher that takes it over.
+    begins
+        How many records had been written to each ring before it, in the order of
+        :data:`rigd.engine.topics.TOPICS`.
+    """
+
+    subject: Subject
+    recording_id: str
+    begins: tuple[int, ...]

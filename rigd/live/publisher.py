@@ -1,27 +1,40 @@
-"""The publisher process: ring → Rerun.
+"""The publisher process: rings → picture → Rerun, for one session after the other.
 
-It only looks at the ring, so neither the loop nor the recorder can feel it; what it cannot show
-in time is dropped and counted. It ends when its standard input does, and takes the server along.
+It only looks at the rings, so neither the loop nor the recorder can feel it; what it cannot show in
+time is dropped and counted. What the picture computes does not depend on what could be shown. It
+ends when its standard input does, and takes the server along.
 """
 
 import os
 import signal
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Final
 
 from rigd.engine import signals
-from rigd.engine.board import Board, Word
-from rigd.engine.process import Parent
-from rigd.engine.ring import Observer, Ring
+from rigd.engine.board import Word
+from rigd.engine.channels import Channels, attach_channels
+from rigd.engine.process import Message, Parent
+from rigd.live.backlog import Backlog
 from rigd.live.feed import Feed
-from rigd.live.server import ServerError
-from rigd.session.format import SAMPLE_SIZE, decode_samples
+from rigd.live.intake import Intake
+from rigd.live.outlet import Outlet
+from rigd.live.program import RerunError
+from rigd.live.vitals import Vitals
 
 if TYPE_CHECKING:
-    from rigd.live.job import LiveJob
+    from rigd.live.job import LiveJob, LiveSession
 
-_PERIOD_S = 0.05
-_STUCK_S = 20
+_PERIOD_S: Final = 1 / 15
+"""What is sent costs more by the piece than by its size; the eye takes this for smooth."""
+_IDLE_PERIOD_S: Final = 1.0
+_HURRY_S: Final = 0.2
+_WAITING_S: Final = 10.0
+"""Of samples that wait for a server that stalls."""
+_STUCK_S: Final = 20
+_PARTING_S: Final = 0.3
+"""What was sent last is on its way to the viewers for so long."""
 
 
 def main() -> None:
@@ -34,69 +47,143 @@ def main() -> None:
     os.environ["RUST_LOG"] = "off"
     parent = Parent()
     job: LiveJob = parent.receive_job()
-    observer = Observer(Ring(job.samples))
-    board = Board(job.board_fd)
+    channels = attach_channels(job.channels)
     try:
-        feed = Feed(job.name)
-    except (ServerError, ImportError) as error:
+        outlet = Outlet(job.rig)
+        import rerun  # noqa: F401 - half a second, spent while the server starts
+
+        outlet.wait()
+    except (RerunError, ImportError) as error:
         parent.send(error=str(error))
         raise SystemExit(1) from None
-    parent.send(url=feed.url)
-    _publish(parent, _Publisher(observer, board, feed, round(job.rate_hz)))
-    _linger(parent, job.linger_s)
-    feed.close()
+    publisher = _Publisher(parent, channels, outlet)
+    publisher.serve()
+    publisher.linger(job.linger_s)
+    outlet.close()
     # Not through the interpreter's clean-up: the SDK's may wait for a server that does not answer.
     os._exit(0)
 
 
 class _Publisher:
-    def __init__(self, observer: Observer, board: Board, feed: Feed, most: int) -> None:
-        self._observer = observer
-        self._board = board
-        self._feed = feed
-        self._most = most
+    def __init__(self, parent: Parent, channels: Channels, outlet: Outlet) -> None:
+        self._parent = parent
+        self._channels = channels
+        self._outlet = outlet
+        self._feed = Feed(outlet)
+        self._shown: _Shown | None = None
+        self._told: int | None = None
+
+    def serve(self) -> None:
+        """Show what there is, until the supervisor is gone or has no more use for it."""
+        while self._parent.alive():
+            _arm_watchdog()
+            self._step()
+            try:
+                message = self._parent.poll(self._pause_s)
+            except EOFError:
+                break
+            if message is not None:
+                self._obey(message)
+        self._finish([ring.written for ring in self._channels.rings])
+
+    def linger(self, linger_s: float) -> None:
+        """Leave viewers the time to show the last of it, and to look at it."""
+        end = time.monotonic() + max(linger_s, _PARTING_S if self._feed.connections else 0.0)
+        while self._parent.alive() and time.monotonic() < end:
+            _arm_watchdog()
+            self._step()
+            time.sleep(_PERIOD_S)
+
+    @property
+    def _pause_s(self) -> float:
+        shown = self._shown
+        if shown is not None and not shown.over:
+            # Not in real time, more comes than can be left waiting.
+            return _PERIOD_S if shown.intake.took_s < _HURRY_S else 0.0
+        waits = self._feed.stalled or (shown is not None and bool(shown.backlog))
+        return _PERIOD_S if waits else _IDLE_PERIOD_S
+
+    def _obey(self, message: Message) -> None:
+        if "session" in message:
+            self._begin(message["session"])
+        elif "finish" in message:
+            self._finish(message["finish"])
+
+    def _begin(self, session: "LiveSession") -> None:
+        self._finish(session.begins)
+        self._shown = _Shown(session, self._channels)
+        self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
+        self._step()
+        self._parent.send(shown=session.recording_id)
+
+    def _finish(self, ends: Sequence[int]) -> None:
+        if self._shown is not None and not self._shown.over:
+            self._shown.finish(ends)
+            self._step()
+
+    def _step(self) -> None:
+        """Show what has come; count what cannot be shown."""
+        self._channels.board.beat(Word.LIVE_BEAT)
+        if self._shown is not None:
+            self._shown.gather()
+        before = self._feed.connections
+        if self._feed.ready() and self._shown is not None:
+            self._shown.send(self._feed, connected=self._feed.connections != before)
+        self._tell()
+
+    def _tell(self) -> None:
+        """Tell the supervisor where the view is, whenever that is another server."""
+        address = self._outlet.address
+        if address is not None and address.server != self._told:
+            self._told = address.server
+            self._parent.send(address=asdict(address))
+
+
+class _Shown:
+    """The session that is shown, or was last."""
+
+    def __init__(self, session: "LiveSession", channels: Channels) -> None:
+        self.intake = Intake(session, channels)
+        self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
+        self.over = False
+        self._board = channels.board
+        self._vitals = Vitals(channels)
         self._unsent = 0
 
-    def transfer(self) -> None:
-        """Show what the ring has, a second of it at most; count what cannot be shown."""
-        self._board.beat(Word.LIVE_BEAT)
-        block = self._observer.take(self._most)
-        try:
-            sent = not block or self._feed.offer(decode_samples(block))
-        except ValueError:
-            sent = False  # overwritten while it was copied
-        if not sent:
-            self._unsent += len(block) // SAMPLE_SIZE
-        self._board[Word.LIVE_DROPPED] = self._observer.dropped + self._unsent
+    @property
+    def dropped(self) -> int:
+        """Samples that could not be shown."""
+        return self.intake.dropped + self.backlog.dropped + self._unsent
 
+    def gather(self) -> None:
+        """Take what has come, while the session lasts."""
+        if self.over:
+            return
+        harvest = self.intake.take()
+        drawings = harvest.drawings
+        now_s = time.monotonic()
+        if self._vitals.due(now_s):
+            health = self._vitals.look(now_s, self.dropped)
+            drawings += self.intake.picture.health(self.intake.t_ns, health)
+        self.backlog.owe(harvest.notes)
+        self.backlog.put(drawings, harvest.samples)
+        self._board[Word.LIVE_DROPPED] = self.dropped
 
-def _publish(parent: Parent, publisher: _Publisher) -> None:
-    due = time.monotonic()
-    ended = False
-    while not ended:
-        _arm_watchdog()
-        due = max(due + _PERIOD_S, time.monotonic())
-        ended = _ended(parent, due)
-        publisher.transfer()
+    def finish(self, ends: Sequence[int]) -> None:
+        """Take the rest of it, and what can only be known at its end."""
+        self.intake.end(ends)
+        self.gather()
+        self.backlog.owe(self.intake.picture.finish())
+        self.over = True
 
-
-def _linger(parent: Parent, linger_s: float) -> None:
-    end = time.monotonic() + linger_s
-    while parent.alive() and time.monotonic() < end:
-        _arm_watchdog()
-        time.sleep(_PERIOD_S)
-
-
-def _ended(parent: Parent, due: float) -> bool:
-    """Wait until ``due``, on :func:`time.monotonic`, or until the session has ended."""
-    while parent.alive():
-        try:
-            parent.poll(max(0.0, due - time.monotonic()))
-        except EOFError:
-            return True
-        if time.monotonic() >= due:
-            return False
-    return True
+    def send(self, feed: Feed, *, connected: bool) -> None:
+        """Send what waits; `connected` anew, with the frame of the picture."""
+        if connected:
+            self.backlog.forgive()
+        if self.backlog:
+            drawings, samples = self.backlog.take()
+            if not feed.send(drawings):
+                self._unsent += samples
 
 
 def _arm_watchdog() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from rigd.engine.board import Phase
 from rigd.engine.processes import PROCESSES
+from rigd.live.address import LiveAddress
 from rigd.planning import Plan
 from rigd.service.states import Transition
 from rigd.supervisor.status import ProcessStatus, RigStatus
@@ -92,6 +93,7 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
             "disk_free_mb": look.disk_free_mb,
             "view_dropped": look.view_dropped,
         },
+        "live_view": _view_document(look.live_view),
         "processes": [
             asdict(process) | {"state": _state(process, look.phase)} for process in look.processes
         ],
@@ -111,6 +113,11 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
 def _finite(values: Mapping[str, float]) -> Document:
     """Return numbers as JSON can have them."""
     return {name: value if isfinite(value) else None for name, value in values.items()}
+
+
+def _view_document(view: LiveAddress | None) -> Document | None:
+    """Tell where the live view is."""
+    return None if view is None else {"url": view.page_url, **asdict(view)}
 
 
 def _state(process: ProcessStatus, phase: Phase) -> str:

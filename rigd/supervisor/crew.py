@@ -82,17 +82,11 @@ class Crew:
             If it cannot be started.
         """
         if process in self._used:
-            if process in self._children:
+            if process in self._children:  # the last one may not have been started
                 self._children.pop(process).stop(process.grace_s)
             self._start(process)
         self._used.add(process)
         return self._children[process]
-
-    def replace(self, process: Process) -> Child:
-        """Kill a process and start another in its place; raises as `fresh` does."""
-        if process in self._children:
-            self._children[process].kill()
-        return self.fresh(process)
 
     def has_job(self, process: Process) -> bool:
         """Whether a process has had its job."""
@@ -109,8 +103,8 @@ class Crew:
         assert self._channels is not None
         return self._channels
 
-    def lay_out(self, rate_hz: float) -> None:
-        """Size the shared memory for sessions at ``rate_hz``.
+    def lay_out(self, rate_hz: float, *, fast: bool = False) -> None:
+        """Size the shared memory for sessions at ``rate_hz``, `fast` under the virtual clock.
 
         Raises
         ------
@@ -118,8 +112,10 @@ class Crew:
             If there is not enough shared memory.
         """
         from rigd.engine.channels import create_channels
+        from rigd.engine.topics import BUFFERED_S, HURRIED_BUFFERED_S
 
-        self._channels = create_channels(rate_hz, self._fds)
+        buffered_s = HURRIED_BUFFERED_S if fast and self.live else BUFFERED_S
+        self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:
         self._children[process] = Child(process.name, process.module, self._fds)

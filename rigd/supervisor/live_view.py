@@ -1,103 +1,178 @@
-"""The live view of a session: started, watched, and started again if it is lost."""
+"""The live view of a rig: started with its processes, watched, started again if it is lost."""
 
 import time
+import uuid
 
 from rigd.engine.board import Word
-from rigd.engine.channels import Channels
 from rigd.engine.events import Event, Level
-from rigd.engine.process import ChildError
+from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import LIVE, Pulse
-from rigd.engine.topics import SAMPLE, TOPICS
-from rigd.live.job import LiveJob
+from rigd.live.address import LiveAddress
+from rigd.live.job import LiveJob, LiveSession
 from rigd.supervisor.crew import Crew
+from rigd.supervisor.orders import Order
+from rigd.view.subject import Subject
 
 _PATIENCE_S = 10.0
+"""It takes its time to start."""
+_BEGIN_PATIENCE_S = 1.0
 _MOST_RESTARTS = 3
 """In one session: what dies again and again is not worth the processor time."""
 
 
 class LiveView:
-    """The publisher process of one session, which the session never waits for.
+    """The publisher process of a rig, which no session ever waits for.
 
     Parameters
     ----------
     crew
-        With a publisher.
-    name
-        Of the session.
-    rate_hz
-        Samples a second.
+        With a publisher, its memory laid out.
+    rig
+        The profile's name.
+
+    Attributes
+    ----------
+    address
+        Where the view is, as far as is known.
     """
 
-    def __init__(self, crew: Crew, name: str, rate_hz: float) -> None:
+    def __init__(self, crew: Crew, rig: str) -> None:
+        self.address: LiveAddress | None = None
         self._crew = crew
-        self._job = _job(crew.channels, name, rate_hz)
-        self._pulse = Pulse()
+        self._job = LiveJob(rig, crew.channels.specs)
+        self._session: LiveSession | None = None
+        self._untold: list[Event] = []
         self._restarts = 0
+        self._lost = ""
         self._shown = False
-        self._lost = False
+        self._start()
 
-    def start(self) -> str:
-        """Start it and return the address of the view, or why there is none."""
-        try:
-            child = self._crew.fresh(LIVE)
-            child.start(self._job)
-            answer = child.poll(_PATIENCE_S) or {"error": "it does not answer."}
-        except ChildError as error:
-            answer = {"error": str(error)}
-        if "url" in answer:
-            self._shown = True
-            return f"Live view: {answer['url']}"
-        self._lost = True
-        return f"No live view: {answer['error']} The session goes on without it."
+    def show(self, order: Order) -> str:
+        """Show a session that is about to be run.
+
+        Returns
+        -------
+        str
+            The address of the view, or why there is none, for the operator.
+        """
+        self._restarts = 0
+        if self._lost:  # perhaps not any more
+            self._start()
+        deadline = time.monotonic() + _PATIENCE_S
+        while not (self._heard or self._lost) and time.monotonic() < deadline:
+            self._listen(0.1)
+        begins = tuple(ring.written for ring in self._crew.channels.rings)
+        self._session = LiveSession(subject_of(order), str(uuid.uuid4()), begins)
+        self._shown = False
+        self._send(session=self._session)
+        # So that it is there from the first sample on; a session does not depend on it.
+        deadline = time.monotonic() + _BEGIN_PATIENCE_S
+        while not (self._lost or self._shown) and time.monotonic() < deadline:
+            self._listen(0.1)
+        if self._lost:
+            return f"No live view: {self._lost} The session goes on without it."
+        if self.address is None:
+            return "The live view takes its time to start; rigd live shows it when it is there."
+        return f"Live view: {self.address.viewer_url}"
+
+    def look(self) -> None:
+        """See whether it is at work; if it died or hangs, start it again."""
+        if not self._lost:
+            self._listen(0.0)
+        if not self._lost:
+            self._feel_pulse()
 
     def attend(self) -> list[Event]:
-        """See whether it is at work; if it died or hangs, start it again and say so."""
-        if self._lost:
-            return []
-        board = self._crew.channels.board
-        try:
-            answer = self._crew[LIVE].poll(0.0)
-        except ChildError as error:
-            return self._restart(str(error))
-        assert LIVE.hung_after_s is not None
-        # It takes its time to start.
-        patience_s = LIVE.hung_after_s if self._shown else _PATIENCE_S
-        if self._pulse.look(board[Word.LIVE_BEAT], time.monotonic()) > patience_s:
-            return self._restart(
-                f"The live process has not moved for {patience_s:g} s and was killed."
-            )
-        if answer is None:
-            return []
-        if "url" in answer:
-            self._shown = True
-            return [_event("info", f"Live view: {answer['url']}")]
-        return self._restart(f"No live view: {answer.get('error', answer)}")
+        """Look, and return what the operator is to be told."""
+        self.look()
+        told, self._untold = self._untold, []
+        return told
 
-    def _restart(self, why: str) -> list[Event]:
+    def finish(self) -> None:
+        """Take note of the end of the session that is shown."""
+        if self._session is not None:
+            self._session = None
+            self._send(finish=[ring.written for ring in self._crew.channels.rings])
+
+    def _start(self) -> None:
+        """Set a new process to work."""
+        self._heard = False
+        self._lost = ""
+        self._pulse = Pulse()
+        try:
+            self._crew.fresh(LIVE)
+        except ChildError as error:
+            self._lost = str(error)
+            return
+        self._send(job=self._job)
+        if self._session is not None:
+            self._send(session=self._session)
+
+    def _send(self, **message: object) -> None:
+        if self._lost:
+            return
+        ((name, value),) = message.items()
+        try:
+            self._crew[LIVE].send_object(name, value)
+        except ChildError as error:
+            self._restart(str(error))
+
+    def _listen(self, patience_s: float) -> None:
+        try:
+            answer = self._crew[LIVE].poll(patience_s)
+        except ChildError as error:
+            self._restart(str(error))
+        else:
+            if answer is not None:
+                self._understand(answer)
+
+    def _understand(self, answer: Message) -> None:
+        if "shown" in answer:
+            self._shown = True
+            return
+        if "address" not in answer:
+            # It says why it cannot do its work, and ends.
+            self._lost = str(answer.get("error", answer))
+            if self._session is not None:
+                self._note("warning", f"No live view: {self._lost} The session goes on.")
+            return
+        before, self.address = self.address, LiveAddress(**answer["address"])
+        self._heard = True
+        if before is not None and before.viewer_url != self.address.viewer_url:
+            self._note("info", f"Live view: {self.address.viewer_url}")
+
+    def _feel_pulse(self) -> None:
+        assert LIVE.hung_after_s is not None
+        patience_s = LIVE.hung_after_s if self._heard else _PATIENCE_S
+        beat = self._crew.channels.board[Word.LIVE_BEAT]
+        if self._pulse.look(beat, time.monotonic()) > patience_s:
+            self._restart(f"The live process has not moved for {patience_s:g} s and was killed.")
+
+    def _restart(self, why: str) -> None:
         self._restarts += 1
         if self._restarts > _MOST_RESTARTS:
-            self._lost = True
-            return [_event("warning", f"{why} It is not started again; the session goes on.")]
-        self._pulse, self._shown = Pulse(), False
-        try:
-            child = self._crew.replace(LIVE)
-            child.start(self._job)
-        except ChildError as error:
-            self._lost = True
-            return [_event("warning", f"{error} The session goes on without a live view.")]
-        return [_event("warning", f"{why} It is started again; the session goes on.")]
+            self._lost = why
+            self._note("warning", f"{why} It is not started again; the session goes on.")
+            return
+        self._note("warning", f"{why} It is started again; the session goes on.")
+        self._crew[LIVE].kill()
+        self._start()
+
+    def _note(self, level: Level, message: str) -> None:
+        self._untold.append(Event(0, level, message))
 
 
-def _job(channels: Channels, name: str, rate_hz: float) -> LiveJob:
-    specs = channels.specs
-    return LiveJob(
-        samples=specs.rings[TOPICS.index(SAMPLE)],
-        board_fd=specs.board_fd,
-        name=name,
-        rate_hz=rate_hz,
+def subject_of(order: Order) -> Subject:
+    """Return what the picture of a session is of."""
+    rig = order.profile.rig
+    return Subject(
+        name=order.path.stem,
+        rate_hz=rig.rate_hz,
+        ticks=order.excitation.reference_rad.size,
+        sweep=order.excitation.segments["sweep"],
+        beam=rig.beam,
+        damping=rig.damping,
+        tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
+        angle_delay_s=rig.encoder.delay_s,
+        torque_delay_s=rig.sensor.delay_s,
     )
-
-
-def _event(level: Level, message: str) -> Event:
-    return Event(0, level, message)

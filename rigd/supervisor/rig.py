@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from rigd.devices.contracts import DeviceError
@@ -12,7 +13,7 @@ from rigd.devices.resetting import reset_drive
 from rigd.engine.board import Stop, Word
 from rigd.engine.jobs import ControlJob
 from rigd.engine.process import ChildError, Message
-from rigd.engine.processes import CONTROL, Pulse
+from rigd.engine.processes import CONTROL, LIVE, Pulse
 from rigd.engine.signals import StopRequest
 from rigd.profile import Profile
 from rigd.supervisor.crew import Crew
@@ -97,13 +98,15 @@ class Rig:
             crew = self._crew = self._crew or Crew(live=self._live)
             if reset_fault:
                 self._reset_fault(moving)
-            _lay_out(crew, self._profile.rig.rate_hz)
+            _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast)
             job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
             crew.fresh(CONTROL).start(job)
             self._told = self._ask(_CONNECT_PATIENCE_S)
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
+        if LIVE in crew:
+            self._view = LiveView(crew, self._profile.name)
         self.connected = True
         self.zero_lost |= self._zero_set
         self._zero_set = False
@@ -144,26 +147,25 @@ class Rig:
         board[Word.GO] = 0
         board[Word.LIVE_DROPPED] = 0
         crew.channels.clear()
-        view, self._view = self._view, None
-        session = Session(order, crew, self._told, view, watcher, listens)
+        session = Session(order, crew, self._told, self._view, watcher, listens)
         try:
             return session.run(stop)
         finally:
+            if self._view is not None:
+                self._view.finish()
             if session.device_failed:
                 self._await_end()
 
     def show(self, order: Order) -> str:
-        """Start the live view of a session that is about to be run.
+        """Show a session that is about to be run in the live view.
 
         Returns
         -------
         str
             Its address, or why there is none, for the operator.
         """
-        crew = self._require()
-        crew.channels.clear()
-        self._view = LiveView(crew, order.path.stem, order.profile.rig.rate_hz)
-        return self._view.start()
+        self._require()
+        return "No live view was asked for." if self._view is None else self._view.show(order)
 
     def tare(self) -> dict[str, Any]:
         """Average the sensor at rest.
@@ -206,6 +208,8 @@ class Rig:
             If it reported a fault, died or hangs; everything is closed then.
         """
         crew = self._require()
+        if self._view is not None:
+            self._view.look()
         try:
             message = crew.control.poll(0.0)
         except ChildError as error:
@@ -224,13 +228,17 @@ class Rig:
     def status(self) -> RigStatus | None:
         """Return a look at the board, from any thread; None while there is none."""
         with self._looking:
-            crew = self._crew
-            return None if crew is None or not crew.laid_out else self._statuses.look(crew)
+            crew, view = self._crew, self._view
+            if crew is None or not crew.laid_out:
+                return None
+            address = None if view is None else view.address
+            return replace(self._statuses.look(crew), live_view=address)
 
     def disconnect(self) -> None:
         """Disable the drive, close the devices, end the processes; harmless when repeated."""
         with self._looking:
             crew, self._crew = self._crew, None
+            self._view = None
             self.connected = False
         if crew is not None:
             crew.end()
@@ -289,9 +297,9 @@ class Rig:
         self.disconnect()
 
 
-def _lay_out(crew: Crew, rate_hz: float) -> None:
+def _lay_out(crew: Crew, rate_hz: float, *, fast: bool) -> None:
     try:
-        crew.lay_out(rate_hz)
+        crew.lay_out(rate_hz, fast=fast)
     except OSError as error:
         raise RigError(
             "There is not enough shared memory for the processes of a session "

@@ -50,7 +50,8 @@ class SignalWatch:
     def look(self, ring: Ring) -> SignalStatus | None:
         """Take what has come since the last look; None as long as nothing has."""
         if self._seen is None or self._seen[0] is not ring:
-            self._seen = ring, Observer(ring)
+            recent = max(0, ring.written - round(_WINDOW_S * self._rate_hz))
+            self._seen = ring, Observer(ring, recent)
         while block := self._seen[1].take(ring.capacity // 4):
             try:
                 samples = decode_samples(block)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from rigd.engine.board import Phase, Word
 from rigd.engine.processes import PROCESSES, SUPERVISOR, Pulse
 from rigd.engine.topics import TOPICS
+from rigd.live.address import LiveAddress
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.signal_watch import SignalStatus, SignalWatch
 
@@ -62,6 +63,8 @@ class RigStatus:
     """Of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
     topics: tuple[TopicStatus, ...]
+    live_view: LiveAddress | None = None
+    """Where the sessions are shown, if they are."""
 
 
 class StatusWatch:
@@ -82,6 +85,7 @@ class StatusWatch:
     def look(self, crew: Crew) -> RigStatus:
         """Return how it stands now."""
         board = crew.channels.board
+        load_ppm = board.known(Word.BUS_LOAD_PPM)
         return RigStatus(
             phase=Phase(board[Word.PHASE]),
             angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
@@ -91,9 +95,9 @@ class StatusWatch:
             missed=board[Word.MISSED],
             late=board[Word.LATE],
             lost=board[Word.LOST],
-            bus_load_percent=None if (ppm := board[Word.BUS_LOAD_PPM]) < 0 else ppm * 1e-4,
-            bus_errors=_known(board[Word.BUS_ERRORS]),
-            sensor_status=_known(board[Word.SENSOR_STATUS]),
+            bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
+            bus_errors=board.known(Word.BUS_ERRORS),
+            sensor_status=board.known(Word.SENSOR_STATUS),
             disk_free_mb=board[Word.DISK_FREE_MB] or None,
             view_dropped=board[Word.LIVE_DROPPED],
             signals=self._signals.look(crew.channels.samples),
@@ -132,7 +136,3 @@ class StatusWatch:
             else:
                 state = "at work"
             yield ProcessStatus(process.name, child.pid, state, still_s)
-
-
-def _known(word: int) -> int | None:
-    return None if word < 0 else word

@@ -1,19 +1,7 @@
-"""What Rerun shows: samples turned into named columns, and the one layout of the views.
+"""What Rerun shows of a session: its layout, and what becomes of samples, events and health in it.
 
 Rerun takes half a second to import, so it is imported by the functions that need it.
 """
 
-from rigd.view.layout import APPLICATION_ID, WINDOW_S, blueprint
-from rigd.view.samples import PLOTS, TIMELINE, Curve, Plot, columns, send_samples
-
-__all__ = [
-    "APPLICATION_ID",
-    "PLOTS",
-    "TIMELINE",
-    "WINDOW_S",
-    "Curve",
-    "Plot",
-    "blueprint",
-    "columns",
-    "send_samples",
-]
+APPLICATION_ID = "rigd"
+"""Rerun keeps one layout for each application."""

@@ -5,46 +5,139 @@ Rerun's plots have no axis titles: the unit stands in the title of the view and 
 
 from typing import TYPE_CHECKING
 
-from rigd.view.samples import (
-    ANGLE,
-    COUPLING_TORQUE,
-    LOOP_LATENESS,
-    TIMELINE,
-    TORQUE_COMMAND,
-    TRACKING_ERROR,
-    Plot,
-)
+from rigd.view import antenna, plots
+from rigd.view.log import EVENTS
+from rigd.view.plots import TIMELINE, Plot, Source
+from rigd.view.response_charts import COHERENCE, MAGNITUDE, OVERVIEW_MAGNITUDE, PHASE, SIZES
+from rigd.view.spectrogram_chart import SIZE as SPECTROGRAM_SIZE
+from rigd.view.spectrogram_chart import SPECTROGRAM
+from rigd.view.summary import SUMMARY
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-APPLICATION_ID = "rigd"
-"""Rerun keeps one layout for each application."""
-
 WINDOW_S = 10.0
 """Time shown up to the cursor; a viewer's load grows with it, not with the session."""
 
+CLOSE_UP_S = 2.0
+"""Time shown of the signals where they are all that is shown: one sees the oscillations."""
 
-def blueprint() -> "rrb.Blueprint":
-    """Return the layout, which follows the newest sample."""
+HISTORY_S = 60.0
+"""Time shown of what comes a few times a second only."""
+
+TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
+
+
+def blueprint(active_tab: str = TABS[0]) -> "rrb.Blueprint":
+    """Return the layout, which follows the newest sample, with one of its tabs in front."""
     import rerun.blueprint as rrb
 
+    contents = (
+        _overview(),
+        _signals(),
+        _frequency_response(),
+        _spectrogram(),
+        _health(),
+        _events(),
+    )
+    for tab, name in zip(contents, TABS, strict=True):
+        tab.name = name
     return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(_view(ANGLE), _view(COUPLING_TORQUE)),
-            rrb.Horizontal(_view(TRACKING_ERROR), _view(TORQUE_COMMAND)),
-            _view(LOOP_LATENESS),
-            row_shares=[3, 3, 2],
-        ),
+        rrb.Tabs(*contents, active_tab=TABS.index(active_tab)),
         rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
     )
 
 
-def _view(plot: Plot) -> "rrb.TimeSeriesView":
+def _overview() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Horizontal(
+        rrb.Vertical(
+            *(
+                _plot(plots.SIGNALS, plot, WINDOW_S)
+                for plot in (plots.ANGLE, plots.COUPLING_TORQUE, plots.TRACKING_ERROR)
+            )
+        ),
+        rrb.Vertical(
+            _chart(
+                "Frequency response, torque over angle",
+                OVERVIEW_MAGNITUDE,
+                SIZES[OVERVIEW_MAGNITUDE],
+            ),
+            rrb.Horizontal(
+                antenna.view(),
+                _log(),
+            ),
+        ),
+        column_shares=[6, 7],
+    )
+
+
+def _signals() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Grid(
+        *(
+            _plot(plots.SIGNALS, plot, CLOSE_UP_S)
+            for plot in (
+                plots.ANGLE,
+                plots.TRACKING_ERROR,
+                plots.COUPLING_TORQUE,
+                plots.TORQUE_COMMAND,
+                plots.FORCES,
+                plots.TORQUES,
+            )
+        ),
+        grid_columns=2,
+    )
+
+
+def _frequency_response() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(
+        _chart("Magnitude of torque over angle", MAGNITUDE, SIZES[MAGNITUDE]),
+        rrb.Horizontal(
+            _chart("Phase of torque over angle", PHASE, SIZES[PHASE]),
+            _chart("Coherence of angle and torque", COHERENCE, SIZES[COHERENCE]),
+        ),
+        row_shares=[4, 3],
+    )
+
+
+def _spectrogram() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(_chart("Spectrogram of the coupling torque", SPECTROGRAM, SPECTROGRAM_SIZE))
+
+
+def _health() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Horizontal(
+        rrb.Grid(
+            _plot(plots.SIGNALS, plots.LOOP, WINDOW_S),
+            _plot(plots.READINGS, plots.AGES, WINDOW_S),
+            *(_plot(plots.HEALTH, plot, HISTORY_S) for plot in plots.HEALTH.plots),
+            grid_columns=2,
+        ),
+        _summary(),
+        column_shares=[7, 2],
+    )
+
+
+def _events() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(_log())
+
+
+def _plot(source: Source, plot: Plot, window_s: float) -> "rrb.TimeSeriesView":
     import rerun as rr
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
     lines = rr.SeriesLines(
         names=[curve.label for curve in plot.curves],
@@ -53,14 +146,48 @@ def _view(plot: Plot) -> "rrb.TimeSeriesView":
         # The default averages what falls on one pixel, and so understates peaks.
         aggregation_policy="MinMax",
     )
+    values = VisualizerComponentMapping(
+        "Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=plot.component
+    )
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-window_s)
+    end = rrb.TimeRangeBoundary.cursor_relative()
     return rrb.TimeSeriesView(
         name=plot.title,
-        origin=plot.entity,
-        overrides={plot.entity: lines},
-        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=True),
-        time_ranges=rrb.VisibleTimeRange(
-            TIMELINE,
-            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S),
-            end=rrb.TimeRangeBoundary.cursor_relative(),
+        origin=source.entity,
+        overrides={source.entity: lines.visualizer(mappings=[values])},
+        # The title says it all where there is but one curve.
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot.curves) > 1),
+        # Left to itself it shows a minute round the cursor, half of it yet to come.
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+        axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
+        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
+    )
+
+
+def _chart(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
+    import rerun.blueprint as rrb
+
+    width, height = size
+    return rrb.Spatial2DView(
+        name=name,
+        origin=entity,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
+    )
+
+
+def _summary() -> "rrb.TextDocumentView":
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(name="State", origin=SUMMARY)
+
+
+def _log() -> "rrb.TextLogView":
+    import rerun.blueprint as rrb
+
+    return rrb.TextLogView(
+        name="Events",
+        origin=EVENTS,
+        columns=rrb.TextLogColumns(
+            timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]
         ),
     )

@@ -10,21 +10,28 @@ import sys
 import threading
 import time
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import pytest
 
+from rigd.beam import Beam, Damping
 from rigd.engine.board import Board, Word
+from rigd.engine.channels import DESCRIPTORS, Channels
+from rigd.engine.events import Event, write_event
 from rigd.engine.process import packed_object
 from rigd.engine.ring import Ring, shared_memory_fd
-from rigd.live.job import LiveJob
-from rigd.session.format import SAMPLE_SIZE, pack_sample_into
+from rigd.engine.topics import TOPICS
+from rigd.live.address import LiveAddress
+from rigd.live.job import LiveJob, LiveSession
+from rigd.session.format import pack_sample_into, pack_timing_into
+from rigd.view.subject import Subject
 
 RATE_HZ = 1000.0
+BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
 
 
 class Producer(threading.Thread):
-    """Writes plausible samples at 1 kHz, like the control loop, and never waits for anybody.
+    """Writes plausible records at 1 kHz, like the control loop, and never waits for anybody.
 
     `speed` makes more of them in the same time: kernels buffer seconds of samples for a server
     that does not read.
@@ -33,72 +40,134 @@ class Producer(threading.Thread):
     def __init__(self, capacity: int = 16_000, speed: float = 1.0) -> None:
         super().__init__(daemon=True)
         self.speed = speed
-        self.ring = Ring.create(SAMPLE_SIZE, capacity, shared_memory_fd())
+        self.fds = [shared_memory_fd() for _ in range(DESCRIPTORS)]
+        *for_rings, for_board, _ = self.fds
+        rings = [
+            Ring.create(topic.record_size, capacity if topic.every else 256, fd)
+            for topic, fd in zip(TOPICS, for_rings, strict=True)
+        ]
+        self.channels = Channels(*rings, Board.create(for_board))
+        self.channels.board[Word.GO] = 1
+        self.written = [0] * len(rings)
         self.tick = 0
         self.refused = 0
         self._halt = threading.Event()
 
+    @property
+    def dropped(self) -> int:
+        return self.channels.board[Word.LIVE_DROPPED]
+
     def run(self) -> None:
+        write_event(self.channels.events, Event(0, "info", "Record starts"))
         start = time.monotonic()
         while not self._halt.wait(0.005):
             while self.tick < (time.monotonic() - start) * self.speed * RATE_HZ:
                 self._write()
-                self.ring.take(1000)  # what the recorder does
+                for ring in self.channels.rings:  # what the recorder does
+                    ring.discard()
 
     def stop(self) -> None:
         self._halt.set()
         self.join()
 
+    def close(self) -> None:
+        self.stop()
+        self.channels.close()
+        for fd in self.fds:
+            os.close(fd)
+
     def _write(self) -> None:
-        t_s = self.tick / RATE_HZ
-        reference_rad = 0.025 * math.sin(2.0 * math.pi * (0.5 * t_s + 0.1 * t_s**2))
-        angle_rad = 0.025 * math.sin(2.0 * math.pi * (0.5 * (t_s - 0.02) + 0.1 * (t_s - 0.02) ** 2))
-        offset = self.ring.slot()
+        t_ns, t_s = self.tick * 1_000_000, self.tick / RATE_HZ
+        timings, samples = self.channels.timings, self.channels.samples
+        pack_timing_into(timings.buffer, timings.slot(), t_ns, self.tick, 0.5e-3, 1.5e-3)
+        timings.publish()
+        offset = samples.slot()
         if offset < 0:
             self.refused += 1
         else:
             pack_sample_into(
-                self.ring.buffer, offset,
-                self.tick * 1_000_000, self.tick, reference_rad, angle_rad,
+                samples.buffer, offset, t_ns, self.tick, reference_rad(t_s), measured_rad(t_s),
                 0.2 * math.cos(3.0 * t_s), 0.05 * math.sin(2.0 * math.pi * 7.0 * t_s),
                 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 40_000 + 1_000 * (self.tick % 60), 90_000,
             )  # fmt: skip
-            self.ring.publish()
+            samples.publish()
         self.tick += 1
+        self.channels.board[Word.SCHEDULED] = self.tick
+
+
+def reference_rad(t_s):
+    return 0.025 * np.sin(2.0 * math.pi * (0.5 * t_s + 0.1 * t_s**2))
+
+
+def measured_rad(t_s):
+    return reference_rad(t_s - 0.02)
 
 
 class Publisher:
-    """``python -m rigd.live.publisher``, as the supervisor starts it."""
+    """``python -m rigd.live.publisher``, as the supervisor starts it, showing one session.
 
-    def __init__(self, ring: Ring, linger_s: float = 0.0, **environment: str) -> None:
-        self.board = Board.create(shared_memory_fd())
+    `first` is what it is to do before anything else.
+    """
+
+    def __init__(
+        self, producer: Producer, linger_s: float = 0.0, first: str = "", **environment: str
+    ) -> None:
+        self.producer = producer
+        run = ["-m", "rigd.live.publisher"]
+        if first:
+            run = ["-c", f"{first}; from rigd.live.publisher import main; main()"]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "rigd.live.publisher", str(os.getpid())],
+            [sys.executable, *run, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            bufsize=0,  # so that what waits there is seen
             stderr=subprocess.PIPE,
-            pass_fds=(ring.spec.fd, self.board.fd),
+            pass_fds=producer.fds,
             env={**os.environ, **environment},
         )
-        job = LiveJob(ring.spec, self.board.fd, "chirp under test", RATE_HZ, linger_s)
-        write_job(self.process.stdin, job)
-        try:
-            self.answer = json.loads(self._first_line())
-        except BaseException:
-            self.close()
-            raise
+        self._job = LiveJob("rig under test", producer.channels.specs, linger_s)
+
+    def begin(self) -> None:
+        """Set it to work, and have it show a session with all that was ever written."""
+        self.send("job", self._job)
+        self.answer = self._hear("address")
+        if "address" in self.answer:
+            self.show()
+
+    def show(self, name: str = "chirp under test", begins: tuple[int, ...] | None = None) -> None:
+        """Have it show a session; `begins` says how many records were written before it."""
+        begins = begins or (0,) * len(TOPICS)
+        ticks = 120_000
+        subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3))
+        self.send("session", LiveSession(subject, f"recording of {name}", begins))
+        self._hear("shown")
+
+    def finish(self) -> None:
+        """Tell it that the session is over."""
+        self.send("finish", [ring.written for ring in self.producer.channels.rings])
+
+    def send(self, name: str, value: object) -> None:
+        send_object(self.process.stdin, name, value)
 
     @property
-    def proxy_url(self) -> str:
-        return parse_qs(urlsplit(self.answer["url"]).query)["url"][0]
+    def address(self) -> LiveAddress:
+        return LiveAddress(**self.answer["address"])
+
+    def next_address(self) -> LiveAddress:
+        """Wait for word of another server."""
+        return LiveAddress(**self._hear("address")["address"])
 
     @property
     def ports(self) -> set[int]:
-        return {urlsplit(self.answer["url"]).port, urlsplit(self.proxy_url).port}
+        return {self.address.grpc_port, self.address.page_port}
+
+    @property
+    def proxy_url(self) -> str:
+        return self.address.proxy_url
 
     @property
     def dropped(self) -> int:
-        return self.board[Word.LIVE_DROPPED]
+        return self.producer.dropped
 
     @property
     def server_pid(self) -> int:
@@ -121,17 +190,19 @@ class Publisher:
         self.process.wait()
         for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
             pipe.close()
-        self.board.close()
-        os.close(self.board.fd)
 
-    def _first_line(self) -> bytes:
-        ready, _, _ = select.select([self.process.stdout], [], [], 60.0)
-        assert ready, "the publisher does not answer"
-        return self.process.stdout.readline()
+    def _hear(self, what: str) -> dict:
+        """Return its next message that has this to say, or an error."""
+        while True:
+            ready, _, _ = select.select([self.process.stdout], [], [], 60.0)
+            assert ready, "the publisher does not answer"
+            message = json.loads(self.process.stdout.readline())
+            if what in message or "error" in message:
+                return message
 
 
-def write_job(pipe, job: LiveJob) -> None:
-    pipe.write(packed_object("job", job))
+def send_object(pipe, name: str, value: object) -> None:
+    pipe.write(packed_object(name, value))
     pipe.flush()
 
 
@@ -159,9 +230,129 @@ def rerun_program(rerun_runs):
     return program()
 
 
+class Columns:
+    """What Rerun received of a recording: by entity and component, times in ns and values."""
+
+    def __init__(self, chunks) -> None:
+        self._batches: dict[str, list] = {}
+        for chunk in chunks:
+            if "session_time" in chunk.timeline_names:
+                self._batches.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+
+    def __call__(self, entity: str, component: str) -> tuple[np.ndarray, np.ndarray]:
+        batches = [b for b in self._batches[entity] if component in b.schema.names]
+        time_ns = [batch.column("session_time").cast("int64").to_numpy() for batch in batches]
+        values = [np.array(batch.column(component).to_pylist()) for batch in batches]
+        return np.concatenate(time_ns), np.concatenate(values)
+
+
+class Saver:
+    """Rerun itself, saving what a server sends."""
+
+    def __init__(self, program: Path, proxy_url: str, path: Path) -> None:
+        self._path = path
+        self._process = subprocess.Popen(
+            [program, proxy_url, "--save", path, "--bind", "127.0.0.1", "--port", "0"],
+            env={**os.environ, "CI": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def has_begun(self) -> bool:
+        """Whether something that counts has come."""
+        return self._path.exists() and self._path.stat().st_size > 100_000
+
+    def has_all(self) -> bool:
+        """Whether nothing more comes: what is on its way when the server goes is lost."""
+        if not self.has_begun():
+            return False
+        sizes = []
+        for _ in range(8):  # looked at often, as a sleep may be one of the machine
+            sizes.append(self._path.stat().st_size)
+            time.sleep(0.1)
+        return len(set(sizes)) == 1
+
+    def recordings(self) -> list:
+        """Return (recording, columns) of each recording, once the server has gone away."""
+        from rerun.chunk import RrdReader
+
+        assert self._process.wait(60.0) == 0
+        reader = RrdReader(self._path)
+        return [
+            (recording, Columns(reader.stream(store=recording)))
+            for recording in reader.recordings()
+        ]
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
 @pytest.fixture
-def send_job():
-    return write_job
+def save(rerun_program, tmp_path):
+    savers = []
+
+    def start(proxy_url: str) -> Saver:
+        savers.append(Saver(rerun_program, proxy_url, tmp_path / f"{len(savers)}.rrd"))
+        return savers[-1]
+
+    yield start
+    for saver in savers:
+        saver.close()
+
+
+@pytest.fixture
+def receive(save, eventually):
+    """Have what a publisher shows from now on saved.
+
+    What that returns ends the session and the publisher, and gives (recording, columns) of each
+    recording.
+    """
+
+    def begin(publisher):
+        saver = save(publisher.proxy_url)
+
+        def end():
+            assert eventually(saver.has_begun)
+            publisher.producer.stop()
+            publisher.finish()
+            assert eventually(saver.has_all)
+            publisher.end()
+            return saver.recordings()
+
+        return end
+
+    return begin
+
+
+@pytest.fixture
+def sockets():
+    """The TCP sockets that a process has open: (local, remote, state) of each."""
+    return sockets_of
+
+
+def sockets_of(pid: int) -> list[tuple[str, str, str]]:
+    """Return (local, remote, state) of each TCP socket that a process has open."""
+    inodes = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = str(descriptor.readlink())
+        except FileNotFoundError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    found = []
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[9] in inodes:
+                found.append((words[1], words[2], words[3]))
+    return found
+
+
+@pytest.fixture
+def send():
+    return send_object
 
 
 @pytest.fixture
@@ -202,9 +393,7 @@ def start_producer():
 
     yield start
     for producer in producers:
-        producer.stop()
-        producer.ring.close()
-        os.close(producer.ring.spec.fd)
+        producer.close()
 
 
 @pytest.fixture
@@ -216,8 +405,9 @@ def producer(start_producer):
 def start_publisher(producer):
     publishers = []
 
-    def start(ring: Ring = producer.ring, **options) -> Publisher:
-        publishers.append(Publisher(ring, **options))
+    def start(producer: Producer = producer, **options) -> Publisher:
+        publishers.append(Publisher(producer, **options))
+        publishers[-1].begin()
         return publishers[-1]
 
     yield start

@@ -1,0 +1,153 @@
+"""What the live view costs: processor time of its processes, and how late the loop wakes up.
+
+    python benchmarks/bench_live.py [SECONDS] [ROUNDS]
+
+In each round, in turn, a chirp at 1 kHz with recorder is run without and with a live view, which
+has all its views. No viewer is connected: what it draws is its own affair. The ratio is the median
+over the rounds.
+"""
+
+import os
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigd.bench import loops
+from rigd.bench.measure import Measurement, figures, measurement
+from rigd.engine.board import Phase
+from rigd.engine.process import SINGLE_THREADED
+from rigd.engine.processes import LIVE
+from rigd.engine.signals import StopRequest
+from rigd.excitation.named import make_excitation
+from rigd.profile import load_profile
+from rigd.session import read_session
+from rigd.supervisor.orders import Order
+
+RATE_HZ = 1000.0
+MOST_CPU_PERCENT = 6.0
+MOST_RATIO = 1.2
+
+
+@dataclass
+class Meter:
+    """Processor time of a process, all its threads, over what was seen of a record."""
+
+    pid: int
+    first: tuple[float, float] | None = None
+    last: tuple[float, float] | None = None
+
+    def look(self) -> None:
+        """Take a reading."""
+        self.last = time.monotonic(), cpu_s(self.pid)
+        self.first = self.first or self.last
+
+    @property
+    def percent(self) -> float:
+        """Of one core."""
+        assert self.first is not None
+        assert self.last is not None
+        (begin_s, before_s), (end_s, after_s) = self.first, self.last
+        return 100.0 * (after_s - before_s) / (end_s - begin_s)
+
+
+def cpu_s(pid: int) -> float:
+    """Return what all threads of a process have computed, as the scheduler counts it."""
+    total_ns = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        total_ns += int((task / "schedstat").read_text().split()[0])
+    return total_ns * 1e-9
+
+
+def resident_mb(pid: int) -> float:
+    """Return the memory that a process has in use."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") * 1e-6
+
+
+def child_of(pid: int) -> int:
+    """Return the one process that a process has started."""
+    (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return int(child)
+
+
+def run(seconds: float, *, live: bool) -> tuple[Measurement, str, float]:
+    """Run one chirp.
+
+    Returns
+    -------
+    tuple
+        What the loop did; a text on the live view; processor time of the publisher, %.
+    """
+    profile = loops.rig_for(load_profile("sim"), RATE_HZ, 0.0)
+    options = {"amplitude_rad": 0.005, "start_hz": 0.5, "stop_hz": 50.0, "duration_s": seconds}
+    excitation = make_excitation("chirp", options | {"rest_s": 0.0, "ring_down_s": 0.0}, RATE_HZ)
+    text, percent = "", 0.0
+    with (
+        tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
+        loops.connected(profile, live=live) as (rig, crew),
+    ):
+        order = Order(profile, excitation, Path(folder) / "bench.mcap")
+        meters = []
+        if live:
+            rig.show(order)
+            pid = crew[LIVE].pid
+            meters = [Meter(pid), Meter(child_of(pid))]
+
+        def watch(progress: object, _: object) -> None:
+            if progress.phase == Phase.RUNNING:
+                for meter in meters:
+                    meter.look()
+
+        result = rig.run(order, StopRequest(), watch)
+        if live:
+            publisher, server = meters
+            percent = publisher.percent
+            text = (
+                f"publisher {percent:.1f} % of a core, {resident_mb(publisher.pid):.0f} MB; "
+                f"server {server.percent:.1f} %, {resident_mb(server.pid):.0f} MB; "
+                f"{result.live_dropped} samples not shown"
+            )
+        samples = read_session(result.path).samples
+    found = measurement(
+        "with" if live else "without",
+        RATE_HZ,
+        samples,
+        scheduled=excitation.reference_rad.size,
+        cpu_percent=None,
+        page_faults=None,
+    )
+    return found, text, percent
+
+
+def main() -> None:
+    """Print every round, then the medians."""
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
+    rounds = int(sys.argv[2]) if len(sys.argv) > 2 else 5
+    os.environ.update(SINGLE_THREADED)
+    ratios, costs = [], []
+    for _ in range(rounds):
+        p99 = {}
+        for live in (False, True):
+            found, text, percent = run(seconds, live=live)
+            late = figures(found.lateness_us)
+            p99[live] = late.p99
+            print(
+                f"{found.name:8s} late p50 {late.p50:5.0f} p99 {late.p99:6.0f} p99.9 "
+                f"{late.p999:6.0f} µs, missed {100 * (1 - found.held):.3f} %  {text}",
+                flush=True,
+            )
+            if live:
+                costs.append(percent)
+        ratios.append(p99[True] / p99[False])
+    print(f"publisher: {statistics.median(costs):.1f} % of a core (at most {MOST_CPU_PERCENT:g})")
+    print(
+        f"lateness p99, with over without: {statistics.median(ratios):.2f} "
+        f"(at most {MOST_RATIO:g}); of the rounds {', '.join(f'{ratio:.2f}' for ratio in ratios)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

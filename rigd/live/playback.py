@@ -1,0 +1,146 @@
+"""A file of Rerun's, played in its viewer: in a window, or served to browsers on this computer."""
+
+import time
+from pathlib import Path
+from typing import Final, Self
+
+from rigd.devices.simulator import runtime_folder
+from rigd.live.address import LiveAddress
+from rigd.live.outlet import GRPC_PORT, free_port
+from rigd.live.page import serve_page
+from rigd.live.program import RerunError, RerunProgram
+
+_MOST_MEMORY: Final = "4GiB"
+"""Then the oldest is forgotten: a session of some hours has room."""
+_START_S: Final = 30.0
+"""In which a server has to take connections."""
+_LOOK_S: Final = 0.05
+
+
+class Window:
+    """The viewer's window on a file.
+
+    What the user has set in Rerun's own viewer is neither used nor changed.
+
+    Parameters
+    ----------
+    path
+        Of the recording.
+    scratch
+        Folder in which Rerun may leave files: it does when it is ended.
+    options
+        More of the program's command line.
+
+    Raises
+    ------
+    RerunError
+        If Rerun's program cannot be run.
+    """
+
+    def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
+        self._program = RerunProgram(
+            (
+                str(path.absolute()),
+                *("--port", "0"),
+                *("--memory-limit", _MOST_MEMORY),
+                "--hide-welcome-screen",
+                *options,
+            ),
+            {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
+        )
+
+    @property
+    def program(self) -> RerunProgram:
+        """Rerun's program behind the window."""
+        return self._program
+
+    def wait(self) -> int:
+        """Wait until the window is closed; return the viewer's exit code."""
+        while (code := self._program.exit_code) is None:
+            time.sleep(_LOOK_S)
+        return code
+
+    def close(self) -> None:
+        """Close the window."""
+        self._program.kill()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class PageOfFile:
+    """The viewer's page on a file, on loopback.
+
+    Parameters
+    ----------
+    path
+        Of the recording.
+    scratch
+        Folder in which Rerun may leave files.
+
+    Attributes
+    ----------
+    address
+        Where it is.
+
+    Raises
+    ------
+    RerunError
+        If Rerun's program cannot be run, or takes no connections.
+    """
+
+    def __init__(self, path: Path, scratch: Path) -> None:
+        self._program = RerunProgram(
+            (
+                str(path.absolute()),
+                "--serve-web",
+                *("--port", str(free_port(GRPC_PORT))),
+                *("--web-viewer-port", "0"),
+                *("--server-memory-limit", _MOST_MEMORY),
+            ),
+            {"TMPDIR": str(scratch)},
+        )
+        try:
+            self._await_server()
+            self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
+        except BaseException:
+            self._program.kill()
+            raise
+        self.address = LiveAddress.of_this_process(
+            path.stem, self._program.grpc_port, self._page.port, time.time_ns()
+        )
+
+    @property
+    def program(self) -> RerunProgram:
+        """Rerun's program behind the page."""
+        return self._program
+
+    def wait(self) -> int:
+        """Wait until the server ends, which it does not by itself; return its exit code."""
+        while (code := self._program.exit_code) is None:
+            time.sleep(_LOOK_S)
+        return code
+
+    def close(self) -> None:
+        """Take the page away."""
+        self._page.close()
+        self._program.kill()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _await_server(self) -> None:
+        deadline = time.monotonic() + _START_S
+        program = self._program
+        while not (program.grpc_port and program.page_port):
+            if not program.running:
+                raise RerunError(f"The Rerun server ended: {program.last_words}.")
+            if time.monotonic() > deadline:
+                raise RerunError(f"The Rerun server does not answer: {program.last_words}.")
+            time.sleep(_LOOK_S)

@@ -1,0 +1,98 @@
+"""Rerun's native viewer, as a window on a live view."""
+
+import contextlib
+from typing import Final
+
+from rigd.devices.simulator import runtime_folder
+from rigd.live.address import LiveAddress, proxy_url
+from rigd.live.program import RerunProgram
+
+_MOST_MEMORY: Final = "2GiB"
+"""Then the oldest is forgotten; the same computer may be running the loop."""
+_HOSTS: Final = ("127.0.0.1", "localhost")
+
+
+class Viewer:
+    """The viewer's window.
+
+    What the user has set in Rerun's own viewer is neither used nor changed.
+
+    Parameters
+    ----------
+    address
+        Of the live view that is shown first.
+    options
+        More of the program's command line.
+
+    Raises
+    ------
+    RerunError
+        If Rerun's program cannot be run.
+    """
+
+    def __init__(self, address: LiveAddress, options: tuple[str, ...] = ()) -> None:
+        self._connections = 0
+        self._program = RerunProgram(
+            (
+                *("--connect", self._next_url(address)),
+                *("--port", "0"),
+                *("--memory-limit", _MOST_MEMORY),
+                "--hide-welcome-screen",
+                *options,
+            ),
+            {"XDG_DATA_HOME": str(runtime_folder() / "viewer")},
+        )
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._program.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """How it ended; None while the window is open."""
+        return self._program.exit_code
+
+    @property
+    def last_words(self) -> str:
+        """What it said last."""
+        return self._program.last_words
+
+    @property
+    def control_url(self) -> str:
+        """Where the viewer itself takes orders; empty: not yet."""
+        port = self._program.grpc_port
+        return proxy_url(_HOSTS[0], port) if port else ""
+
+    def connect(self, address: LiveAddress) -> bool:
+        """Show a live view whose server is another one than before; say whether that was done.
+
+        The viewer connects to an address once. To have it connect again, it is given another name
+        of the same place. Earlier sessions are forgotten: it would go to the first of them instead
+        of staying with the one that is shown.
+        """
+        from rerun.experimental import ViewerClient
+
+        if not self.control_url:
+            return False
+        self._connections += 1
+        url = self._next_url(address)
+        try:
+            client = ViewerClient.connect(self.control_url)
+            state = client.get_state()
+            earlier = [r.store_id for r in state.recordings if r.store_id != state.active_recording]
+            if earlier:
+                client.close(store_ids=earlier)
+            with contextlib.suppress(ConnectionError):  # nothing came from there
+                client.close(url)
+            client.open(url)
+        except (OSError, RuntimeError):  # it is busy, or about to end
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the window."""
+        self._program.kill()
+
+    def _next_url(self, address: LiveAddress) -> str:
+        return proxy_url(_HOSTS[self._connections % len(_HOSTS)], address.grpc_port)

@@ -1,0 +1,110 @@
+"""Files of Rerun: new ones are complete or not there, and nothing is overwritten."""
+
+import contextlib
+import os
+import re
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rigd.session.durable import rename_new
+from rigd.view import APPLICATION_ID
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+SUFFIX: Final = ".rrd"
+"""By which Rerun's viewer tells what a file is."""
+
+_MAGIC: Final = b"RRF"
+_TRIAL_BYTES: Final = 1 << 20
+_OS_ERROR: Final = re.compile(r"os error (\d+)")
+"""How the SDK tells the system's reason, within sentences that are not for the operator."""
+
+
+class RrdFileError(Exception):
+    """A file of Rerun's cannot be written, or is none."""
+
+
+@contextlib.contextmanager
+def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
+    """Give a recording that is written to a file, which has its name once all is in it.
+
+    Raises
+    ------
+    RrdFileError
+        If there is something of that name, or the file cannot be written.
+    """
+    # Read when Rerun is first imported: what it has to say of a full disk is told here.
+    os.environ["RUST_LOG"] = "off"
+    import rerun as rr
+
+    check_new(path)
+    part = path.with_name(f".{path.name}.part-{os.getpid()}")
+    stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
+    try:
+        with _told(path, part):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream.save(part)
+        yield stream
+        with _told(path, part):
+            stream.flush()
+            stream.disconnect()
+            rename_new(part, path)
+    finally:
+        stream.disconnect()
+        part.unlink(missing_ok=True)
+
+
+def check_new(path: Path) -> None:
+    """Raise RrdFileError if something has that name, or it is no name of such a file."""
+    if path.suffix != SUFFIX:
+        raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
+    if os.path.lexists(path):
+        raise RrdFileError(
+            f"{path} exists; choose another name or move it away, nothing is overwritten."
+        )
+
+
+def check_rrd_file(path: Path) -> None:
+    """Raise RrdFileError if a file is no recording of Rerun's, as far as its beginning tells."""
+    try:
+        with path.open("rb") as file:
+            found = file.read(len(_MAGIC))
+    except OSError as error:
+        raise RrdFileError(
+            f"{path} cannot be read: {error.strerror}. Check the path and its permissions."
+        ) from None
+    if found != _MAGIC:
+        raise RrdFileError(
+            f"{path} is no recording of Rerun's, though its name says so. Give a session file "
+            "(*.mcap), or what `rigd replay … --save` or `analyze … --rerun` wrote."
+        )
+
+
+@contextlib.contextmanager
+def _told(path: Path, part: Path) -> Iterator[None]:
+    """Tell what kept a file from being written."""
+    try:
+        yield
+    except FileExistsError:
+        raise RrdFileError(
+            f"{path} has appeared meanwhile; choose another name, nothing is overwritten."
+        ) from None
+    except OSError as error:
+        raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
+    except RuntimeError as error:  # from the SDK
+        number = _OS_ERROR.search(str(error))
+        cause = os.strerror(int(number[1])) if number else _why_not(part)
+        raise RrdFileError(f"{path} cannot be written: {cause}.") from None
+
+
+def _why_not(part: Path) -> str:
+    """Find out by trying why a file does not grow; the SDK may only say that it gave up."""
+    try:
+        with part.open("ab") as file:
+            file.write(bytes(_TRIAL_BYTES))
+    except OSError as error:
+        return error.strerror or str(error)
+    return "Rerun gave up"

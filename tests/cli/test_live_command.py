@@ -1,0 +1,198 @@
+"""``rigd live``: which view it finds, what it says where there is none, how it opens a window."""
+
+import json
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+
+from rigd.cli.live import _follow
+from rigd.live.address import LiveAddress, announce
+
+VIEWER = """#!/bin/sh
+echo "$@" > "$SEEN.arguments"
+env > "$SEEN.environment"
+echo "it is dark here" >&2
+exit $CODE
+"""
+
+
+@pytest.fixture(autouse=True)
+def nobody_else(runtime_folder, monkeypatch):
+    """No live view of somebody else's is found, and there is no screen."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@pytest.fixture
+def view(nobody_else):
+    """A live view of the rig sim, as far as can be told from outside."""
+    address = LiveAddress.of_this_process("sim", grpc_port=9876, page_port=9090, server=1)
+    announce(address)
+    return address
+
+
+@pytest.fixture
+def fake_viewer(tmp_path, monkeypatch):
+    """Have a script take the place of Rerun's program; returns what it saw."""
+    package = tmp_path / "packages" / "rerun_cli"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "rerun").write_text(VIEWER)
+    (package / "rerun").chmod(0o755)
+    monkeypatch.setenv("PYTHONPATH", str(package.parent))
+    monkeypatch.setenv("DISPLAY", ":no-such-screen")
+    monkeypatch.setenv("SEEN", str(tmp_path / "seen"))
+    monkeypatch.setenv("CODE", "0")
+    return lambda what: (tmp_path / f"seen.{what}").read_text()
+
+
+@pytest.fixture
+def eventually():
+    """Whether a condition comes true; the limit only ends a test that fails."""
+
+    def wait(condition, within_s: float = 60.0) -> bool:
+        deadline = time.monotonic() + within_s
+        while not (met := condition()) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        return met
+
+    return wait
+
+
+def test_without_a_view_it_says_how_to_get_one(rigd_here):
+    done = rigd_here("live")
+    assert done.returncode == 1
+    assert done.stdout == ""
+    for remedy in ("rigd run chirp --profile NAME --live", "rigd serve --profile NAME --live"):
+        assert remedy in done.stderr
+    done = rigd_here("live", "--profile", "antenna_can")
+    assert done.returncode == 1
+    assert "No live view of the rig antenna_can is running" in done.stderr
+    assert "rigd serve --profile antenna_can --live" in done.stderr
+
+
+def test_a_profile_that_there_is_not_is_wrong_use(rigd_here):
+    done = rigd_here("live", "--profile", "antena_can")
+    assert done.returncode == 2
+    assert "There is no profile 'antena_can'" in done.stderr
+
+
+def test_the_address_for_a_browser_is_all_that_standard_output_gets(rigd_here, view):
+    done = rigd_here("live", "--web")
+    assert (done.returncode, done.stdout) == (0, "http://127.0.0.1:9090\n")
+    assert "ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 " in done.stderr
+
+
+def test_without_a_screen_it_says_what_to_do_instead(rigd_here, view):
+    done = rigd_here("live")
+    assert done.returncode == 1
+    for word in ("DISPLAY", "rigd live --web", "ssh -L 9090:127.0.0.1:9090"):
+        assert word in done.stderr
+
+
+def test_of_several_views_one_has_to_be_named(rigd_here, view, write_profile):
+    announce(replace(view, rig="second", page_port=1234))
+    done = rigd_here("live", "--web")
+    assert done.returncode == 1
+    assert "(second, sim); name one with --profile" in done.stderr
+    assert rigd_here("live", "--web", "--profile", "second").stdout == "http://127.0.0.1:1234\n"
+    file = write_profile("sim", {"name": '"second"'})
+    assert rigd_here("live", "--web", "--profile", file).stdout == "http://127.0.0.1:1234\n"
+
+
+def test_it_waits_if_it_is_to(rigd_here, nobody_else):
+    address = LiveAddress.of_this_process("sim", grpc_port=9876, page_port=9090, server=1)
+    later = threading.Timer(0.2, announce, [address])
+    later.start()
+    done = rigd_here("live", "--web", "--wait")
+    later.join()
+    assert (done.returncode, done.stdout) == (0, "http://127.0.0.1:9090\n")
+    assert "Waiting for a live view to begin; Ctrl-C ends." in done.stderr
+
+
+def test_the_window_keeps_to_this_computer_and_leaves_the_users_settings_alone(
+    rigd, view, fake_viewer, runtime_folder
+):
+    done = rigd("live")
+    assert done.returncode == 0, done.stderr
+    arguments = fake_viewer("arguments")
+    assert "--bind 127.0.0.1" in arguments
+    assert f"--connect {view.proxy_url}" in arguments
+    environment = dict(
+        line.split("=", 1) for line in fake_viewer("environment").splitlines() if "=" in line
+    )
+    assert environment["CI"] == "1", "no usage data"
+    assert environment["HTTPS_PROXY"].startswith("http://127.0.0.1:"), "nothing is looked up"
+    assert environment["XDG_DATA_HOME"].startswith(str(runtime_folder))
+
+
+def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(rigd, view, fake_viewer, monkeypatch):
+    monkeypatch.setenv("CODE", "3")
+    done = rigd("live")
+    assert done.returncode == 1
+    assert "(it is dark here). rigd live --web shows the same in a browser." in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+class Window:
+    """Stands in for the viewer: open for some looks, then closed by the user."""
+
+    def __init__(self, looks: int) -> None:
+        self._looks = looks
+        self.connected = []
+
+    @property
+    def exit_code(self):
+        self._looks -= 1
+        return None if self._looks >= 0 else 0
+
+    def connect(self, view) -> bool:
+        self.connected.append(view.server)
+        return len(self.connected) != 2  # once it is too busy
+
+
+def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkeypatch, capsys):
+    second, third = replace(view, server=2), replace(view, server=3, grpc_port=1234)
+    there = iter([[view], [view], [second], [], [], [third], [third], [third]])
+    monkeypatch.setattr("rigd.service.live_views.find_views", lambda rig: next(there))
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    window = Window(looks=8)
+    assert _follow(window, view) == 0
+    assert window.connected == [2, 3, 3]
+    said = capsys.readouterr().err
+    assert said.count("has ended; the window stays, and shows the next one") == 1
+    assert said.count("The live view of sim has begun anew.") == 2
+
+
+def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read(
+    rigd, rigd_here, start_rigd, runtime_folder, eventually
+):
+    serve = start_rigd("serve", "--profile", "sim", "--live", "--fast")
+    file = runtime_folder / "rigd" / "live-sim.json"
+    assert eventually(file.exists)
+    ports = json.loads(file.read_text())
+    file.unlink()
+
+    def told():
+        status = rigd_here("status", "--json")
+        return status.returncode == 0 and (json.loads(status.stdout)["rig"] or {}).get("live_view")
+
+    assert eventually(told)
+    assert told()["url"] == f"http://127.0.0.1:{ports['page_port']}"
+    done = rigd_here("live", "--web")
+    assert done.stdout == f"http://127.0.0.1:{ports['page_port']}\n"
+    serve.terminate()
+    assert serve.wait(60.0) == 0
+    assert rigd_here("live", "--web").returncode == 1
+
+
+def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd, eventually):
+    serve = start_rigd("serve", "--profile", "sim", "--fast")
+    assert eventually(lambda: rigd_here("status").returncode == 0)
+    done = rigd_here("live")
+    assert "started without a live view" in done.stderr
+    assert "rigd serve --profile sim --live" in done.stderr
+    serve.terminate()
+    serve.wait(60.0)

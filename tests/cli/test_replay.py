@@ -1,0 +1,629 @@
+"""`rigd replay`: what is shown of a file is what was seen live, and what the file holds."""
+
+import contextlib
+import importlib.util
+import io
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from analysis.estimate import estimate
+from analysis.record import load_record
+from analysis.settings import WelchSettings
+from rigd.session import SessionWriter, Status, read_session
+from rigd.session.format import (
+    SAMPLE_SIZE,
+    TIMING_SIZE,
+    pack_sample_into,
+    pack_timing_into,
+)
+from rigd.view.palette import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
+from rigd.view.recorded import nominal_damping, subject_of_session
+from rigd.view.response_charts import MAGNITUDE, ResponseCharts
+
+pytestmark = pytest.mark.xdist_group("replay")
+
+NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
+RIGD = Path(sys.executable).parent / "rigd"
+QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")
+LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
+LISTENING = "0A"
+
+
+def run(*arguments, **options):
+    return subprocess.run(
+        [RIGD, *map(str, arguments)], capture_output=True, text=True, check=False, **options
+    )
+
+
+def refused(done, code, *words):
+    """Check a message of one or two sentences that says what is wrong, and nothing else."""
+    assert done.returncode == code, done.stdout + done.stderr
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("Error: ")
+    for word in words:
+        assert word in line, line
+
+
+def chunks(path: Path) -> dict[str, list]:
+    """Read a recording with Rerun's own reader: record batches by entity, in order of time."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list] = {}
+    for chunk in RrdReader(path).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def columns(batches: list, *names: str) -> dict[str, np.ndarray]:
+    """Return times in ns and the values of components, (n, k), of one entity's timely batches."""
+    timely = [batch for batch in batches if "session_time" in batch.schema.names]
+    parts: dict[str, list] = {name: [] for name in ("t_ns", *names)}
+    for batch in timely:
+        parts["t_ns"].append(batch.column("session_time").cast("int64").to_numpy())
+        for name in names:
+            values = batch.column(name).flatten().to_numpy(zero_copy_only=False)
+            parts[name].append(values.reshape(batch.num_rows, -1))
+    return {name: np.concatenate(blocks) for name, blocks in parts.items()}
+
+
+def rows(batches: list, name: str) -> list[tuple[int, list]]:
+    """Return times in ns and values of a component of which each row has another number."""
+    found = []
+    for batch in batches:
+        if {"session_time", name} <= set(batch.schema.names):
+            times = batch.column("session_time").cast("int64").to_pylist()
+            found += zip(times, batch.column(name).to_pylist(), strict=True)
+    return sorted(found, key=lambda row: row[0])
+
+
+@pytest.fixture(scope="module")
+def paper(tmp_path_factory):
+    """The paper's session, but of half its length, and what `--save` made of it."""
+    folder = tmp_path_factory.mktemp("paper")
+    half = ("--duration", "60", "--stop-hz", "25", "--ring-down", "1", "--fast")
+    done = run("run", "chirp", *half, "--json", "--output", "out", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (session,) = json.loads(done.stdout)["sessions"]
+    path = folder / session["path"]
+    done = run("replay", path, "--save", "paper.rrd", cwd=folder)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    assert done.stderr == "paper.rrd: open it with rigd replay paper.rrd.\n"
+    return read_session(path), chunks(folder / "paper.rrd"), folder / "paper.rrd"
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A session of 5 s."""
+    folder = tmp_path_factory.mktemp("short")
+    done = run("run", "chirp", *QUICK, "--json", "--output", ".", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (session,) = json.loads(done.stdout)["sessions"]
+    return folder / session["path"]
+
+
+@pytest.fixture(scope="module")
+def recording(short):
+    """What `--save` makes of the short session."""
+    path = short.with_suffix(".rrd")
+    assert run("replay", short, "--save", path).returncode == 0
+    return path
+
+
+def test_every_sample_is_shown_in_the_units_of_the_plots(paper):
+    session, found, _ = paper
+    samples = session.samples
+    shown = columns(
+        found["/signals"],
+        "angle_mrad", "tracking_error_mrad", "coupling_torque_nm", "torque_command_nm",
+        "forces_n", "torques_nm", "loop_us",
+    )  # fmt: skip
+    assert np.array_equal(shown["t_ns"], samples["t_ns"])
+    reference, angle = samples["angle_reference_rad"], samples["angle_rad"]
+    assert shown["angle_mrad"] == pytest.approx(1e3 * np.column_stack([reference, angle]))
+    assert shown["tracking_error_mrad"][:, 0] == pytest.approx(1e3 * (reference - angle), abs=1e-9)
+    for name in ("coupling_torque_nm", "torque_command_nm"):
+        assert np.array_equal(shown[name][:, 0], samples[name])
+    for name, fields in (
+        ("forces_n", ("fx_n", "fy_n", "fz_n")),
+        ("torques_nm", ("tx_nm", "ty_nm", "tz_nm")),
+    ):
+        assert np.array_equal(shown[name], np.column_stack([samples[f] for f in fields]))
+
+
+def test_the_frequency_response_grows_with_the_sweep(paper):
+    session, found, _ = paper
+    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE)
+    left, _, right, _ = chart.frame
+    first_hz, last_hz = chart.x.first, chart.x.last
+    drawn = rows(found[f"{MAGNITUDE}/measured"], "LineStrips2D:strips")
+    assert len({t_ns for t_ns, _ in drawn}) > 50  # once a second
+    for time_s, least_hz, most_hz in ((0.5, 0.0, 0.0), (21.0, 7.0, 10.0), (41.0, 15.0, 19.0)):
+        # What a viewer shows at that time is the last that was drawn before.
+        strips = [strips for t_ns, strips in drawn if t_ns <= 1e9 * time_s][-1]
+        if most_hz == 0.0:
+            assert not strips
+            continue
+        reached = max(x for strip in strips for x, _ in strip)
+        reached_hz = first_hz * (last_hz / first_hz) ** ((reached - left) / (right - left))
+        # The chirp's frequency at that time is 0.05 Hz + 0.4158 Hz a second of sweep.
+        assert least_hz < reached_hz < most_hz
+
+
+def test_the_last_frequency_response_is_that_of_analyze(paper):
+    session, found, _ = paper
+    chart = ResponseCharts(subject_of_session(session)).chart(MAGNITUDE)
+    left, top, right, bottom = chart.frame
+    *_, (_, strips) = rows(found[f"{MAGNITUDE}/measured"], "LineStrips2D:strips")
+    points = np.concatenate([np.asarray(strip, dtype=np.float64) for strip in strips])
+    share = (points[:, 0] - left) / (right - left)
+    frequency_hz = chart.x.first * (chart.x.last / chart.x.first) ** share
+    level = (bottom - points[:, 1]) / (bottom - top)
+    measured_db = chart.y.first + level * (chart.y.last - chart.y.first)
+    reference, _ = estimate(load_record(session.path), WelchSettings())
+    inside = (frequency_hz > 0.6) & (frequency_hz < 24.9) & (level > 1e-3) & (level < 1 - 1e-3)
+    assert inside.sum() > 250
+    nearest = np.abs(reference.frequency_hz[:, None] - frequency_hz[inside]).argmin(axis=0)
+    expected_db = 20 * np.log10(np.abs(reference.response[nearest]))
+    # Drawn in single precision: a hundredth of a point on the canvas is 0.005 dB.
+    assert np.abs(measured_db[inside] - expected_db).max() < 0.0864  # 1 %
+
+
+def test_the_antenna_moves_and_the_spectrogram_grows(paper):
+    _, found, _ = paper
+    beam = columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"] * 1e-9
+    assert beam[-1] == pytest.approx(62.0, abs=0.2)
+    assert np.diff(beam) == pytest.approx(0.05, abs=1e-6)
+    sizes = [len(row[0]) for _, row in rows(found["/spectrogram/levels"], "DepthImage:buffer")]
+    assert len(sizes) >= 60
+    assert sizes == sorted(sizes)
+    assert sizes[-1] > 50 * sizes[0]
+
+
+def test_the_log_has_the_events_and_the_outcome(paper):
+    session, found, _ = paper
+    texts = [text for _, (text,) in rows(found["/events"], "TextLog:text")]
+    assert [event.message for event in session.events] == texts[: len(session.events)]
+    assert texts[-1] == "Outcome: complete."
+
+
+def test_it_is_played_from_its_start_in_the_layout_of_the_live_view(paper):
+    from rerun.blueprint.components import PlayState
+    from rerun.chunk import RrdReader
+
+    session, found, path = paper
+    reader = RrdReader(path)
+    (layout,) = reader.blueprints()
+    parts: dict[str, list] = {}
+    for chunk in reader.stream(store=layout):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if "Blueprint:" in name:
+                parts.setdefault(name, []).extend(batch.column(name).to_pylist())
+    assert parts["TimePanelBlueprint:play_state"] == [[PlayState.Playing.value]]
+    assert parts["TimePanelBlueprint:timeline"] == [["session_time"]]
+    titles = {title for row in parts["ViewBlueprint:display_name"] for title in row or ()}
+    assert {"Motor angle (mrad)", "Frequency response, torque over angle", "State"} <= titles
+    (recording,) = reader.recordings()
+    assert recording.application_id == "rigd"
+    starts_ns = [
+        batch.column("RecordingInfo:start_time").flatten().cast("int64").to_pylist()
+        for batch in found["/__properties"]
+        if "RecordingInfo:start_time" in batch.schema.names
+    ]
+    assert starts_ns[-1][-1] == session.start_utc_ns
+
+
+LEAST = {
+    "rate_hz": "1000.0",
+    "beam_length_m": "0.98",
+    "beam_density_kg_per_m": "4.7e-3",
+    "beam_bending_stiffness_n_m2": "0.0903",
+}
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a session that is not the rig's, of a motor that sways."""
+
+    def session(
+        name, ticks, status=(), metadata=None, segments=None, outcome=None, profile=None
+    ) -> Path:
+        block = bytearray(len(ticks) * SAMPLE_SIZE)
+        status = [0] * len(ticks) if len(status) == 0 else status
+        for place, (tick, bits) in enumerate(zip(ticks, status, strict=True)):
+            angle_rad = 0.02 * np.sin(6.0 * tick / 1000)
+            pack_sample_into(
+                block, place * SAMPLE_SIZE, int(tick) * 1_000_000, int(tick), angle_rad, angle_rad,
+                0.0, -0.01 * angle_rad, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, int(bits), 0, 0,
+            )  # fmt: skip
+        writer = SessionWriter(tmp_path / name)
+        attachments = {} if profile is None else {"profile.toml": profile}
+        writer.begin(10**18, LEAST | (metadata or {}), segments or {}, attachments)
+        writer.write_samples(block)
+        ages = bytearray(len(ticks) * TIMING_SIZE)
+        for place, tick in enumerate(ticks):
+            age_s = 1e-6 * (place % 100)
+            pack_timing_into(ages, place * TIMING_SIZE, int(tick) * 1_000_000, tick, age_s, -age_s)
+        writer.write_timings(ages)
+        return writer.close(outcome or {})
+
+    return session
+
+
+@pytest.fixture
+def saved(rigd_here):
+    """Return what `--save` makes of a session."""
+
+    def save(path: Path) -> dict[str, list]:
+        out = path.with_suffix(".rrd")
+        done = rigd_here("replay", path, "--save", out)
+        assert done.returncode == 0, done.stderr
+        return chunks(out)
+
+    return save
+
+
+def test_missing_and_late_ticks_are_counted_as_the_file_tells_them(write, saved):
+    ticks = np.concatenate([np.arange(100, 1500), np.arange(1510, 2500), np.arange(2504, 4000)])
+    status = np.zeros(ticks.size, int)
+    status[[0, 1400]] = Status.AFTER_MISSED
+    status[1400 + 990] = Status.AFTER_LOST
+    status[500:520] = Status.LATE
+    found = saved(write("gaps.mcap", ticks, status))
+    shown = columns(found["/health"], "faulty_ticks")
+    by_second = dict(zip(shown["t_ns"] // 10**9, shown["faulty_ticks"].tolist(), strict=True))
+    assert by_second == {
+        0: [100.0, 20.0, 0.0],
+        1: [110.0, 20.0, 0.0],
+        2: [110.0, 20.0, 4.0],
+        3: [110.0, 20.0, 4.0],
+    }
+    assert len(columns(found["/signals"], "angle_mrad")["t_ns"]) == ticks.size
+
+
+def test_the_ages_of_the_readings_are_shown(write, saved):
+    ticks = np.arange(2500)
+    shown = columns(saved(write("ages.mcap", ticks))["/readings"], "ages_ms")
+    assert np.array_equal(shown["t_ns"], ticks * 1_000_000)
+    age_ms = 1e-3 * (ticks % 100)
+    assert shown["ages_ms"] == pytest.approx(np.column_stack([age_ms, -age_ms]))
+
+
+def test_a_file_with_the_least_there_may_be_is_shown_without_a_model(write, saved):
+    found = saved(write("least.mcap", np.arange(6000)))
+    assert f"{MAGNITUDE}/model" not in found
+    assert f"{MAGNITUDE}/measured" in found
+    assert len(columns(found["/antenna/beam"], "LineStrips3D:strips")["t_ns"]) == 120
+
+
+def test_a_session_that_was_stopped_ends_with_the_reason(write, saved):
+    path = write(
+        "stopped.mcap",
+        np.arange(700),
+        segments={"rest": (0, 500), "sweep": (500, 20_500)},
+        outcome={"outcome": "fault", "reason": "The drive does not answer."},
+    )
+    found = saved(path)
+    (event,) = rows(found["/events"], "TextLog:text")
+    assert event == (699_000_000, ["Outcome: fault. The drive does not answer."])
+    (level,) = rows(found["/events"], "TextLog:level")
+    assert level[1] == ["ERROR"]
+    # As it was live: of what was planned, this much had come.
+    *_, (_, (state,)) = rows(found["/summary"], "TextDocument:text")
+    assert "1 of 20 s" in state
+
+
+@pytest.mark.parametrize(
+    ("profile", "known"),
+    [
+        (b"[beam.damping]\n" + b"".join(
+            b"%s = { value = %s, source = 'paper' }\n" % pair for pair in
+            ((b"zeta", b"7.1e-5"), (b"alpha", b"0.996"), (b"gamma", b"5.5e-2"), (b"lambda", b"0.6"))
+        ), True),
+        (b"", False),
+        (b"[beam.damping]\nzeta = { value = 1e-5, source = 'paper' }\n", False),
+        (b"[beam.damping]\nzeta = 3\nalpha = 1\ngamma = 0\nlambda = 1\n", False),
+        (b"\xff\xfe", False),
+        (b"beam = 3", False),
+        (b"= no toml", False),
+        (b"[beam.damping]\n" + b"".join(
+            b"%s = { value = %s }\n" % pair for pair in
+            ((b"zeta", b"nan"), (b"alpha", b"1"), (b"gamma", b"0"), (b"lambda", b"1"))
+        ), False),
+        (b"[beam.damping]\n" + b"".join(
+            b"%s = { value = %s }\n" % pair for pair in
+            ((b"zeta", b"1e-5"), (b"alpha", b"1"), (b"gamma", b"inf"), (b"lambda", b"1"))
+        ), False),
+        (b"[beam.damping]\n" + b"".join(
+            b"%s = { value = %s }\n" % pair for pair in
+            ((b"zeta", b"1e-5"), (b"alpha", b"1"), (b"gamma", b"0"), (b"lambda", b"2"))
+        ), False),
+    ],
+)  # fmt: skip
+def test_the_nominal_damping_is_the_profile_s_if_it_states_one_that_can_be(profile, known):
+    damping = nominal_damping(profile)
+    assert (damping is not None) == known
+    if known:
+        assert (damping.zeta, damping.alpha) == (7.1e-5, 0.996)
+        assert (damping.gamma, damping.lambda_) == (5.5e-2, 0.6)
+
+
+def test_wrong_use_is_told(rigd_here, short, tmp_path):
+    taken = tmp_path / "taken.rrd"
+    taken.write_bytes(b"mine")
+    refused(
+        rigd_here("replay", short, "--save", taken), 2, "taken.rrd exists", "nothing is overwritten"
+    )
+    assert taken.read_bytes() == b"mine"
+    refused(rigd_here("replay", short, "--save", tmp_path / "a.txt"), 2, "--save", ".rrd")
+    refused(rigd_here("replay", short, "--save", tmp_path / "a.rrd", "--web"), 2, "--web")
+    refused(rigd_here("replay", taken, "--save", tmp_path / "a.rrd"), 2, "already")
+    assert not (tmp_path / "a.rrd").exists()
+
+
+def test_files_that_cannot_be_shown_are_told(rigd_here, short, write, tmp_path):
+    out = ("--save", tmp_path / "out.rrd")
+    refused(rigd_here("replay", tmp_path / "none.mcap", *out), 1, "none.mcap cannot be read")
+    torn = tmp_path / "torn.mcap.part"
+    torn.write_bytes(short.read_bytes()[:-3000])
+    refused(rigd_here("replay", torn, *out), 1, "torn.mcap.part is incomplete", "`rigd recover ")
+    refused(rigd_here("replay", write("empty.mcap", []), *out), 1, "no samples were recorded")
+    sparse = write("sparse.mcap", np.arange(100) * 1000)
+    refused(rigd_here("replay", sparse, *out), 1, "only 100 of the 99001 ticks")
+    still = write("still.mcap", np.arange(100), metadata={"beam_length_m": "0"})
+    refused(rigd_here("replay", still, *out), 1, "beam_length_m is 0 m")
+    false = tmp_path / "false.rrd"
+    false.write_text("no recording")
+    refused(rigd_here("replay", false, "--web"), 1, "no recording of Rerun's")
+    refused(rigd_here("replay", tmp_path / "none.rrd", "--web"), 1, "none.rrd cannot be read")
+    assert not (tmp_path / "out.rrd").exists()
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
+    def little_room():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+
+    done = run("replay", short, "--save", "out.rrd", cwd=tmp_path, preexec_fn=little_room)
+    refused(done, 1, "out.rrd cannot be written: File too large")
+    temporary = os.environ | {"TMPDIR": str(tmp_path)}
+    done = run("replay", short, "--web", cwd=tmp_path, preexec_fn=little_room, env=temporary)
+    refused(done, 1, ".rrd cannot be written: File too large")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_appears_when_it_takes_long(rigd_here, short, monkeypatch, tmp_path):
+    monkeypatch.setattr("rigd.cli.progress._QUIET_S", -1.0)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    done = rigd_here("replay", short, "--save", tmp_path / "out.rrd")
+    assert done.returncode == 0, done.stderr
+    assert short.name in done.stderr.partition("open it with")[0]
+
+
+def test_without_a_screen_it_says_what_else_there_is(rigd_here, short, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    refused(rigd_here("replay", short), 1, "no screen", "--web", "--save")
+
+
+def test_a_window_that_cannot_be_opened_is_told(rerun_program, short, tmp_path):
+    environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
+    environment |= {"DISPLAY": ":48123", "TMPDIR": str(tmp_path)}
+    done = run("replay", short, env=environment, timeout=60)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "--web shows the same in a browser" in done.stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def rerun_program():
+    package = importlib.util.find_spec("rerun_cli")
+    assert package is not None
+    path = Path(package.origin).with_name("rerun")
+    try:
+        subprocess.run([path, "--version"], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"LIVE VIEW NOT TESTED: the rerun program does not run here: {error}")
+    return path
+
+
+def eventually(condition, within_s: float = 60.0):
+    """Whether a condition comes true; the limit only ends a test that fails."""
+    deadline = time.monotonic() + within_s
+    while not (met := condition()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return met
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def listening(pid: int) -> set[str]:
+    """Return the addresses at which a process listens, as /proc/net/tcp writes them."""
+    inodes = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            target = str(descriptor.readlink())
+            if target.startswith("socket:["):
+                inodes.add(target[8:-1])
+    lines = [
+        line.split()
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]
+    ]
+    return {line[1] for line in lines if line[9] in inodes and line[3] == LISTENING}
+
+
+@pytest.fixture
+def served(rerun_program, short, tmp_path):
+    """`rigd replay --web` of the short session, from when it has told its address."""
+    process = subprocess.Popen(
+        [RIGD, "replay", short, "--web"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    address = process.stdout.readline().strip()
+    yield process, address
+    process.kill()
+    process.communicate()
+
+
+def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
+    process, address = served
+    assert address.startswith("http://127.0.0.1:"), process.stderr.read()
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with opener.open(address, timeout=30.0) as answer:
+        page = answer.read().decode()
+        assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+    assert "rerun" in page.lower()
+    (server,) = children(process.pid)
+    ends = listening(process.pid) | listening(server)
+    assert {end.split(":")[0] for end in ends} == {LOOPBACK}
+    (folder,) = tmp_path.iterdir()
+    assert [path.suffix for path in folder.iterdir()] == [".rrd"]
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode == 130
+    assert "is shown there until Ctrl-C. From another computer: ssh -L " in said
+    assert list(tmp_path.iterdir()) == []
+    assert eventually(lambda: not Path(f"/proc/{server}").exists())
+
+
+def test_a_server_that_dies_is_told(served, tmp_path):
+    process, _ = served
+    (server,) = children(process.pid)
+    os.kill(server, signal.SIGKILL)
+    _, said = process.communicate(timeout=60.0)
+    assert process.returncode == 1
+    assert said.splitlines()[-1].startswith("Error: The Rerun server ended: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+COLORS = {
+    "Motor angle (mrad)": [ORANGE, SKY_BLUE],
+    "Coupling torque, tared (N·m)": [GREEN],
+    "Tracking error, reference − measured (mrad)": [VERMILION],
+    "Frequency response, torque over angle": [SKY_BLUE, ORANGE, GREY],
+}
+"""Views of the first tab → what is to be seen in them."""
+
+
+def count(image: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Return the number of pixels within a few grey levels of a colour."""
+    distance = np.abs(image[..., :3] * 255.0 - np.array(color))
+    return int(np.count_nonzero(np.all(distance < 12.0, axis=-1)))
+
+
+def unseen(viewer, colors: dict) -> list:
+    """Return which colours are not seen in the views of the tab in front."""
+    missing = {(name, color) for name in colors for color in colors[name]}
+    for view in viewer.get_state().views:
+        assert view.reports == []
+        if view.name in colors:
+            try:
+                shot = viewer.take_screenshot(view.view_id)
+            except ConnectionError:
+                continue  # it is one of the same name on another tab
+            image = matplotlib.image.imread(io.BytesIO(shot), "png")
+            missing -= {(view.name, c) for c in colors[view.name] if count(image, c) >= 40}
+    return sorted(missing)
+
+
+@pytest.mark.parametrize("way", ["window", "browser"])
+def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
+    """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
+    from rerun.experimental import ViewerClient
+
+    from rigd.live.playback import PageOfFile, Window
+    from rigd.live.program import RerunProgram
+
+    headless = ("--headless", "--window-size", "1280x800")
+    if way == "window":
+        program, page = Window(recording, tmp_path, headless).program, None
+    else:
+        page = PageOfFile(recording, tmp_path)
+        program = RerunProgram(("--connect", page.address.proxy_url, "--port", "0", *headless))
+    try:
+        assert eventually(lambda: not program.running or program.grpc_port)
+        url = f"rerun+http://127.0.0.1:{program.grpc_port}/proxy"
+
+        def client():
+            try:
+                return ViewerClient.connect(url)
+            except (OSError, RuntimeError):
+                return None
+
+        found = eventually(lambda: not program.running or client())
+        if not program.running:
+            if re.search("graphics adapter|wgpu", program.last_words):
+                pytest.skip(NO_GRAPHICS)
+            pytest.fail(program.last_words)
+        with found as viewer:
+
+            def loaded() -> bool:
+                state = viewer.get_state()
+                ends = [line.end for r in state.recordings for line in r.timelines if line.end]
+                return bool(ends) and not state.loading and max(ends) >= 4_999_000_000
+
+            assert eventually(loaded)
+            viewer.set_time("session_time", duration=4.4, play_state="paused")
+            assert eventually(lambda: not unseen(viewer, COLORS), 20.0), unseen(viewer, COLORS)
+            if page is None:
+                ends = {end.split(":")[0] for end in listening(program.pid)}
+                assert ends == {LOOPBACK}
+    finally:
+        program.kill()
+        if page is not None:
+            page.close()
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="there is no Xvfb to open a window in")
+def test_a_window_is_closed_with_the_command(rerun_program, short, tmp_path):
+    screen = subprocess.Popen(
+        ["Xvfb", "-displayfd", "1", "-screen", "0", "800x600x24", "-nolisten", "tcp"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        display = screen.stdout.readline().strip()
+        environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
+        process = subprocess.Popen(
+            [RIGD, "replay", short],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment | {"DISPLAY": f":{display}", "TMPDIR": str(tmp_path)},
+        )
+        said = process.stderr.readline()
+        assert said == f"{short.name} is shown; close the window, or press Ctrl-C, to end.\n"
+        (viewer,) = children(process.pid)
+        assert eventually(lambda: process.poll() is not None or listening(viewer))
+        if process.poll() is not None:
+            pytest.skip(f"{NO_GRAPHICS}: {process.stderr.read()}")
+        assert {end.split(":")[0] for end in listening(viewer)} == {LOOPBACK}
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60.0)
+        assert process.returncode == 130
+        assert list(tmp_path.iterdir()) == []
+        assert eventually(lambda: not Path(f"/proc/{viewer}").exists())
+    finally:
+        screen.kill()
+        screen.communicate()

@@ -1,0 +1,294 @@
+"""The layouts for session files that are opened directly, and the page that says how."""
+
+import importlib.util
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from rigd.session.schema import EVENT_TOPIC, SAMPLE_TOPIC, message_class
+from rigd.view.palette import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
+
+pytestmark = pytest.mark.xdist_group("replay")
+
+DOCS = Path(__file__).parents[2] / "docs"
+LAYOUTS = DOCS / "layouts"
+PAGE = (DOCS / "opening_sessions.md").read_text("utf-8")
+EXAMPLE = "sessions/20261120-101500-chirp.mcap"
+BIN = Path(sys.executable).parent
+NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
+
+
+@pytest.fixture(scope="module")
+def make():
+    spec = importlib.util.spec_from_file_location("make_layouts", LAYOUTS / "make.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session under the name that the page uses, with the layouts where it finds them."""
+    folder = tmp_path_factory.mktemp("opening")
+    short = ("--duration", "8", "--ring-down", "1")
+    command = (BIN / "rigd", "run", "chirp", "--fast", *short, "--output", "made")
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    (made,) = (folder / "made").glob("*.mcap")
+    (folder / EXAMPLE).parent.mkdir()
+    made.rename(folder / EXAMPLE)
+    (folder / "docs").symlink_to(DOCS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fields(session):
+    """Fields of each topic, by the schemas in a file."""
+    from mcap.reader import make_reader
+
+    with (session / EXAMPLE).open("rb") as file:
+        summary = make_reader(file).get_summary()
+        found = {}
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            found[channel.topic] = {
+                field.name for field in message_class(schema.name, schema.data).DESCRIPTOR.fields
+            }
+    return found
+
+
+def contents(path: Path) -> dict:
+    """What a layout of Rerun's says, without the moments at which it was said."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(path)
+    (layout,) = reader.blueprints()
+    found: dict = {"application": layout.application_id}
+    for chunk in reader.stream(store=layout):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if ":" in name:
+                found[chunk.entity_path, name] = batch.column(name).to_pylist()
+    return found
+
+
+def test_the_files_are_what_the_script_makes(make, tmp_path):
+    make.write(tmp_path)
+    for name in (make.RERUN, make.FOXGLOVE):
+        assert (LAYOUTS / name).exists()
+    assert (tmp_path / make.FOXGLOVE).read_bytes() == (LAYOUTS / make.FOXGLOVE).read_bytes()
+    assert contents(tmp_path / make.RERUN) == contents(LAYOUTS / make.RERUN)
+
+
+def test_rerun_s_layout_is_of_fields_that_there_are(make, fields):
+    found = contents(LAYOUTS / make.RERUN)
+    text = repr(list(found.values()))
+    selectors = set(re.findall(r"'selector': '\.(\w+)'", text))
+    assert len(selectors) == 12
+    assert selectors <= fields[SAMPLE_TOPIC]
+    assert set(re.findall(r"'source_component': '([^']+)'", text)) == {"rigd.Sample:message"}
+    origins = {
+        row[0]
+        for key, rows in found.items()
+        if key[1] == "ViewBlueprint:space_origin"
+        for row in rows
+    }
+    assert origins == {SAMPLE_TOPIC, EVENT_TOPIC}
+
+
+def panels(layout) -> list[str]:
+    """Names in a tree of splits, as Foxglove has it."""
+    if isinstance(layout, str):
+        return [layout]
+    assert layout["direction"] in ("row", "column")
+    assert 0 < layout["splitPercentage"] < 100
+    return panels(layout["first"]) + panels(layout["second"])
+
+
+def test_foxglove_s_layout_is_of_paths_that_there_are(make, fields):
+    layout = json.loads((LAYOUTS / make.FOXGLOVE).read_text("utf-8"))
+    shown = panels(layout["layout"])
+    assert sorted(shown) == sorted(layout["configById"])
+    assert {name.partition("!")[0] for name in shown} == {"Plot", "RosOut"}
+    (script,) = layout["userNodes"].values()
+    source = script["sourceCode"]
+    (inputs,) = re.findall(r"^export const inputs = (.*);$", source, re.MULTILINE)
+    (output,) = re.findall(r'^export const output = "(.*)";$', source, re.MULTILINE)
+    (computed,) = re.findall(r"^type Output = \{ (\w+): number \};$", source, re.MULTILINE)
+    assert json.loads(inputs) == [SAMPLE_TOPIC]
+    assert set(re.findall(r"event\.message\.(\w+)", source)) <= fields[SAMPLE_TOPIC]
+    assert (
+        f"return {{ {computed}: event.message.angle_reference_rad - event.message.angle_rad }}"
+        in source
+    )
+    assert output not in fields
+    known = fields | {output: {computed}}
+    paths = [
+        path["value"]
+        for config in layout["configById"].values()
+        for path in config.get("paths", [])
+    ]
+    for path in paths:
+        topic, _, field = path.partition(".")
+        assert field in known[topic], path
+    wanted = (
+        "angle_reference_rad", "angle_rad", "coupling_torque_nm", "torque_command_nm",
+        "lateness_ns", "work_ns",
+    )  # fmt: skip
+    assert {f"{SAMPLE_TOPIC}.{field}" for field in wanted} < set(paths)
+    assert f"{output}.{computed}" in paths
+    (log,) = (c for name, c in layout["configById"].items() if name.startswith("RosOut!"))
+    assert log["topicToRender"] == EVENT_TOPIC
+    # The log panel needs what a foxglove.Log has.
+    assert {"timestamp", "level", "message", "name"} <= fields[EVENT_TOPIC]
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def look(session):
+    """Open files in Rerun's viewer, without a screen; return what it shows after a while."""
+    from rerun.experimental import ViewerClient
+
+    from rigd.live.program import RerunProgram
+
+    def shown(*files: str) -> tuple[dict[str, np.ndarray], list]:
+        program = RerunProgram(
+            (
+                *(str(session / file) for file in files),
+                *("--headless", "--window-size", "1280x800", "--port", "0"),
+            ),
+            {"XDG_DATA_HOME": str(session / "viewer"), "TMPDIR": str(session)},
+        )
+        try:
+            deadline = time.monotonic() + 60.0
+            while time.monotonic() < deadline:
+                if not program.running:
+                    if re.search("graphics adapter|wgpu", program.last_words):
+                        pytest.skip(NO_GRAPHICS)
+                    pytest.fail(program.last_words)
+                try:
+                    client = ViewerClient.connect(
+                        f"rerun+http://127.0.0.1:{program.grpc_port}/proxy"
+                    )
+                    state = client.get_state()
+                except (OSError, RuntimeError, ValueError):
+                    time.sleep(0.1)
+                    continue
+                if state.views and not state.loading:
+                    time.sleep(1.0)  # the plots need a frame or two
+                    state = client.get_state()
+                    return {
+                        view.name: matplotlib.image.imread(
+                            io.BytesIO(client.take_screenshot(view.view_id)), "png"
+                        )
+                        for view in state.views
+                    }, [report for view in state.views for report in view.reports]
+                time.sleep(0.1)
+            pytest.fail("the viewer shows nothing")
+        finally:
+            program.kill()
+
+    return shown
+
+
+def count(image: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Return the number of pixels within a few grey levels of a colour."""
+    distance = np.abs(image[..., :3] * 255.0 - np.array(color))
+    return int(np.count_nonzero(np.all(distance < 12.0, axis=-1)))
+
+
+COLORS = {
+    "Motor angle (rad)": [ORANGE, SKY_BLUE],
+    "Coupling torque (N·m)": [GREEN],
+    "Torque command (N·m)": [PURPLE],
+    "Forces at the sensor (N)": [ORANGE, SKY_BLUE, PURPLE],
+    "Torques at the sensor (N·m)": [SKY_BLUE, PURPLE],
+    # Of a session that was not in real time both are 0, and the topmost is seen.
+    "Lateness and work time of the loop (ns)": [GREY, ORANGE],
+    "Events": [],
+}
+
+
+def assert_plotted(seen) -> None:
+    views, reports = seen
+    assert reports == []
+    assert views.keys() == COLORS.keys()
+    for name, colors in COLORS.items():
+        for color in colors:
+            assert count(views[name], color) > 30, (name, color)
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}", "CI": "1"}
+
+
+def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
+    (block,) = (block for block in blocks("sh") if "mcap convert" in block)
+    convert, show = block.splitlines()
+    done = subprocess.run(
+        ["bash", "-ec", convert], cwd=session, env=environment(), capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    words = show.split()
+    assert words[:3] == ["rerun", "--bind", "127.0.0.1"]
+    assert_plotted(look(*words[3:]))
+
+
+def test_the_python_of_the_page_puts_session_and_layout_into_one_file(session):
+    from rerun.chunk import RrdReader
+
+    (block,) = blocks("python")
+    block = block.replace("session.rrd", "by_python.rrd")
+    subprocess.run([sys.executable, "-c", block], cwd=session, env=environment(), check=True)
+    reader = RrdReader(session / "by_python.rrd")
+    (recording,), (layout,) = reader.recordings(), reader.blueprints()
+    assert recording.application_id == layout.application_id == "rigd"
+    count = sum(
+        chunk.to_record_batch().num_rows
+        for chunk in reader.stream()
+        if chunk.entity_path == SAMPLE_TOPIC and "message_log_time" in chunk.timeline_names
+    )
+    assert count == 10_000
+
+
+def test_a_session_file_opened_as_it_is_shows_the_events_only(look):
+    """As the page says: should Rerun ever do better, the page is to say so."""
+    views, _ = look(EXAMPLE, "docs/layouts/rigd.rbl")
+    assert len(views) == 1
+    assert "Motor angle (rad)" not in views
+
+
+def test_the_other_commands_of_the_page(session):
+    (replay,) = (b.strip() for b in blocks("sh") if b.startswith("rigd replay"))
+    command = ["bash", "-ec", f"{replay} --save seen.rrd"]
+    subprocess.run(command, cwd=session, env=environment(), capture_output=True, check=True)
+    assert (session / "seen.rrd").exists()
+    # What these do is tested where the analyser is.
+    (fits,) = (b for b in blocks("sh") if b.startswith("analyze"))
+    assert fits.splitlines() == [f"analyze {EXAMPLE} --rerun fits.rrd", "rigd replay fits.rrd"]
+
+
+def test_its_links_lead_somewhere():
+    headings = {
+        re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).replace(" ", "-")
+        for line in PAGE.splitlines()
+        if line.startswith("#")
+    }
+    for target in re.findall(r"\]\(([^)]+)\)", PAGE):
+        if target.startswith("#"):
+            assert target[1:] in headings, target
+        else:
+            assert (DOCS / target).exists(), target

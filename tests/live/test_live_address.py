@@ -1,0 +1,108 @@
+"""The file by which a live view is found, and the ports that it stands for."""
+
+import json
+import os
+import socket
+import stat
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rigd.devices.simulator import runtime_folder
+from rigd.live.address import LiveAddress, announce, find, running, withdraw
+from rigd.live.outlet import free_port
+
+
+@pytest.fixture
+def address(runtime_folder):
+    return LiveAddress.of_this_process("antenna can", grpc_port=9876, page_port=9090, server=1)
+
+
+def files():
+    return list(runtime_folder().glob("live-*"))
+
+
+@pytest.fixture
+def ended():
+    """The process id of a process that was."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_it_is_found_by_the_rigs_name_as_long_as_it_is_there(address):
+    assert find("antenna can") is None
+    announce(address)
+    announce(second := replace(address, server=2))
+    assert find("antenna can") == second
+    assert find("another") is None
+    announce(other := replace(address, rig="another", grpc_port=1234))
+    assert running() == [other, second]
+    withdraw(second)
+    assert running() == [other]
+    withdraw(other)
+    assert files() == []
+
+
+def test_it_is_for_this_user_only(address):
+    before = os.umask(0o000)
+    announce(address)
+    os.umask(before)
+    (file,) = files()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert file.name == "live-antenna-can.json"
+    assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
+
+
+def test_what_a_dead_process_left_is_no_live_view(address, ended):
+    announce(replace(address, pid=ended))
+    announce(replace(address, rig="reborn", born=address.born - 1))  # the number is used again
+    assert len(files()) == 2
+    assert running() == []
+    announce(address)
+    assert running() == [address], "a new one takes its place"
+
+
+def test_a_process_that_has_not_been_waited_for_has_ended_all_the_same(address, eventually):
+    wait = "import sys; sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", wait], stdin=subprocess.PIPE) as process:
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        child = replace(address, pid=process.pid, born=int(fields[19]))
+        announce(child)
+        assert running() == [child]
+        process.stdin.close()
+        assert eventually(lambda: running() == [])
+
+
+def test_only_its_own_file_is_taken_away(address, ended):
+    announce(address)
+    withdraw(replace(address, pid=ended))
+    assert find("antenna can") == address
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", json.dumps({"rig": "x", "more": 1})])
+def test_a_file_that_is_none_of_ours_is_passed_over(address, text):
+    announce(address)
+    (file,) = files()
+    file.write_text(text)
+    assert running() == []
+    withdraw(address)
+    assert file.exists()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_a_port_on_which_somebody_listens_is_not_taken(host):
+    with socket.create_server((host, 0)) as taken:
+        assert free_port(taken.getsockname()[1]) == 0
+
+
+def test_a_port_whose_last_connections_are_still_closing_is_free():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        place = server.getsockname()
+        with socket.create_connection(place) as client:
+            server.accept()[0].close()  # the end that closes first is the one that waits
+            assert client.recv(1) == b""
+    assert free_port(place[1]) == place[1]

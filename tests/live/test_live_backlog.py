@@ -1,0 +1,119 @@
+"""What waits for a server that stalls, and what the board tells of the rig's health."""
+
+from functools import partial
+
+import pytest
+
+from rigd.engine.board import UNKNOWN, Word
+from rigd.engine.channels import DESCRIPTORS, create_channels
+from rigd.engine.ring import shared_memory_fd
+from rigd.live.backlog import Backlog
+from rigd.live.vitals import LOOK_S, Vitals
+
+
+def drawing(name):
+    return partial(str, name)
+
+
+def names(drawings):
+    return [draw() for draw in drawings]
+
+
+def test_everything_goes_out_in_order_and_once():
+    backlog = Backlog(most_samples=100)
+    assert not backlog
+    backlog.put([drawing("a"), drawing("b")], 50)
+    backlog.owe([drawing("note")])
+    backlog.put([drawing("c")], 50)
+    drawings, samples = backlog.take()
+    assert (names(drawings), samples) == (["note", "a", "b", "c"], 100)
+    assert not backlog
+    assert backlog.take() == ([], 0)
+    assert backlog.dropped == 0
+
+
+def test_the_oldest_samples_make_room_and_are_counted():
+    backlog = Backlog(most_samples=100)
+    backlog.owe([drawing("note")])
+    for number in range(5):
+        backlog.put([drawing(number)], 40)
+    assert backlog.dropped == 120
+    drawings, samples = backlog.take()
+    assert (names(drawings), samples) == (["note", "3", "4"], 80)
+
+
+def test_the_newest_stay_however_many_they_are():
+    backlog = Backlog(most_samples=100)
+    backlog.put([drawing("old")], 10)
+    backlog.put([drawing("new")], 500)
+    assert (backlog.dropped, backlog.take()[1]) == (10, 500)
+
+
+def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
+    backlog = Backlog(most_samples=100)
+    backlog.owe([drawing("note")])
+    backlog.put([drawing("a")], 1)
+    backlog.forgive()
+    assert names(backlog.take()[0]) == ["a"]
+
+
+@pytest.fixture
+def channels():
+    made = create_channels(1000.0, [shared_memory_fd() for _ in range(DESCRIPTORS)])
+    yield made
+    made.close()
+
+
+def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
+    board = channels.board
+    for word, value in {
+        Word.GO: 1,
+        Word.MISSED: 3,
+        Word.LATE: 7,
+        Word.LOST: 2,
+        Word.DISK_FREE_MB: 12_000,
+        Word.BUS_LOAD_PPM: 345_000,
+        Word.BUS_ERRORS: 4,
+        Word.SENSOR_STATUS: 0x8001,
+    }.items():
+        board[word] = value
+    for _ in range(5):
+        channels.samples.publish()
+    health = Vitals(channels).look(0.0, view_dropped=11)
+    assert (health.missed_ticks, health.late_ticks, health.lost_ticks) == (3, 7, 2)
+    assert (health.disk_free_mb, health.recorder_lag_ticks, health.view_dropped) == (12_000, 5, 11)
+    assert health.bus_load_percent == pytest.approx(34.5)
+    assert (health.bus_errors, health.sensor_status) == (4, 0x8001)
+
+
+def test_vitals_of_what_there_is_not_are_not_known(channels):
+    for word in (Word.BUS_LOAD_PPM, Word.BUS_ERRORS, Word.SENSOR_STATUS):
+        channels.board[word] = UNKNOWN
+    health = Vitals(channels).look(0.0, view_dropped=0)
+    assert health.disk_free_mb is None
+    assert (health.bus_load_percent, health.bus_errors, health.sensor_status) == (None, None, None)
+    assert health.rate_hz is None
+
+
+def test_counts_of_the_session_before_are_not_taken_for_this_ones(channels):
+    channels.board[Word.MISSED] = 5
+    vitals = Vitals(channels)
+    assert vitals.look(0.0, view_dropped=0).missed_ticks == 0
+    channels.board[Word.GO] = 1
+    assert vitals.look(1.0, view_dropped=0).missed_ticks == 5
+
+
+def test_the_rate_is_that_of_the_last_second(channels):
+    vitals, board = Vitals(channels), channels.board
+    board[Word.GO] = 1
+    rates = []
+    for look in range(20):
+        now_s = look * LOOK_S
+        assert vitals.due(now_s)
+        board[Word.SCHEDULED] = round(1000 * now_s if look < 10 else 1250 + 500 * now_s)
+        rates.append(vitals.look(now_s, view_dropped=0).rate_hz)
+        assert not vitals.due(now_s + 0.9 * LOOK_S)
+    assert rates[9] == pytest.approx(1000.0, abs=2.0)
+    assert rates[-1] == pytest.approx(500.0, abs=2.0)
+    board[Word.SCHEDULED] = 10
+    assert vitals.look(6.0, view_dropped=0).rate_hz is None, "another session has begun"

@@ -1,0 +1,104 @@
+"""The live view of a rig from the supervisor's side: begun once, found, replaced, given up."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from rigd.engine.signals import StopRequest
+from rigd.excitation.named import make_excitation
+from rigd.live.address import find
+from rigd.profile import load_profile
+from rigd.session import read_session
+from rigd.supervisor.orders import Order
+from rigd.supervisor.rig import Rig
+
+pytestmark = pytest.mark.xdist_group("realtime")
+
+
+@pytest.fixture
+def rig(write_profile, runtime_folder):
+    rig = Rig(load_profile(str(write_profile("sim"))), fast=True, live=True)
+    rig.connect()
+    yield rig
+    rig.disconnect()
+
+
+@pytest.fixture
+def run(rig, tmp_path):
+    """Run a session under the virtual clock; returns its result and what the operator was told."""
+
+    def run(name: str, duration_s: float = 5.0, meanwhile=lambda progress: None):
+        profile = rig._profile
+        excitation = make_excitation(
+            "hold", {"duration_s": duration_s, "rest_s": 0.0}, profile.rig.rate_hz
+        )
+        order = Order(profile, excitation, tmp_path / f"{name}.mcap")
+        told = [rig.show(order)]
+
+        def watch(progress, events) -> None:
+            told.extend(event.message for event in events)
+            meanwhile(progress)
+
+        return rig.run(order, StopRequest(), watch), told
+
+    return run
+
+
+def test_a_series_has_one_view_which_gets_every_sample(rig, run, save, eventually):
+    first, (told, *_) = run("first")
+    view = rig.status().live_view
+    assert told == f"Live view: {view.viewer_url}"
+    assert view == find("sim")
+    saver = save(view.proxy_url)
+    second, (told, *_) = run("second")
+    assert told == f"Live view: {view.viewer_url}"
+    assert rig.status().live_view == view, "the same process, and the same server"
+    assert (first.live_dropped, second.live_dropped) == (0, 0)
+    assert eventually(saver.has_all)
+    rig.disconnect()
+    assert find("sim") is None
+    shown = [columns("/signals", "coupling_torque_nm") for _, columns in saver.recordings()]
+    assert len(shown) == 2
+    for result in (first, second):
+        samples = read_session(result.path).samples
+        assert any(
+            np.array_equal(time_ns, samples["t_ns"])
+            and np.allclose(torque_nm[:, 0], samples["coupling_torque_nm"], rtol=0.0, atol=1e-12)
+            for time_ns, torque_nm in shown
+        )
+
+
+def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run, eventually):
+    run("first")
+    before = rig.status().live_view
+    os.kill(before.pid, signal.SIGKILL)
+
+    def replaced() -> bool:
+        rig.watch()
+        return rig.status().live_view.pid != before.pid
+
+    assert eventually(replaced)
+    result, told = run("second")
+    assert told[0].startswith("Live view: http://127.0.0.1:")
+    assert "The live process was killed by signal 9. It is started again" in "\n".join(told)
+    assert (result.outcome, result.live_dropped) == ("complete", 0)
+
+
+def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig, run):
+    killed = set()
+
+    def kill(_) -> None:
+        for process in rig.status().processes:
+            if process.name == "live" and process.state == "at work":
+                killed.add(process.pid)
+                os.kill(process.pid, signal.SIGKILL)
+
+    result, told = run("watched", 120.0, kill)
+    assert len(killed) == 4
+    assert sum("It is started again" in text for text in told) == 3
+    assert sum("It is not started again" in text for text in told) == 1
+    assert result.outcome == "complete"
+    _, told = run("next")
+    assert told[0].startswith("Live view: "), "a new session is a new chance"

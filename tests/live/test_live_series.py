@@ -1,0 +1,86 @@
+"""One publisher for all sessions of a rig: a recording for each, and nothing that adds up."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.xdist_group("realtime")
+
+
+def run_session(publisher, name: str, eventually) -> None:
+    """Have the producer's next quarter of a second be a session of its own."""
+    producer = publisher.producer
+    begins = tuple(ring.written for ring in producer.channels.rings)
+    publisher.show(name, begins)
+    until = producer.tick + 250
+    assert eventually(lambda: producer.tick > until)
+    publisher.finish()
+
+
+def resident_mb(pid: int) -> float:
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") * 1e-6
+
+
+def threads(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/task").iterdir()))
+
+
+def test_every_session_is_a_recording_with_its_own_samples(publisher, receive, eventually):
+    received = receive(publisher)
+    producer = publisher.producer
+    publisher.finish()
+    bounds = []
+    for name in ("second", "third"):
+        first = producer.channels.samples.written
+        run_session(publisher, name, eventually)
+        bounds.append((name, first, producer.channels.samples.written))
+    for (recording, columns), (name, first, end) in zip(received()[1:], bounds, strict=True):
+        assert recording.recording_id == f"recording of {name}"
+        ticks = columns("/signals", "angle_mrad")[0] // 1_000_000
+        assert ticks[0] == first
+        assert first + 250 <= ticks[-1] + 1 <= end + 50, "up to about when it was finished"
+        assert (ticks[1:] - ticks[:-1] == 1).all()
+
+
+def test_sessions_leave_nothing_behind(publisher, eventually):
+    publisher.finish()
+    for number in range(4):  # what is made once, and kept
+        run_session(publisher, f"early {number}", eventually)
+    pid, server = publisher.process.pid, publisher.server_pid
+    before_mb, before = resident_mb(pid), threads(pid)
+    for number in range(8):
+        run_session(publisher, f"later {number}", eventually)
+    assert publisher.server_pid == server
+    assert eventually(lambda: threads(pid) <= before + 3), "of streams that have come and gone"
+    assert resident_mb(pid) < before_mb + 10.0
+
+
+def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_on(
+    start_producer, start_publisher, receive, eventually
+):
+    producer = start_producer(speed=8.0)
+    publisher = start_publisher(
+        producer, first="from rigd.live import publisher; publisher._WAITING_S = 1.0"
+    )
+    server = publisher.server_pid
+    os.kill(server, signal.SIGSTOP)
+    assert eventually(lambda: publisher.dropped > 1000)
+    publisher.show("next", tuple(ring.written for ring in producer.channels.rings))
+    assert eventually(lambda: publisher.dropped < 1000), "they are counted for each session"
+    os.kill(server, signal.SIGCONT)
+    dropped = -1
+
+    def goes_on() -> bool:
+        nonlocal dropped
+        before, dropped = dropped, publisher.dropped
+        time.sleep(0.3)
+        return dropped == before
+
+    assert eventually(goes_on)
+    *_, (recording, columns) = receive(publisher)()
+    assert recording.recording_id == "recording of next"
+    assert columns("/signals", "angle_mrad")[0].size > 100

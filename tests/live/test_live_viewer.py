@@ -1,0 +1,72 @@
+"""The window of ``rigd live``: Rerun's own viewer, here without a screen."""
+
+import os
+import re
+import signal
+
+import pytest
+
+from rigd.live.viewer import Viewer
+
+pytestmark = pytest.mark.xdist_group("realtime")
+
+NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
+
+
+@pytest.fixture
+def viewer(publisher, eventually):
+    window = Viewer(publisher.address, ("--headless", "--window-size", "320x200"))
+    if not eventually(lambda: window.control_url or window.exit_code is not None):
+        pytest.fail(window.last_words)
+    yield window
+    window.close()
+
+
+@pytest.fixture
+def shown_s(viewer):
+    """The time up to which it shows the recording that is in front."""
+    from rerun.experimental import ViewerClient
+
+    def ask() -> float:
+        if viewer.exit_code is not None:
+            if re.search("graphics adapter|wgpu", viewer.last_words):
+                pytest.skip(NO_GRAPHICS)
+            pytest.fail(viewer.last_words)
+        state = ViewerClient.connect(viewer.control_url).get_state()
+        front = [r for r in state.recordings if r.store_id == state.active_recording]
+        return (front[0].current_time or 0) * 1e-9 if front else 0.0
+
+    return ask
+
+
+def test_it_keeps_up_through_everything(publisher, viewer, shown_s, sockets, eventually):
+    def current() -> bool:
+        return shown_s() > publisher.producer.tick * 1e-3 - 1.5
+
+    assert eventually(lambda: shown_s() > 1.0)
+    assert eventually(current)
+    every = sockets(viewer.pid)
+    ends = {end.split(":")[0] for local, remote, _ in every for end in (local, remote)}
+    assert ends == {"0100007F", "00000000"}, "127.0.0.1, and the far end of a listening socket"
+
+    # A window that stands still holds nobody up, and catches up.
+    os.kill(viewer.pid, signal.SIGSTOP)
+    until = publisher.producer.tick + 1000
+    assert eventually(lambda: publisher.producer.tick > until)
+    os.kill(viewer.pid, signal.SIGCONT)
+    assert eventually(current)
+
+    # Sessions follow each other in it.
+    publisher.finish()
+    begins = tuple(ring.written for ring in publisher.producer.channels.rings)
+    publisher.show("second", begins)
+    assert eventually(lambda: shown_s() > begins[-1] * 1e-3 + 0.2)
+
+    # When the server is another one, it is brought back to the same session.
+    os.kill(publisher.server_pid, signal.SIGKILL)
+    address = publisher.next_address()
+    assert viewer.connect(address)
+    then_s = publisher.producer.tick * 1e-3
+    assert eventually(lambda: shown_s() > then_s)
+    assert eventually(current)
+    assert publisher.producer.refused == 0

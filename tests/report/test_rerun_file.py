@@ -1,0 +1,220 @@
+"""`analyze --rerun`: the session as `rigd replay` shows it, and the fits on charts."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from analysis.cli import app
+from analysis.record import load_record
+from analysis.report import fit_charts
+from analysis.report.folder import OutputError
+from analysis.report.rerun_file import write_rerun_file
+from analysis.settings import WelchSettings
+from analysis.welch_route import analyse
+from rigd.cli.app import app as rigd
+from rigd.session import read_session
+from rigd.view.rrd_file import new_rrd_file
+
+BAND = (0.5875, 50.0)
+
+
+def read(path: Path) -> dict[str, list]:
+    """Read a recording with Rerun's own reader: record batches by entity."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list] = {}
+    for chunk in RrdReader(path).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def value(batches: list, name: str):
+    """Return the one value of a component that stays as it is."""
+    (found,) = [b.column(name).to_pylist()[0] for b in batches if name in b.schema.names]
+    return found
+
+
+@pytest.fixture(scope="module")
+def written(paper_analysis, tmp_path_factory):
+    path = tmp_path_factory.mktemp("rerun") / "paper.rrd"
+    write_rerun_file(paper_analysis, path)
+    return read(path), path
+
+
+class Canvas:
+    """Where a chart's own tick labels say that values are: read from the file, not computed."""
+
+    def __init__(self, chunks, entity):
+        labels = [str(text) for text in value(chunks[f"{entity}/labels"], "Points2D:labels")]
+        places = np.array(value(chunks[f"{entity}/labels"], "Points2D:positions"))
+        frame = np.array(value(chunks[f"{entity}/frame"], "LineStrips2D:strips")[0])
+        (self.left, self.top), (self.right, self.bottom) = frame.min(axis=0), frame.max(axis=0)
+        numbers = {
+            text: place
+            for text, place in zip(labels, places, strict=True)
+            if text.replace("−", "").replace(".", "").isdigit()
+        }
+        # Beside the frame stand the ticks of the vertical axis, below it those of the other.
+        upright = {t: p for t, p in numbers.items() if p[0] < self.left}
+        across = {t: p for t, p in numbers.items() if p[1] > self.bottom - 5 and p[0] >= self.left}
+        self.hz = np.array([[float(t), p[0]] for t, p in across.items()])
+        self.values = np.array([[float(t.replace("−", "-")), p[1]] for t, p in upright.items()])
+
+    def points(self, strips):
+        """Return frequencies in Hz and values (n, 2) from what is drawn."""
+        drawn = np.concatenate([np.asarray(strip, dtype=float) for strip in strips])
+        inside = (drawn[:, 1] > self.top + 0.01) & (drawn[:, 1] < self.bottom - 0.01)
+        drawn = drawn[inside]
+        order = np.argsort(self.hz[:, 1])
+        slope, offset = np.polyfit(self.hz[order, 1], np.log(self.hz[order, 0]), 1)
+        rise, base = np.polyfit(self.values[:, 1], self.values[:, 0], 1)
+        # Labels stand a little above the middle of their ticks, each by as much.
+        lift = self.values[np.argmin(self.values[:, 0]), 1] - self.bottom
+        return np.exp(slope * drawn[:, 0] + offset), rise * (drawn[:, 1] + lift) + base
+
+
+def assert_on_curve(chunks, entity, name, grid_hz, expected, tolerance, *, component=None):
+    """Check that all that is drawn lies on a curve, and that it spans the band."""
+    component = component or "LineStrips2D:strips"
+    strips = value(chunks[f"{entity}/{name}"], component)
+    strips = [strips] if component.startswith("Points2D") else strips
+    frequency_hz, values = Canvas(chunks, entity).points(strips)
+    assert len(values) > 300
+    place = np.abs(grid_hz[:, None] - frequency_hz).argmin(axis=0)
+    assert frequency_hz == pytest.approx(grid_hz[place], rel=2e-3)
+    # On steep flanks the neighbouring bin may be as near.
+    near = np.stack([expected[np.clip(place + k, 0, grid_hz.size - 1)] for k in range(-4, 5)])
+    assert np.abs(near - values).min(axis=0).max() < tolerance
+    return frequency_hz
+
+
+def decibels(values):
+    return 20 * np.log10(np.abs(values))
+
+
+def degrees(values):
+    return np.degrees(np.angle(values * -1j)) + 90.0
+
+
+@pytest.mark.parametrize("kind", ["I", "III", "VI"])
+def test_each_model_and_its_residual_lie_over_the_measured_response(paper_analysis, written, kind):
+    chunks, _ = written
+    grid_hz, measured = paper_analysis.response.frequency_hz, paper_analysis.response.response
+    entity = f"/fits/type_{kind}"
+    models = [m for m in paper_analysis.models if m.fit.structure.name == kind]
+    assert [model.fit.weighting for model in models] == ["const", "omega"]
+    reached = assert_on_curve(
+        chunks, f"{entity}/magnitude", "measured", grid_hz, decibels(measured), 0.2
+    )
+    assert (reached.min(), reached.max()) == pytest.approx(BAND, rel=5e-3)
+    for model in models:
+        name = f"model_{model.fit.weighting}"
+        for page, values, tolerance in (
+            ("magnitude", decibels(model.response), 0.2),
+            ("phase", degrees(model.response), 1.0),
+            ("residual", decibels(measured - model.response), 0.5),
+        ):
+            assert_on_curve(chunks, f"{entity}/{page}", name, grid_hz, values, tolerance)
+
+
+def test_the_estimate_of_the_fits_is_shown_with_its_coherence(paper_analysis, written):
+    chunks, _ = written
+    response = paper_analysis.response
+    assert_on_curve(
+        chunks, "/fits/measured/magnitude", "measured", response.frequency_hz,
+        decibels(response.response), 0.2,
+    )  # fmt: skip
+    assert_on_curve(
+        chunks, "/fits/measured/phase", "measured", response.frequency_hz,
+        degrees(response.response), 1.0, component="Points2D:positions",
+    )  # fmt: skip
+    assert_on_curve(
+        chunks, "/fits/measured/coherence", "coherence", response.frequency_hz,
+        response.coherence, 0.01,
+    )  # fmt: skip
+
+
+def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper_file, written):
+    from rerun.chunk import RrdReader
+
+    chunks, path = written
+    assert sum(b.num_rows for b in chunks["/signals"]) == len(read_session(paper_file).samples)
+    text = value(chunks["/fits/tables"], "TextDocument:text")[0]
+    best = next(
+        m
+        for m in paper_analysis.models
+        if (m.fit.structure.name, m.fit.weighting) == ("VI", "omega")
+    )
+    assert f"{best.indices.wmse:.4g}" in text
+    reader = RrdReader(path)
+    (layout,) = reader.blueprints()
+    tabs = set()
+    for chunk in reader.stream(store=layout):
+        batch = chunk.to_record_batch()
+        for name in ("ContainerBlueprint:display_name", "ViewBlueprint:display_name"):
+            if name in batch.schema.names:
+                tabs |= {title for row in batch.column(name).to_pylist() for title in row or ()}
+    assert {"Fits", "Measured", "Type I", "Type III", "Type VI", "Tables", "Overview"} <= tabs
+    assert any(f"WMSE {best.indices.wmse:.3g}" in tab for tab in tabs)
+
+
+def test_weightings_of_ones_own_and_an_estimate_without_coherence(paper_file, tmp_path):
+    settings = WelchSettings(
+        estimator="fft", types=("III",), weightings=("omega", "omega^0.5", "omega^-0.5")
+    )
+    analysis = analyse(load_record(paper_file), settings)
+    assert analysis.response.coherence is None
+    path = tmp_path / "own.rrd"
+    with new_rrd_file(path) as stream:
+        fit_charts.draw(analysis, "numbers", stream)
+    chunks = read(path)
+    names = {
+        entity.rpartition("/")[2] for entity in chunks if "/type_III/magnitude/model" in entity
+    }
+    assert names == {"model_omega", "model_omega_0_5", "model_omega__0_5"}
+    keys = fit_charts.line_keys(settings.weightings)
+    assert len({key.color for key in keys.values()}) == 3
+
+
+@pytest.fixture
+def session(paper_file, tmp_path):
+    return shutil.copy(paper_file, tmp_path / "session.mcap")
+
+
+def test_a_file_that_cannot_be_written_is_told(paper_analysis):
+    with pytest.raises(OutputError, match=r"^/proc/fits.rrd cannot be written: [A-Z][^:]*\.$"):
+        write_rerun_file(paper_analysis, Path("/proc/fits.rrd"))
+
+
+def run(application, *arguments):
+    return CliRunner().invoke(application, list(map(str, arguments)))
+
+
+def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeypatch):
+    # The figures take longer than all the rest, and are tested elsewhere.
+    monkeypatch.setattr("analysis.report.write.write_report", lambda *_: None)
+    out = tmp_path / "new" / "fits.rrd"
+    quick = ("--types", "I", "--weights", "const")
+    done = run(app, session, *quick, "--rerun", out)
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.stdout.split())
+    assert f"Session and fits for Rerun: {out} (rigd replay {out})" in said
+    assert "/fits/type_I/magnitude/model_const" in read(out)
+    before = out.read_bytes()
+    for options, words in (
+        (("--rerun", out), "nothing is overwritten"),
+        (("--rerun", tmp_path / "fits.txt"), ".rrd"),
+        ((session, "--rerun", tmp_path / "two.rrd"), "2 files were given"),
+    ):
+        done = run(app, session, *quick, *options)
+        assert done.exit_code == 2
+        assert "--rerun" in done.stderr
+        assert words in done.stderr
+    assert out.read_bytes() == before
+    # `rigd replay` takes it for what it is.
+    done = run(rigd, "replay", out, "--save", tmp_path / "copy.rrd")
+    assert done.exit_code == 2
+    assert "is a recording for Rerun already" in done.stderr

@@ -1,0 +1,122 @@
+"""What drawings send, read back from a file of Rerun's."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from rigd.beam import Beam, Damping
+from rigd.session.format import SAMPLE_DTYPE
+from rigd.view.plots import TIMELINE
+from rigd.view.subject import Subject
+
+
+@pytest.fixture(autouse=True)
+def strict():
+    """Errors that Rerun otherwise only logs."""
+    import rerun as rr
+
+    before = rr.strict_mode()
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(before)
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """Execute drawings; return the recorded batches by entity, not always in order of time."""
+
+    def draw(drawings) -> dict[str, list]:
+        import rerun as rr
+        from rerun.chunk import RrdReader
+
+        path = tmp_path / "drawn.rrd"
+        path.unlink(missing_ok=True)
+        stream = rr.RecordingStream("rigd")
+        stream.save(path)
+        for drawing in drawings:
+            drawing(stream)
+        stream.flush(timeout_sec=60.0)
+        stream.disconnect()
+        found: dict[str, list] = {}
+        for chunk in RrdReader(path).stream():
+            found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+        return found
+
+    return draw
+
+
+@dataclass
+class Shown:
+    """What was sent to one entity: of each component its values by time, timeless ones first."""
+
+    times_ns: dict[str, list] = field(default_factory=dict)
+    values: dict[str, list] = field(default_factory=dict)
+    kinds: dict[str, str] = field(default_factory=dict)
+    batches: int = 0
+
+    def add(self, batch) -> None:
+        self.batches += 1
+        times_ns = [None] * batch.num_rows
+        if TIMELINE in batch.schema.names:
+            times_ns = batch.column(TIMELINE).cast("int64").to_pylist()
+        for entry in batch.schema:
+            kind = (entry.metadata or {}).get(b"rerun:component_type")
+            if kind is not None:
+                self.kinds[entry.name] = kind.decode()
+                rows = zip(times_ns, batch.column(entry.name).to_pylist(), strict=True)
+                self._add(entry.name, [row for row in rows if row[1] is not None])
+
+    def _add(self, name: str, rows: list) -> None:
+        rows += zip(self.times_ns.get(name, []), self.values.get(name, []), strict=True)
+        rows.sort(key=lambda row: -1 if row[0] is None else row[0])
+        self.times_ns[name] = [time_ns for time_ns, _ in rows]
+        self.values[name] = [value for _, value in rows]
+
+    def last(self, name: str):
+        """The newest value of a component that has but one a time."""
+        (value,) = self.values[name][-1]
+        return value
+
+
+@pytest.fixture
+def shown(drawn):
+    """Execute drawings; return what was recorded, by entity."""
+
+    def draw(drawings) -> dict[str, Shown]:
+        found = {}
+        for entity, batches in drawn(drawings).items():
+            found[entity] = Shown()
+            for batch in batches:
+                found[entity].add(batch)
+        return found
+
+    return draw
+
+
+@pytest.fixture
+def subject():
+    """The paper's antenna and session."""
+    return Subject(
+        name="20261121-101500-chirp",
+        rate_hz=1000.0,
+        ticks=136_000,
+        sweep=(1000, 121_000),
+        beam=Beam(0.98, 4.7e-3, 0.090275),
+        damping=Damping(7.1e-5, 0.996, 5.5e-2, 0.594),
+    )
+
+
+@pytest.fixture
+def make_samples():
+    """Make samples (n,) at 1 kHz from a tick on, at rest but for the fields given."""
+
+    def make(n: int, first_tick: int = 0, **fields) -> np.ndarray:
+        samples = np.zeros(n, SAMPLE_DTYPE)
+        samples["tick"] = np.arange(first_tick, first_tick + n)
+        samples["t_ns"] = samples["tick"].astype(np.int64) * 1_000_000
+        for name, values in fields.items():
+            samples[name] = values
+        return samples
+
+    return make

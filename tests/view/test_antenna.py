@@ -1,0 +1,177 @@
+"""The antenna as it is drawn, against the shape that is computed of it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rigd.beam import DeflectionFilter
+from rigd.view import antenna
+from rigd.view.antenna import ANTENNA, BEAM, DRAWN_HZ, FACTOR, LABEL, TITLE, TRAIL, TRAIL_S, Antenna
+
+STRIPS = "LineStrips3D:strips"
+
+
+def angle_rad(n: int) -> np.ndarray:
+    time_s = np.arange(n) * 1e-3
+    return 0.3 + 0.025 * np.sin(2 * np.pi * (0.5 + 2 * time_s) * time_s)
+
+
+def moments(batches) -> list[tuple[int, np.ndarray]]:
+    """Times in ns and lines (n, points, 3) of what was sent to an entity, in order of time."""
+    found = []
+    for batch in batches:
+        if STRIPS in batch.schema.names:
+            times = batch.column("session_time").cast("int64").to_pylist()
+            found += zip(times, batch.column(STRIPS).to_pylist(), strict=True)
+    found.sort(key=lambda moment: moment[0])
+    return [(t_ns, np.array(strips)) for t_ns, strips in found]
+
+
+def blocks(samples, size: int):
+    return [samples[i : i + size] for i in range(0, len(samples), size)]
+
+
+@pytest.fixture
+def follow(subject, drawn):
+    """Feed an antenna with blocks of samples; return what it sent, by entity."""
+
+    def run(blocks_of_samples, of=subject):
+        drawing = Antenna(of)
+        return drawn([d for block in blocks_of_samples for d in drawing.samples(block)])
+
+    return run
+
+
+@pytest.fixture
+def samples(make_samples):
+    return make_samples(3000, angle_rad=angle_rad(3000))
+
+
+def test_what_is_drawn_is_the_computed_shape_times_the_factor(subject, samples, follow):
+    beams = moments(follow(blocks(samples, 50))[BEAM])
+    assert len(beams) == 60
+    bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    largest_m = 0.0
+    for (t_ns, (line, beam)), block in zip(beams, blocks(samples, 50), strict=True):
+        deflection_m = bends.feed(block["angle_rad"])
+        largest_m = max(largest_m, abs(deflection_m[-1]))
+        assert t_ns == block["t_ns"][-1]
+        length_m = subject.beam.length_m
+        np.testing.assert_allclose(beam[:, 0] * length_m, bends.x_m, atol=1e-6)
+        # What moves it across the line it rests on: the angle, and what it bends from there.
+        np.testing.assert_allclose(
+            beam[:, 1] * length_m / FACTOR,
+            block["angle_rad"][-1] * bends.x_m + deflection_m,
+            atol=1e-6,
+        )
+        np.testing.assert_allclose((beam - line)[:, 1] * length_m / FACTOR, deflection_m, atol=1e-6)
+        assert np.all(beam[:, 2] == 0)
+    assert largest_m > 0.05
+
+
+def test_the_factor_stands_in_the_title_and_at_the_tip(samples, follow):
+    assert f"× {FACTOR:g}" in TITLE
+    sent = follow(blocks(samples, 50))[LABEL]
+    labels = [label for batch in sent for label in batch.column("Points3D:labels").to_pylist()]
+    assert all(f"drawn × {FACTOR:g}" in label[0] for label in labels)
+    assert 10 <= len(labels) <= 15  # readable: four a second
+
+
+@pytest.mark.parametrize(
+    ("tip_m", "text"),
+    [(0.0, "± 0.0 mm"), (0.00123, "± 1.2 mm"), (0.0456, "± 46 mm"), (0.3519, "± 350 mm")],
+)
+def test_label(tip_m, text):
+    assert antenna.label(tip_m) == f"tip bends {text}, drawn × {FACTOR:g}"
+
+
+def test_the_label_tells_the_largest_deflection_of_late(subject, samples, follow):
+    sent = follow(blocks(samples, 50))[LABEL]
+    times = [t for batch in sent for t in batch.column("session_time").cast("int64").to_pylist()]
+    labels = [label for batch in sent for label in batch.column("Points3D:labels").to_pylist()]
+    last_ns, (last,) = max(zip(times, labels, strict=True))
+    bends = DeflectionFilter(subject.beam, subject.damping, subject.rate_hz)
+    tips_m = np.array([abs(bends.feed(block["angle_rad"])[-1]) for block in blocks(samples, 1)])
+    lately = (samples["t_ns"] <= last_ns) & (samples["t_ns"] > last_ns - 1e9 * TRAIL_S)
+    assert last == antenna.label(tips_m[lately][9::10].max())
+
+
+def test_the_trail_is_what_the_beam_has_been(samples, follow):
+    sent = follow(blocks(samples, 50))
+    beams, trail = moments(sent[BEAM]), moments(sent[TRAIL])
+    assert 55 <= len(trail) <= 60  # it follows a quarter of a second behind
+    for (t_ns, lines), (trail_ns, (past,)) in zip(beams, trail, strict=False):
+        assert trail_ns == t_ns
+        np.testing.assert_array_equal(past, lines[1])
+
+
+@pytest.mark.parametrize("size", [1, 7, 64, 3000])
+def test_blocks_make_no_difference(size, samples, follow):
+    expected = moments(follow(blocks(samples, 50))[BEAM])
+    found = moments(follow(blocks(samples, size))[BEAM])
+    assert [t_ns for t_ns, _ in found] == [t_ns for t_ns, _ in expected]
+    for (_, lines), (_, expected_lines) in zip(found, expected, strict=True):
+        np.testing.assert_allclose(lines, expected_lines, atol=1e-6)
+
+
+def test_missing_samples_are_bridged(samples, follow):
+    expected = moments(follow(blocks(samples, 50))[BEAM])
+    kept = np.ones(3000, dtype=bool)
+    kept[1000:1020] = kept[1500] = kept[2037:2061] = False
+    found = moments(follow(blocks(samples[kept], 50))[BEAM])
+    assert [t_ns for t_ns, _ in found] == [t_ns for t_ns, _ in expected]
+    largest = max(np.abs(lines[1, :, 1] - lines[0, :, 1]).max() for _, lines in expected)
+    for (_, lines), (_, expected_lines) in zip(found, expected, strict=True):
+        np.testing.assert_allclose(lines, expected_lines, atol=0.05 * largest)
+
+
+def test_after_a_gap_of_hours_it_goes_on_at_once(make_samples, follow):
+    blocks_of_samples = [
+        make_samples(100, angle_rad=angle_rad(100)),
+        make_samples(100, first_tick=30_000_000, angle_rad=angle_rad(100)),
+    ]
+    beams = moments(follow(blocks_of_samples)[BEAM])
+    assert len(beams) < 250
+    assert beams[-1][0] > 30_000 * 10**9
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 250.0, 4000.0])
+def test_other_rates_are_drawn_at_most_20_times_a_second(rate_hz, subject, make_samples, follow):
+    n = int(10 * rate_hz)
+    samples = make_samples(n, angle_rad=0.02 * np.sin(np.arange(n) / rate_hz))
+    samples["t_ns"] = np.arange(n) * round(1e9 / rate_hz)
+    of = dataclasses.replace(subject, rate_hz=rate_hz)
+    beams = moments(follow(blocks(samples, 500), of)[BEAM])
+    assert 0.85 <= len(beams) / (10 * min(rate_hz, DRAWN_HZ)) <= 1.0
+    assert all(np.isfinite(lines).all() for _, lines in beams)
+
+
+def test_without_a_damping_the_beam_swings_on(subject, make_samples, follow):
+    n = 4000
+    step = make_samples(n, angle_rad=np.where(np.arange(n) < 500, 0.0, 0.02))
+    unknown = dataclasses.replace(subject, damping=None)
+    beams = moments(follow(blocks(step, 50), unknown)[BEAM])
+    bends = np.array([lines[1, -1, 1] - lines[0, -1, 1] for _, lines in beams])
+    assert np.abs(bends[:9]).max() < 1e-6
+    assert 0.5 < np.abs(bends[-20:]).max() / np.abs(bends[10:30]).max() < 1.0
+
+
+def test_nothing_comes_of_nothing(subject, make_samples):
+    assert Antenna(subject).samples(make_samples(0)) == []
+
+
+def test_frame_draws_the_motor_and_how_the_beam_looks(subject, drawn):
+    sent = drawn(Antenna(subject).frame())
+    assert {f"{ANTENNA}/motor", f"{ANTENNA}/positive", BEAM, TRAIL, LABEL} <= sent.keys()
+    # Nothing of it moves, so nothing of it has a time.
+    assert all("session_time" not in b.schema.names for batches in sent.values() for b in batches)
+    (styles,) = sent[BEAM]
+    assert len(styles.column("LineStrips3D:colors")[0]) == 2
+
+
+def test_view_shows_the_antenna_and_its_trail_from_a_fixed_place():
+    view = antenna.view()
+    assert view.name == TITLE
+    assert view.origin == ANTENNA
+    assert TRAIL in view.visualizer_overrides

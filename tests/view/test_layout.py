@@ -1,0 +1,94 @@
+"""The layout shows all of what is drawn, each thing where it is drawn."""
+
+import pytest
+
+from rigd.view import plots
+from rigd.view.layout import CLOSE_UP_S, HISTORY_S, TABS, WINDOW_S, blueprint
+from rigd.view.plots import TIMELINE
+from rigd.view.response_charts import SIZES
+
+
+def leaves(part):
+    children = getattr(part, "contents", None)
+    if isinstance(children, list | tuple):
+        return [leaf for child in children for leaf in leaves(child)]
+    return [part]
+
+
+def component(batches, name: str) -> list:
+    (batch,) = [b for b in batches if b.component_descriptor().component.endswith(f":{name}")]
+    return batch.as_arrow_array().to_pylist()
+
+
+@pytest.fixture
+def tabs():
+    root = blueprint().root_container
+    return {tab.name: leaves(tab) for tab in root.contents}
+
+
+@pytest.fixture
+def time_series(tabs):
+    """Views of plots over time, with their only visualizer."""
+    return [
+        (view, visualizer)
+        for views in tabs.values()
+        for view in views
+        if view.class_identifier == "TimeSeries"
+        for visualizer in view.visualizer_overrides.values()
+    ]
+
+
+def test_tabs_are_in_order_and_any_can_be_in_front(tabs):
+    assert tuple(tabs) == TABS
+    for i, name in enumerate(TABS):
+        assert blueprint(name).root_container.active_tab == i
+
+
+def test_every_plot_has_a_view_with_all_its_curves(time_series):
+    from rerun.components import AggregationPolicy
+
+    sources = {source.entity: source for source in (plots.SIGNALS, plots.READINGS, plots.HEALTH)}
+    seen = set()
+    for view, visualizer in time_series:
+        source = sources[view.origin]
+        assert list(view.visualizer_overrides) == [source.entity]
+        (mapping,) = visualizer.mappings
+        (plot,) = [p for p in source.plots if p.component == mapping.source_component]
+        seen.add(plot)
+        assert view.name == plot.title
+        batches = visualizer.overrides
+        assert component(batches, "names") == [curve.label for curve in plot.curves]
+        assert component(batches, "aggregation_policy") == [AggregationPolicy.MinMax.value]
+        packed = [int.from_bytes(bytes((*curve.color, 255)), "big") for curve in plot.curves]
+        assert component(batches, "colors") == packed
+        legend = view.properties["PlotLegend"].as_component_batches()
+        assert component(legend, "visible") == [len(plot.curves) > 1]
+    assert seen == {plot for source in sources.values() for plot in source.plots}
+
+
+def test_plots_show_a_window_up_to_the_cursor(time_series):
+    windows_s = set()
+    for view, _ in time_series:
+        (window,) = component(view.properties["VisibleTimeRanges"].as_component_batches(), "ranges")
+        assert window["timeline"] == TIMELINE
+        axis = view.properties["TimeAxis"].as_component_batches()
+        assert component(axis, "view_range") == [window["range"]]
+        windows_s |= {
+            s
+            for s in (WINDOW_S, CLOSE_UP_S, HISTORY_S)
+            if str(-round(s * 1e9)) in str(window["range"])
+        }
+    assert windows_s == {WINDOW_S, CLOSE_UP_S, HISTORY_S}
+
+
+def test_charts_fill_their_views(tabs):
+    charts = {
+        view.origin: view
+        for views in tabs.values()
+        for view in views
+        if view.class_identifier == "2D"
+    }
+    assert charts.keys() == {*SIZES, "/spectrogram"}
+    for entity, (width, height) in SIZES.items():
+        bounds = charts[entity].properties["VisualBounds2D"].as_component_batches()
+        assert component(bounds, "range") == [{"x_range": [0.0, width], "y_range": [0.0, height]}]

@@ -1,0 +1,185 @@
+"""Everything that is shown of a session, from the samples of a whole one."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.estimate import estimate
+from analysis.record import load_record
+from analysis.settings import PAPER_BAND_HZ, WelchSettings
+from rigd.beam import Damping
+from rigd.session import Status, read_session
+from rigd.session.format import TIMING_DTYPE
+from rigd.view.health import Health
+from rigd.view.notes import Note
+from rigd.view.picture import Picture
+from rigd.view.response_charts import MAGNITUDE
+from rigd.view.subject import Subject
+from rigd.view.sweep_response import SweepResponse
+
+RIGD = Path(sys.executable).parent / "rigd"
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """The paper's session on the simulated rig."""
+    folder = tmp_path_factory.mktemp("session")
+    command = [RIGD, "run", "chirp", "--profile", "sim", "--fast", "--output", folder]
+    subprocess.run(command, check=True, capture_output=True, timeout=100)
+    (path,) = folder.glob("*.mcap")
+    return path
+
+
+@pytest.fixture(scope="module")
+def record(path):
+    return load_record(path)
+
+
+def subject_of(record) -> Subject:
+    return Subject(
+        name=record.path.stem,
+        rate_hz=record.rate_hz,
+        ticks=len(record.time_s),
+        sweep=(record.sweep.start, record.sweep.stop),
+        beam=record.beam,
+        damping=Damping(7.1e-5, 0.996, 5.5e-2, 0.594),
+        tool_inertia_kg_m2=record.tool_inertia_kg_m2,
+        angle_delay_s=record.angle_delay_s,
+        torque_delay_s=record.torque_delay_s,
+    )
+
+
+def blocks(samples, size=50):
+    return (samples[i : i + size] for i in range(0, len(samples), size))
+
+
+def final_response(record, samples):
+    response = SweepResponse(subject_of(record), last_hz=60.0)
+    for block in blocks(samples):
+        response.feed(block)
+    found = response.estimate()
+    assert found.final
+    return found.response.band(*PAPER_BAND_HZ)
+
+
+def test_final_response_is_that_of_the_analyser(path, record):
+    found = final_response(record, read_session(path).samples)
+    expected, _ = estimate(record, WelchSettings())
+    assert found.frequency_hz == pytest.approx(expected.frequency_hz)
+    assert np.all(abs(found.response - expected.response) < 1e-6 * abs(expected.response))
+    assert found.coherence == pytest.approx(expected.coherence, abs=1e-6)
+
+
+def test_missing_and_held_values_are_made_up_for_as_the_analyser_does(path, record):
+    samples = read_session(path).samples.copy()
+    faulty = np.random.default_rng(1).choice(np.arange(2000, 120_000), 300, replace=False)
+    held, missing = faulty[:200], faulty[200:]
+    samples["status"][held] |= np.uint32(Status.WRENCH_STALE)
+    samples["coupling_torque_nm"][held] = 0.3
+    every = np.arange(len(samples))
+    known = np.setdiff1d(every, faulty)
+    present = np.setdiff1d(every, missing)
+    record = replace(
+        record,
+        torque_nm=np.interp(every, known, samples["coupling_torque_nm"][known]),
+        angle_rad=np.interp(every, present, samples["angle_rad"][present]),
+    )
+    found = final_response(record, samples[present])
+    expected, _ = estimate(record, WelchSettings())
+    error = abs(found.response - expected.response)
+    # The angle of a tick whose torque was held is not used either: that is all the difference.
+    assert np.quantile(error / abs(expected.response), 0.99) < 0.01
+
+
+def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, shown):
+    picture = Picture(subject_of(record))
+    for block in blocks(read_session(path).samples):
+        picture.samples(block)
+    drawings = picture.finish()
+    found = shown(drawings)
+    (strip,) = found[f"{MAGNITUDE}/measured"].values["LineStrips2D:strips"][-1]
+    points = np.array(strip)
+    expected, _ = estimate(record, WelchSettings())
+    expected_db = 20 * np.log10(abs(expected.response))
+    chart = picture.response_charts.chart(MAGNITUDE)
+    at = chart.place(expected.frequency_hz, expected_db)
+    inside = (points[:, 0] > at[0, 0]) & (points[:, 0] < at[-1, 0])
+    assert 300 < inside.sum() <= 400
+    nearest = abs(at[:, 0] - points[inside, :1]).argmin(axis=1)
+    _, top, _, bottom = chart.frame
+    decibels = (chart.y.last - chart.y.first) / (bottom - top)
+    one_percent_db = 20 * np.log10(1.01)
+    assert np.all(abs(at[nearest, 1] - points[inside, 1]) * decibels < one_percent_db)
+    # All of the excited band is shown, and the peaks to their tops.
+    assert points[:, 0].max() > at[expected.frequency_hz < 49.0, 0].max()
+    assert points[inside, 1].min() == pytest.approx(at[:, 1].min(), abs=1e-3)
+
+
+def test_everything_has_its_place(subject, make_samples, shown):
+    picture = Picture(subject)
+    frame = picture.frame()
+    t_s = np.arange(3000) / 1000.0
+    samples = make_samples(3000, angle_rad=0.01 * np.sin(t_s), coupling_torque_nm=0.1)
+    timings = np.zeros(3000, TIMING_DTYPE)
+    timings["tick"], timings["t_ns"] = samples["tick"], samples["t_ns"]
+    drawings = list(frame)
+    for i in range(0, 3000, 50):
+        drawings += picture.samples(samples[i : i + 50])
+        drawings += picture.timings(timings[i : i + 50])
+    drawings += picture.health(3_000_000_000, Health(missed_ticks=1, rate_hz=1000.0))
+    drawings += picture.events([Note(1_000_000, "warning", "1 tick was missed.")])
+    drawings += picture.finish()
+    found = shown(drawings)
+    assert {entity for entity in found if entity.count("/") == 1} >= {
+        "/signals",
+        "/readings",
+        "/health",
+        "/summary",
+        "/events",
+    }
+    # No sample is missing, none comes twice.
+    for entity, component, records in (
+        ("/signals", "angle_mrad", samples),
+        ("/readings", "ages_ms", timings),
+    ):
+        assert found[entity].times_ns[component] == records["t_ns"].tolist()
+        assert found[entity].batches <= 31
+    assert found["/events"].last("TextLog:text") == "1 tick was missed."
+    assert found["/events"].last("TextLog:level") == "WARN"
+    assert found["/events"].times_ns["TextLog:text"] == [1_000_000]
+    assert "3 of 136 s" in found["/summary"].last("TextDocument:text")
+
+
+def test_a_new_connection_is_shown_what_is_known_already(path, record, shown):
+    picture = Picture(subject_of(record))
+    for block in blocks(read_session(path).samples[:30_000], 1000):
+        picture.samples(block)
+    picture.events([Note(1_000_000, "info", "The record begins.")])
+    found = shown(picture.frame())
+    assert found[f"{MAGNITUDE}/measured"].values["LineStrips2D:strips"][-1][0]
+    assert found["/spectrogram/levels"].last("DepthImage:buffer")
+    assert found["/events"].values["TextLog:text"] == [["The record begins."]]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sweep": (1000, 1000)},
+        {"sweep": (1000, 1003)},
+        {"rate_hz": 100.0, "ticks": 3000, "sweep": (0, 3000)},
+        {"damping": None},
+        {"ticks": 0, "sweep": (0, 0)},
+    ],
+)
+def test_any_session_can_be_shown(subject, make_samples, shown, changes):
+    picture = Picture(replace(subject, **changes))
+    drawings = [*picture.frame(), *picture.samples(make_samples(0))]
+    for samples in blocks(make_samples(3000, angle_rad=np.nan, coupling_torque_nm=np.nan), 700):
+        drawings += picture.samples(samples)
+    for samples in blocks(make_samples(3000, first_tick=9000), 700):
+        drawings += picture.samples(samples)
+    assert shown([*drawings, *picture.finish(), *picture.frame()])

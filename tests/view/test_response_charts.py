@@ -1,0 +1,154 @@
+"""What the charts of the frequency response show: units, delays, the model, what is not excited."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd.beam import transfer
+from rigd.spectral import FrequencyResponse, RunningEstimate
+from rigd.view.response_charts import (
+    COHERENCE,
+    FIRST_HZ,
+    LAST_HZ,
+    MAGNITUDE,
+    OVERVIEW_MAGNITUDE,
+    PHASE,
+    ResponseCharts,
+    magnitude_db,
+    phase_deg,
+)
+
+GRID = np.arange(9601) / 160.0
+
+
+def estimate(subject, *, excited_up_to_hz=20.0, delays_s=(0.0, 0.0)) -> RunningEstimate:
+    """Estimate that is the model as channels of such ages (angle, torque) show it."""
+    s = 2j * np.pi * GRID
+    exact = transfer(s, subject.beam, subject.damping) + subject.tool_inertia_kg_m2 * s * s
+    late = np.exp(-s * (delays_s[1] - delays_s[0]))
+    response = FrequencyResponse(GRID, exact * late, np.full(GRID.shape, 0.75), 3, "h1")
+    below, above = np.searchsorted(GRID, [0.1, excited_up_to_hz], side="right")
+    excited = np.zeros(GRID.shape, bool)
+    excited[below:above] = True
+    return RunningEstimate(response, excited, final=False)
+
+
+def strips(shown) -> list[np.ndarray]:
+    return [np.array(strip) for strip in shown.values["LineStrips2D:strips"][-1]]
+
+
+def values(charts: ResponseCharts, entity: str, strip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Turn a strip on the canvas back to frequency in Hz and value, by the chart's tick labels."""
+    chart = charts.chart(entity)
+    ticks = [(float(t.replace("−", "-")), x, y) for t, x, y in chart.tick_labels()]
+    count = len(chart.x.ticks)
+    (f0, x0, _), (f1, x1, _) = ticks[0], ticks[count - 1]
+    (v0, _, y0), (v1, _, y1) = ticks[count], ticks[-1]
+    frequency_hz = f0 * (f1 / f0) ** ((strip[:, 0] - x0) / (x1 - x0))
+    return frequency_hz, v0 + (v1 - v0) * (strip[:, 1] - y0) / (y1 - y0)
+
+
+@pytest.mark.parametrize("delays_s", [(0.0, 0.0), (1e-3, 0.2e-3), (0.0, 1.5e-3)])
+@pytest.mark.parametrize("tool_inertia_kg_m2", [0.0, 1e-5])
+def test_measured_response_lies_on_the_model_it_was_made_of(
+    subject, shown, delays_s, tool_inertia_kg_m2
+):
+    subject = replace(
+        subject,
+        tool_inertia_kg_m2=tool_inertia_kg_m2,
+        angle_delay_s=delays_s[0],
+        torque_delay_s=delays_s[1],
+    )
+    charts = ResponseCharts(subject)
+    charts.update(20_000_000_000, estimate(subject, delays_s=delays_s))
+    found = shown([charts.draw_frames, charts.draw])
+    for entity, of in (
+        (MAGNITUDE, magnitude_db),
+        (OVERVIEW_MAGNITUDE, magnitude_db),
+        (PHASE, phase_deg),
+    ):
+        for name, last_hz in (("measured", 20.0), ("model", LAST_HZ)):
+            (strip,) = strips(found[f"{entity}/{name}"])
+            frequency_hz, seen = values(charts, entity, strip)
+            assert frequency_hz[0] == pytest.approx(FIRST_HZ, rel=1e-3)
+            assert frequency_hz[-1] == pytest.approx(last_hz, rel=5e-3)
+            s = 2j * np.pi * frequency_hz
+            exact = transfer(s, subject.beam, subject.damping) + tool_inertia_kg_m2 * s * s
+            axis = charts.chart(entity).y
+            expected = np.clip(of(exact), axis.first, axis.last)
+            # Read off a canvas, at a frequency read off a canvas: where it is steep, not so well.
+            assert np.median(abs(seen - expected)) < 1e-3 * (axis.last - axis.first)
+            assert np.mean(abs(seen - expected) < 5e-3 * (axis.last - axis.first)) > 0.97
+    (strip,) = strips(found[f"{COHERENCE}/measured"])
+    assert values(charts, COHERENCE, strip)[1] == pytest.approx(np.full(len(strip), 0.75), abs=1e-5)
+
+
+def test_peaks_of_the_model_are_drawn_at_their_height(subject, shown):
+    charts = ResponseCharts(subject)
+    (strip,) = strips(shown([charts.draw_frames])[f"{MAGNITUDE}/model"])
+    frequency_hz, seen = values(charts, MAGNITUDE, strip)
+    fine_hz = np.arange(0.5, 60.0, 1e-3)
+    exact_db = magnitude_db(transfer(2j * np.pi * fine_hz, subject.beam, subject.damping))
+    assert len(strip) <= 400
+    for first_hz, last_hz in ((2.0, 4.0), (14.0, 18.0), (40.0, 50.0)):
+        near = (frequency_hz > first_hz) & (frequency_hz < last_hz)
+        peak_db = exact_db[(fine_hz > first_hz) & (fine_hz < last_hz)].max()
+        assert seen[near].max() == pytest.approx(peak_db, abs=0.2)
+    axis = charts.chart(MAGNITUDE).y
+    assert axis.first <= exact_db.min()
+    assert axis.last > exact_db.max()
+
+
+def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
+    charts = ResponseCharts(subject)
+    before = shown([charts.draw_frames, charts.draw])
+    assert strips(before[f"{MAGNITUDE}/measured"]) == []
+    charts.update(20_000_000_000, estimate(subject, excited_up_to_hz=20.0))
+    after = shown([charts.draw])
+    chart = charts.chart(MAGNITUDE)
+    left, _, right, _ = chart.frame
+    at_20_hz = chart.place(20.0, chart.y.first)[0]
+
+    def shaded(found, name) -> tuple[float, float]:
+        shade = found[f"{MAGNITUDE}/not_excited_{name}"]
+        x, _, _ = shade.last("Transform3D:translation")
+        width, _, _ = shade.last("Transform3D:scale")
+        return x, x + width
+
+    assert shaded(before, "below") == pytest.approx((left, right))
+    assert shaded(after, "above") == pytest.approx((at_20_hz, right), abs=1e-3)
+    assert shaded(after, "below") == pytest.approx((left, left))
+    (strip,) = strips(after[f"{MAGNITUDE}/measured"])
+    assert strip[:, 0].max() == pytest.approx(at_20_hz, abs=0.5)
+    times_ns = after[f"{MAGNITUDE}/measured"].times_ns["LineStrips2D:strips"]
+    assert times_ns == [20_000_000_000]
+
+
+def test_without_a_nominal_model_none_is_drawn(subject, shown):
+    charts = ResponseCharts(replace(subject, damping=None))
+    found = shown([charts.draw_frames])
+    assert not [entity for entity in found if entity.endswith("/model")]
+    (labels,) = found[f"{MAGNITUDE}/labels"].values["Points2D:labels"]
+    assert "nominal model" not in labels
+    assert "measured" in labels
+
+
+def test_axes_state_their_units(subject, shown):
+    found = shown([ResponseCharts(subject).draw_frames])
+    titles = {
+        MAGNITUDE: "Magnitude (dB re 1 N·m/rad)",
+        OVERVIEW_MAGNITUDE: "Magnitude (dB re 1 N·m/rad)",
+        PHASE: "Phase (degrees)",
+        COHERENCE: "Coherence (1)",
+    }
+    for entity, title in titles.items():
+        (labels,) = found[f"{entity}/labels"].values["Points2D:labels"]
+        assert title in labels
+        assert "Frequency (Hz)" in labels
+
+
+def test_phases_about_zero_and_half_a_turn_do_not_jump():
+    noise = np.exp(1j * np.radians([-10.0, 0.0, 10.0]))
+    assert phase_deg(noise) == pytest.approx([-10.0, 0.0, 10.0])
+    assert phase_deg(-noise) == pytest.approx([170.0, 180.0, 190.0])

@@ -1,0 +1,50 @@
+"""The state of a session at one look."""
+
+from rigd.view.health import Health
+from rigd.view.summary import summary
+
+WELL = Health(
+    missed_ticks=0, late_ticks=0, lost_ticks=0, recorder_lag_ticks=17, disk_free_mb=51_234.0,
+    view_dropped=0, bus_load_percent=31.4, bus_errors=0, sensor_status=0, rate_hz=1000.0,
+)  # fmt: skip
+
+
+def rows(text: str) -> dict[str, str]:
+    """Return the cells by name, of a table as Markdown has it."""
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
+    assert {len(line) for line in lines} == {2}
+    assert lines[1] == ["---", "---"]
+    return dict([lines[0], *lines[2:]])
+
+
+def test_a_session_that_goes_well(subject):
+    assert rows(summary(subject, 43_200_000_000, WELL)) == {
+        "session": "43 of 136 s",
+        "rate": "1000.0 Hz",
+        "missed ticks": "0",
+        "late ticks": "0",
+        "lost ticks": "0",
+        "waiting for the recorder": "17 samples",
+        "not shown here": "0 samples",
+        "bus load": "31 %",
+        "bus errors": "0",
+        "sensor status": "well",
+        "free on the disk": "51.2 GB",
+    }
+
+
+def test_what_is_wrong_stands_out(subject):
+    found = rows(
+        summary(subject, 0, Health(missed_ticks=3, lost_ticks=0, bus_errors=2, sensor_status=0x41))
+    )
+    assert {name for name, text in found.items() if "⚠" in text} == {
+        "missed ticks",
+        "bus errors",
+        "sensor status",
+    }
+    assert "0x0041" in found["sensor status"]
+    assert "3" in found["missed ticks"]
+
+
+def test_what_is_not_known_is_left_out(subject):
+    assert set(rows(summary(subject, 0, Health()))) == {"session"}

@@ -1,0 +1,52 @@
+"""A thinned curve keeps every peak, each where it is."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rigd.view.thinning import Thinning
+
+GRID = np.arange(9601) / 160.0
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    groups=st.integers(1, 300),
+    unknown=st.floats(0.0, 1.0),
+)
+def test_no_extreme_is_lost_and_none_is_made_up(seed, groups, unknown):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=GRID.size)
+    values[rng.random(GRID.size) < unknown] = np.nan
+    thinning = Thinning.logarithmic(GRID, 0.5, 60.0, groups)
+    strips = thinning.strips(values)
+    points = np.concatenate(strips) if strips else np.empty((0, 2))
+    assert len(points) <= 2 * groups
+    inside = (GRID >= 0.5) & (GRID <= 60.0) & np.isfinite(values)
+    if inside.any():
+        assert points[:, 1].max() == values[inside].max()
+        assert points[:, 1].min() == values[inside].min()
+    # Every point is one of the curve, and they go one way.
+    index = np.rint(points[:, 0] * 160.0).astype(int)
+    assert points[:, 1] == pytest.approx(values[index], abs=0.0)
+    assert np.all(np.diff(points[:, 0]) > 0)
+
+
+def test_every_local_peak_wider_than_a_group_survives():
+    peaks_hz = np.geomspace(0.6, 55.0, 12)
+    values = sum(np.exp(-(((GRID - peak) / (0.02 * peak)) ** 2)) for peak in peaks_hz)
+    points = np.concatenate(Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(values))
+    for peak_hz in peaks_hz:
+        near = abs(points[:, 0] - peak_hz) < 0.02 * peak_hz
+        near_all = abs(GRID - peak_hz) < 0.02 * peak_hz
+        assert points[near, 1].max() == values[near_all].max()
+
+
+def test_a_curve_is_broken_where_it_is_not_known():
+    values = np.zeros(GRID.size)
+    values[(GRID > 5.0) & (GRID < 10.0)] = np.nan
+    below, above = Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(values)
+    assert below[-1, 0] <= 5.0
+    assert above[0, 0] >= 10.0
+    assert Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(np.full(GRID.size, np.nan)) == []
