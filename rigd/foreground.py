@@ -123,7 +123,7 @@ def run_in_foreground(
                 if repeat > 1:
                     given["series"] = f"{number} of {repeat}"
                 order = Order(profile, excitation, path, tuple(given.items()))
-                if live and (where := rig.show(order)) != told_where:
+                if live and (where := rig.show(order, stop)) != told_where:
                     tell(where)
                     told_where = where
                 with _ProgressView(excitation.reference_rad.size) as view:

@@ -183,14 +183,15 @@ def run_session(
     ):
         order = Order(profile, excitation, Path(folder) / "bench.mcap")
         meter = UsageMeter(crew.control.pid)
+        stop = StopRequest()
         if live:
-            rig.show(order)
+            rig.show(order, stop)
 
         def watch(progress: SessionProgress, _: object) -> None:
             meter.look(progress.phase)
             look()
 
-        result = rig.run(order, StopRequest(), watch)
+        result = rig.run(order, stop, watch)
         _require(result.outcome, result.reason)
         assert result.path is not None
         samples = read_session(result.path).samples

@@ -1,13 +1,12 @@
 """``rigd live``: the operator's window on a running rig."""
 
-import os
 import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, fail
-from rigd.cli.tunnel import tunnel_advice
+from rigd.cli.viewing import ended_gently, has_screen, scratch_folder, tunnel_advice
 
 if TYPE_CHECKING:
     from rigd.live.address import LiveAddress
@@ -44,7 +43,7 @@ def live(
     if web:
         typer.echo(view.page_url)
         typer.echo(tunnel_advice(view), err=True)
-    elif not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    elif not has_screen():
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
             f"rigd live --web prints the address for a browser. {tunnel_advice(view)}",
@@ -84,16 +83,22 @@ def _await(rig: str | None) -> "LiveAddress":
 
 
 def _how_to_start(profile: str | None) -> str:
-    from rigd.service.live_views import daemons_without_view
+    from rigd.service.live_views import daemons
 
     of_rig = "" if profile is None else f" of the rig {profile}"
     name = profile or "NAME"
-    for rig in daemons_without_view():
-        if profile in (None, rig):
+    for rig, with_view in daemons().items():
+        if profile not in (None, rig):
+            continue
+        if with_view:
             return (
-                f"The daemon of the rig {rig} was started without a live view; end it and start it "
-                f"with rigd serve --profile {rig} --live."
+                f"The daemon of the rig {rig} has no live view at the moment: rigd status says "
+                "what it is doing. rigd live --wait waits for the view."
             )
+        return (
+            f"The daemon of the rig {rig} was started without a live view; end it and start it "
+            f"with rigd serve --profile {rig} --live."
+        )
     return (
         f"No live view{of_rig} is running. Start one with rigd run chirp --profile {name} --live, "
         f"or with rigd serve --profile {name} --live; rigd live --wait waits for it."
@@ -105,18 +110,19 @@ def _show(view: "LiveAddress") -> None:
     from rigd.live.program import RerunError
     from rigd.live.viewer import Viewer
 
-    try:
-        viewer = Viewer(view)
-    except RerunError as error:
-        fail(str(error), EXIT_FAILED)
-    typer.echo(
-        f"The live view of {view.rig} is shown; close the window, or press Ctrl-C, to end.",
-        err=True,
-    )
-    try:
-        code = _follow(viewer, view)
-    finally:
-        viewer.close()
+    with ended_gently(), scratch_folder() as scratch:
+        try:
+            viewer = Viewer(view, scratch)
+        except RerunError as error:
+            fail(str(error), EXIT_FAILED)
+        typer.echo(
+            f"The live view of {view.rig} is shown; close the window, or press Ctrl-C, to end.",
+            err=True,
+        )
+        try:
+            code = _follow(viewer, view)
+        finally:
+            viewer.close()
     if code:
         fail(
             f"The window was closed by a fault ({viewer.last_words}). rigd live --web shows the "

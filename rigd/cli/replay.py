@@ -1,22 +1,14 @@
 """``rigd replay``: a recorded session, as it was seen live."""
 
-import contextlib
-import os
-import signal
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
 from rigd.cli.progress import progress
-from rigd.cli.tunnel import tunnel_advice
+from rigd.cli.viewing import ended_gently, has_screen, scratch_folder, tunnel_advice
 from rigd.view.rrd_file import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
-
-if TYPE_CHECKING:
-    pass
 
 
 def replay(
@@ -47,16 +39,20 @@ def replay(
     if save is not None:
         _save(path, save, web=web)
         return
-    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not web and not has_screen():
+        elsewhere = (
+            "the file can be looked at elsewhere as it is"
+            if path.suffix == SUFFIX
+            else f"--save OUT{SUFFIX} writes a file that can be looked at elsewhere"
+        )
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
-            f"rigd replay {path} --web prints an address for a browser; --save OUT{SUFFIX} writes "
-            "a file that can be looked at elsewhere.",
+            f"rigd replay {path} --web prints an address for a browser; {elsewhere}.",
             EXIT_FAILED,
         )
     from rigd.live.program import RerunError
 
-    with _ended_gently(), _scratch_folder() as scratch:
+    with ended_gently(), scratch_folder() as scratch:
         recording = _as_recording(path, scratch)
         try:
             if web:
@@ -103,22 +99,9 @@ def _as_recording(path: Path, scratch: Path) -> Path:
         except RrdFileError as error:
             fail(str(error), EXIT_FAILED)
         return path
-    recording = scratch / f"{path.stem}{SUFFIX}"
+    recording = scratch / f"session{SUFFIX}"
     _convert(path, recording)
     return recording
-
-
-@contextlib.contextmanager
-def _scratch_folder() -> Iterator[Path]:
-    try:
-        folder = tempfile.TemporaryDirectory(prefix="rigd-replay-", ignore_cleanup_errors=True)
-    except OSError as error:
-        fail(
-            f"No temporary folder can be made ({error.strerror}); set TMPDIR to one with room.",
-            EXIT_FAILED,
-        )
-    with folder as name:
-        yield Path(name)
 
 
 def _open_window(recording: Path, scratch: Path, path: Path) -> None:
@@ -144,15 +127,3 @@ def _serve(recording: Path, scratch: Path, path: Path) -> None:
         )
         page.wait()
         fail(f"The Rerun server ended: {page.program.last_words}.", EXIT_FAILED)
-
-
-@contextlib.contextmanager
-def _ended_gently() -> Iterator[None]:
-    """Have every way of being asked to end mean Ctrl-C, so that the temporary file goes too."""
-    asked = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, signal.default_int_handler) for number in asked]
-    try:
-        yield
-    finally:
-        for number, handler in zip(asked, before, strict=True):
-            signal.signal(number, handler)

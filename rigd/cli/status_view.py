@@ -44,9 +44,13 @@ def status_table(told: dict[str, Any]) -> RenderableType:
     rig = told["rig"]
     if rig is not None:
         recording = told["state"] in ("running", "stopping")
-        beside = Table.grid(padding=(0, 3, 0, 0))
-        beside.add_row(_signals(rig), _processes(rig["processes"]))
-        beside.add_row(_health(rig), _topics(rig["topics"], recording=recording))
+        beside = Table.grid(padding=(0, 2, 0, 0))
+        beside.add_row(
+            Group("", _signals(rig), "", _health(rig)),
+            Group(
+                "", _processes(rig["processes"]), "", _topics(rig["topics"], recording=recording)
+            ),
+        )
         parts.append(beside)
     parts.append(_history(told["history"]))
     return Group(*parts)
@@ -99,7 +103,7 @@ def _series(series: dict[str, Any]) -> str:
 
 
 def _table(title: str, *columns: str) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title_justify="left")
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold underline")
     table.add_column(title, no_wrap=True)
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
@@ -135,9 +139,9 @@ def _signals(rig: dict[str, Any]) -> Table:
         ),
     ):
         table.add_row(
-            name,
-            "" if now is None else f"{now:+.{digits}f} {unit}",
-            "" if peak is None else f"{peak:.{digits}f} {unit}",
+            f"{name}, {unit}",
+            "" if now is None else f"{now:+.{digits}f}",
+            "" if peak is None else f"{peak:.{digits}f}",
         )
     return table
 
@@ -157,8 +161,8 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         expected_hz = max(topic["expected_hz"] or 0.0 for topic in rig["topics"])
         slow = signals["rate_hz"] < 0.999 * expected_hz
         yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if slow else ""
-        late = f"{signals['lateness_p50_us']:.0f}, 99 %: {signals['lateness_p99_us']:.0f} µs"
-        yield "lateness, median", late, ""
+        late = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
+        yield "late, 50 and 99 %", late, ""
         yield "work of a tick, 99 %", f"{signals['work_p99_us']:.0f} µs", ""
     lost = f"{health['missed']}, {health['late']}, {health['lost']}"
     bad = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
@@ -179,22 +183,20 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def _processes(processes: list[dict[str, Any]]) -> Table:
-    table = _table("process", "pid", "state", "last sign")
+    table = _table("process", "pid", "state", "s ago")
     for process in processes:
         bad = process["state"] in ("hung", "ended")
         table.add_row(
             process["name"],
             str(process["pid"]),
             Text(process["state"], style="bold red" if bad else ""),
-            f"{process['still_s']:.1f} s ago"
-            if process["state"] not in ("waiting", "done")
-            else "",
+            f"{process['still_s']:.1f}" if process["state"] not in ("waiting", "done") else "",
         )
     return table
 
 
 def _topics(topics: list[dict[str, Any]], *, recording: bool) -> Table:
-    table = _table("topic", "records", "rate", "expected", "waiting")
+    table = _table("topic", "records", "Hz", "of Hz", "waiting")
     for topic in topics:
         table.add_row(
             topic["name"],
@@ -207,7 +209,7 @@ def _topics(topics: list[dict[str, Any]], *, recording: bool) -> Table:
 
 
 def _rate(rate_hz: float | None) -> str:
-    return "" if rate_hz is None else f"{rate_hz:.0f} Hz"
+    return "" if rate_hz is None else f"{rate_hz:.0f}"
 
 
 def _history(transitions: list[dict[str, Any]]) -> Table:

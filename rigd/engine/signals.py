@@ -7,7 +7,7 @@ publisher let them pass: they end when the supervisor has no more use for them.
 """
 
 import signal
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
@@ -26,11 +26,10 @@ def held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def ignore(*, but: Collection[signal.Signals] = ()) -> None:
-    """Let these signals pass, `but` some."""
+def ignore() -> None:
+    """Let these signals pass."""
     for number in _STOPPING:
-        if number not in but:
-            signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)
 
 

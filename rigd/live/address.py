@@ -18,6 +18,7 @@ from rigd.live.program import LOOPBACK
 
 _PREFIX: Final = "live-"
 _SUFFIX: Final = ".json"
+_MOST_BYTES: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,10 +130,28 @@ def _files() -> Iterator[Path]:
 
 
 def _read(path: Path) -> LiveAddress | None:
+    """Return what a file says, None if it is none of ours: its text ends up on terminals."""
     try:
-        return LiveAddress(**json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError, TypeError):
+        # Anything may lie there, even what blocks whoever opens it.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        with os.fdopen(descriptor, "rb") as file:
+            found = json.loads(file.read(_MOST_BYTES))
+        address = LiveAddress(**found)
+    except (OSError, ValueError, TypeError, RecursionError):
         return None
+    return address if _is_sound(found) else None
+
+
+def _is_sound(found: dict[str, object]) -> bool:
+    """Whether what a file holds can be an address."""
+    rig = found.pop("rig")
+    ports = (found["grpc_port"], found["page_port"])
+    return (
+        isinstance(rig, str)
+        and rig.isprintable()
+        and all(type(number) is int for number in found.values())
+        and all(0 < port < 1 << 16 for port in ports if isinstance(port, int))
+    )
 
 
 def _born(pid: int) -> int | None:

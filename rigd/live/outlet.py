@@ -19,6 +19,8 @@ GRPC_PORT: Final = 9876
 """Rerun's own: where viewers look unless told otherwise, and tunnels can be laid in advance."""
 _BACKLOG: Final = "16MiB"
 """What a viewer that joins late is sent first: some 80 s."""
+_MOST_SESSIONS: Final = 20
+"""Of some 300 kB each that stay, layout and charts; then another server takes its place."""
 _START_S: Final = 4.0
 """In which a server has to take connections."""
 _ANSWER_S: Final = 0.1
@@ -97,6 +99,12 @@ class Outlet:
             return False
         return True
 
+    def begin_session(self) -> None:
+        """Make room for a session: what stays of each, the server never forgets by itself."""
+        self._sessions += 1
+        if self._sessions > _MOST_SESSIONS:
+            self.kill_server()
+
     def kill_server(self) -> None:
         """End the server, which does not answer any more; another one takes its place."""
         self._program.kill()
@@ -120,6 +128,7 @@ class Outlet:
 
     def _start(self) -> None:
         self._started_s = time.monotonic()
+        self._sessions = 0
         self._program = RerunProgram(
             (
                 "--serve-web",

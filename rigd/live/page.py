@@ -9,14 +9,16 @@ server was replaced: viewers do not connect a second time by themselves.
 import http.client
 import json
 import re
+import socket
 import socketserver
 import threading
+import time
 import urllib.parse
 from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Final
+from typing import Any, Final
 
 from rigd.live.address import LiveAddress
 from rigd.live.program import LOOPBACK
@@ -33,7 +35,12 @@ _FILES: Final = frozenset(
 )
 _BLOCK: Final = 65_536
 _PATIENCE_S: Final = 10.0
+_LOOK_S: Final = 0.1
+_LONGEST_S: Final = 60.0
+"""For one connection: the viewer has 40 MB, and the tunnel may be slow."""
 _MOST_AT_ONCE: Final = 16
+_OWN_NAMES: Final = frozenset({LOOPBACK, "localhost"})
+"""Any page on the internet can have its own name lead here; it is not to read what this shows."""
 
 _HERE: Final = f"http://{LOOPBACK}:* http://localhost:*"
 _POLICY: Final = "; ".join(
@@ -98,11 +105,12 @@ class PageServer:
     ) -> None:
         self._server = _Server(port, address, upstream)
         self.port = self._server.server_port
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(_LOOK_S,), daemon=True).start()
 
     def close(self) -> None:
         """Take no more connections."""
-        self._server.socket.close()
+        self._server.shutdown()
+        self._server.server_close()
 
 
 def serve_page(
@@ -117,6 +125,7 @@ def serve_page(
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+    block_on_close = False  # nobody waits for a browser
     # So that the port of a view that has just ended can be taken; not one where somebody listens.
     allow_reuse_address = True
 
@@ -133,6 +142,32 @@ class _Server(ThreadingHTTPServer):
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = LOOPBACK, self.socket.getsockname()[1]
 
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """Take a connection; where that fails for want of descriptors, it would at once again."""
+        try:
+            return super().get_request()
+        except OSError:
+            time.sleep(_LOOK_S)
+            raise
+
+    def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - as there
+        """Answer in a thread, if there is room for one more."""
+        if self.room.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
+        """Answer, and have the connection cut off if that takes too long."""
+        end = threading.Timer(_LONGEST_S, _cut_off, (request,))
+        end.daemon = True
+        end.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            end.cancel()
+            self.room.release()
+
     def handle_error(self, request: object, client_address: object) -> None:
         """Say nothing of a browser that goes away."""
 
@@ -143,13 +178,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a browser."""
-        if not self.server.room.acquire(blocking=False):
-            self._say(HTTPStatus.SERVICE_UNAVAILABLE, "Too many connections at once.")
-            return
-        try:
+        host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        if host in _OWN_NAMES:
             self._answer()
-        finally:
-            self.server.room.release()
+        else:
+            self._say(HTTPStatus.FORBIDDEN, f"Open this page as http://{LOOPBACK}:PORT.")
 
     def log_message(self, *_: object) -> None:
         """Keep quiet: the operator's terminal is for the session."""
@@ -219,6 +252,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _end_headers(self) -> None:
         self.send_header("Content-Security-Policy", _POLICY)
         self.end_headers()
+
+
+def _cut_off(connection: socket.socket) -> None:
+    with suppress(OSError):  # it has just ended by itself
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def kept_here(page: str) -> str:

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from rigd.view.sdk import without_settings
+
 LOOPBACK: Final = "127.0.0.1"
 
 _NOWHERE = f"http://{LOOPBACK}:9"
@@ -61,7 +63,7 @@ class RerunProgram:
         try:
             self._process = subprocess.Popen(
                 command,
-                env={**os.environ, **_QUIET, **(environment or {})},
+                env={**without_settings(os.environ), **_QUIET, **(environment or {})},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,

@@ -22,6 +22,7 @@ from rigd.live.intake import Intake
 from rigd.live.outlet import Outlet
 from rigd.live.program import RerunError
 from rigd.live.vitals import Vitals
+from rigd.view.sdk import settle_sdk
 
 if TYPE_CHECKING:
     from rigd.live.job import LiveJob, LiveSession
@@ -39,12 +40,11 @@ _PARTING_S: Final = 0.3
 
 def main() -> None:
     """Run as ``python -m rigd.live.publisher``."""
-    signals.ignore(but=(signal.SIGTERM,))
+    signals.ignore()
     # The watchdog's signal works whatever this process was started with.
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))
-    # What the SDK has to say about a server that is gone is no news to the operator.
-    os.environ["RUST_LOG"] = "off"
+    settle_sdk()
     parent = Parent()
     job: LiveJob = parent.receive_job()
     channels = attach_channels(job.channels)
@@ -112,6 +112,7 @@ class _Publisher:
     def _begin(self, session: "LiveSession") -> None:
         self._finish(session.begins)
         self._shown = _Shown(session, self._channels)
+        self._outlet.begin_session()
         self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
         self._step()
         self._parent.send(shown=session.recording_id)

@@ -1,6 +1,7 @@
 """Rerun's native viewer, as a window on a live view."""
 
 import contextlib
+from pathlib import Path
 from typing import Final
 
 from rigd.devices.simulator import runtime_folder
@@ -21,6 +22,8 @@ class Viewer:
     ----------
     address
         Of the live view that is shown first.
+    scratch
+        Folder in which Rerun may leave files: it does when it is ended.
     options
         More of the program's command line.
 
@@ -30,7 +33,7 @@ class Viewer:
         If Rerun's program cannot be run.
     """
 
-    def __init__(self, address: LiveAddress, options: tuple[str, ...] = ()) -> None:
+    def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
         self._connections = 0
         self._program = RerunProgram(
             (
@@ -40,7 +43,7 @@ class Viewer:
                 "--hide-welcome-screen",
                 *options,
             ),
-            {"XDG_DATA_HOME": str(runtime_folder() / "viewer")},
+            {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
         )
 
     @property

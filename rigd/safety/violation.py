@@ -18,8 +18,8 @@ class Violation:
         Of the profile, where the limit stands; may be empty.
     below
         The value must not fall below the limit, instead of exceeding it.
-    near
-        The limit was not left yet: only the level of the warning.
+    warning
+        The level that was reached instead, if the limit was not left yet.
     """
 
     channel: str
@@ -29,14 +29,16 @@ class Violation:
     remedy: str = ""
     key: str = ""
     below: bool = False
-    near: bool = False
+    warning: float | None = None
 
     def __str__(self) -> str:
         """Return one or two sentences for the operator."""
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
         left = "is below its limit of" if self.below else "exceeds its limit of"
-        how = "is past its warning level; its limit is" if self.near else left
+        how = left
+        if self.warning is not None:
+            how = f"is past its warning level of {self.warning:.4g} {self.unit}; its limit is"
         where = f" ({self.key})" if self.key else ""
         remedy = f" {self.remedy}" if self.remedy else ""
         return (

@@ -381,12 +381,12 @@ class LimitWatch:
                 near.append(reading)
         if worst is not None:
             self.warning = True
-            return _violation(worst, near=False)
+            return _violation(worst, warns=False)
         for reading in near:
             self.warning = True
             channel = reading[1] or reading[0]
             if channel not in self._warned:
-                self._notices.append(str(_violation(reading, near=True)))
+                self._notices.append(str(_violation(reading, warns=True)))
             self._warned[channel] = self._looks
         return None
 
@@ -402,16 +402,16 @@ def _reading(name: str, value: float, limit: float) -> _Reading:
     return name, "", "", value, limit, _part(name) * limit
 
 
-def _violation(reading: _Reading, *, near: bool) -> Violation:
-    name, channel, unit, value, limit, _ = reading
+def _violation(reading: _Reading, *, warns: bool) -> Violation:
+    name, channel, unit, value, limit, warning = reading
     row = BY_NAME[name]
     return Violation(
         channel or row.channel,
         value,
         limit,
         unit or row.unit,
-        "" if near else row.remedy,
+        "" if warns else row.remedy,
         row.limit,
         below=row.below,
-        near=near,
+        warning=warning if warns else None,
     )

@@ -27,14 +27,14 @@ def find_views(rig: str | None) -> list[LiveAddress]:
     return views
 
 
-def daemons_without_view() -> list[str]:
-    """Return the rigs whose daemons were not asked for a live view."""
+def daemons() -> dict[str, bool]:
+    """Return the rigs that a daemon owns, and whether it was asked for a live view."""
     told = (_status(path) for path in running())
-    return [
-        status["daemon"]["profile"]
+    return {
+        status["daemon"]["profile"]: status["daemon"]["live"]
         for status in told
-        if status is not None and not status["daemon"]["live"]
-    ]
+        if status is not None
+    }
 
 
 def _of_daemon(path: Path) -> LiveAddress | None:

@@ -84,7 +84,7 @@ class RigControl(Protocol):
     ) -> SessionResult:
         """Run one session."""
 
-    def show(self, order: Order) -> str:
+    def show(self, order: Order, stop: StopRequest) -> str:
         """Start its live view."""
 
     def tare(self) -> dict[str, Any]:
@@ -517,7 +517,7 @@ class Service:
             series.session, series.path = number, path
             order = Order(self._profile, excitation, path, tuple(notes.items()))
             if self._live:
-                tell("info", self._rig.show(order))
+                tell("info", self._rig.show(order, series.stop))
             result = self._rig.run(order, series.stop, watcher, self._listens)
             series.results.append(result)
             publish({"event": "session", "number": number, **result.as_dict()})

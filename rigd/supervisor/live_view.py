@@ -2,11 +2,13 @@
 
 import time
 import uuid
+from collections.abc import Callable
 
 from rigd.engine.board import Word
 from rigd.engine.events import Event, Level
 from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import LIVE, Pulse
+from rigd.engine.signals import StopRequest
 from rigd.live.address import LiveAddress
 from rigd.live.job import LiveJob, LiveSession
 from rigd.supervisor.crew import Crew
@@ -47,8 +49,15 @@ class LiveView:
         self._shown = False
         self._start()
 
-    def show(self, order: Order) -> str:
+    def show(self, order: Order, stop: StopRequest) -> str:
         """Show a session that is about to be run.
+
+        Parameters
+        ----------
+        order
+            What is run.
+        stop
+            The operator's: then the view is waited for no longer.
 
         Returns
         -------
@@ -58,17 +67,13 @@ class LiveView:
         self._restarts = 0
         if self._lost:  # perhaps not any more
             self._start()
-        deadline = time.monotonic() + _PATIENCE_S
-        while not (self._heard or self._lost) and time.monotonic() < deadline:
-            self._listen(0.1)
+        self._await(lambda: self._heard, _PATIENCE_S, stop)
         begins = tuple(ring.written for ring in self._crew.channels.rings)
         self._session = LiveSession(subject_of(order), str(uuid.uuid4()), begins)
         self._shown = False
         self._send(session=self._session)
         # So that it is there from the first sample on; a session does not depend on it.
-        deadline = time.monotonic() + _BEGIN_PATIENCE_S
-        while not (self._lost or self._shown) and time.monotonic() < deadline:
-            self._listen(0.1)
+        self._await(lambda: self._shown, _BEGIN_PATIENCE_S, stop)
         if self._lost:
             return f"No live view: {self._lost} The session goes on without it."
         if self.address is None:
@@ -94,6 +99,12 @@ class LiveView:
             self._session = None
             self._send(finish=[ring.written for ring in self._crew.channels.rings])
 
+    def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
+        """Listen until something is met, or cannot be any more, or there is no time for it."""
+        deadline = time.monotonic() + patience_s
+        while not (met() or self._lost or stop.requested) and time.monotonic() < deadline:
+            self._listen(0.1)
+
     def _start(self) -> None:
         """Set a new process to work."""
         self._heard = False
@@ -102,7 +113,7 @@ class LiveView:
         try:
             self._crew.fresh(LIVE)
         except ChildError as error:
-            self._lost = str(error)
+            self._lost, self.address = str(error), None
             return
         self._send(job=self._job)
         if self._session is not None:
@@ -132,7 +143,7 @@ class LiveView:
             return
         if "address" not in answer:
             # It says why it cannot do its work, and ends.
-            self._lost = str(answer.get("error", answer))
+            self._lost, self.address = str(answer.get("error", answer)), None
             if self._session is not None:
                 self._note("warning", f"No live view: {self._lost} The session goes on.")
             return
@@ -151,7 +162,7 @@ class LiveView:
     def _restart(self, why: str) -> None:
         self._restarts += 1
         if self._restarts > _MOST_RESTARTS:
-            self._lost = why
+            self._lost, self.address = why, None
             self._note("warning", f"{why} It is not started again; the session goes on.")
             return
         self._note("warning", f"{why} It is started again; the session goes on.")

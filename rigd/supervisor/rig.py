@@ -10,7 +10,7 @@ from typing import Any
 from rigd.devices.contracts import DeviceError
 from rigd.devices.registry import Reality
 from rigd.devices.resetting import reset_drive
-from rigd.engine.board import Stop, Word
+from rigd.engine.board import Board, Stop, Word
 from rigd.engine.jobs import ControlJob
 from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import CONTROL, LIVE, Pulse
@@ -142,10 +142,7 @@ class Rig:
                 "The zero of the angle was lost with the connection, and the limits with it; move "
                 "the motor to its middle and run rigd zero."
             )
-        board = crew.channels.board
-        board[Word.STOP] = Stop.NO
-        board[Word.GO] = 0
-        board[Word.LIVE_DROPPED] = 0
+        _wipe(crew.channels.board)
         crew.channels.clear()
         session = Session(order, crew, self._told, self._view, watcher, listens)
         try:
@@ -156,16 +153,24 @@ class Rig:
             if session.device_failed:
                 self._await_end()
 
-    def show(self, order: Order) -> str:
+    def show(self, order: Order, stop: StopRequest) -> str:
         """Show a session that is about to be run in the live view.
+
+        Parameters
+        ----------
+        order, stop
+            As for :meth:`run`.
 
         Returns
         -------
         str
             Its address, or why there is none, for the operator.
         """
-        self._require()
-        return "No live view was asked for." if self._view is None else self._view.show(order)
+        crew = self._require()
+        if self._view is None:
+            return "No live view was asked for."
+        _wipe(crew.channels.board)
+        return self._view.show(order, stop)
 
     def tare(self) -> dict[str, Any]:
         """Average the sensor at rest.
@@ -295,6 +300,13 @@ class Rig:
         with contextlib.suppress(ChildError):
             self._crew.control.poll(_ANSWER_PATIENCE_S)
         self.disconnect()
+
+
+def _wipe(board: Board) -> None:
+    """Take from the board what is said to or of one session."""
+    board[Word.STOP] = Stop.NO
+    board[Word.GO] = 0
+    board[Word.LIVE_DROPPED] = 0
 
 
 def _lay_out(crew: Crew, rate_hz: float, *, fast: bool) -> None:

@@ -27,6 +27,7 @@ _BLOCK_S: Final = 1.0
 """Of the session, drawn at a time: as often as the charts are drawn anew."""
 _MOST_SPAN: Final = 10
 """Ticks per sample: what lies between few samples would be made up, and fill the disk."""
+_LAST_UTC_NS: Final = 2**63 - 1
 _PROFILE: Final = "profile.toml"
 """Attachment that tells the nominal damping."""
 _LEVELS: Final = {"complete": "info", "fault": "error"}
@@ -48,6 +49,11 @@ def subject_of_session(session: Session) -> Subject:
     if len(ticks) == 0:
         raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
     first, end = int(ticks[0]), int(ticks[-1]) + 1
+    if session.start_utc_ns > _LAST_UTC_NS:
+        raise SessionError(
+            f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, which "
+            "Rerun cannot show. Whoever writes the file must correct it."
+        )
     if end - first > _MOST_SPAN * len(ticks):
         raise SessionError(
             f"{session.path}: only {len(ticks)} of the {end - first} ticks from {first} to "
@@ -55,13 +61,13 @@ def subject_of_session(session: Session) -> Subject:
         )
     return Subject(
         name=session.metadata.get("id") or session.path.stem,
-        rate_hz=_positive(session, "rate_hz", "Hz"),
+        rate_hz=_within(session, "rate_hz", "Hz", 1.0, 1e5),
         ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
         sweep=session.segments.get("sweep", (first, end)),
         beam=Beam(
-            _positive(session, "beam_length_m", "m"),
-            _positive(session, "beam_density_kg_per_m", "kg/m"),
-            _positive(session, "beam_bending_stiffness_n_m2", "N·m²"),
+            _within(session, "beam_length_m", "m", 1e-3, 1e3),
+            _within(session, "beam_density_kg_per_m", "kg/m", 1e-6, 1e3),
+            _within(session, "beam_bending_stiffness_n_m2", "N·m²", 1e-9, 1e9),
         ),
         damping=nominal_damping(session.attachments.get(_PROFILE, b"")),
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
@@ -163,12 +169,13 @@ def recorded_blueprint(front: "Sequence[rrb.Container]" = ()) -> "rrb.Blueprint"
     )
 
 
-def _positive(session: Session, key: str, unit: str) -> float:
+def _within(session: Session, key: str, unit: str, least: float, most: float) -> float:
+    """Return a number of the file, if a rig can have it."""
     value = session.number(key)
-    if not value > 0.0:
+    if not least <= value <= most:
         raise SessionError(
-            f"{session.path}: {key} is {value:g} {unit}, but must be greater than 0. Whoever "
-            "writes the file must correct it."
+            f"{session.path}: {key} is {value:g} {unit}, but must be from {least:g} to {most:g} "
+            f"{unit}. Whoever writes the file must correct it."
         )
     return value
 

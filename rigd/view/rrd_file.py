@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import stat
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rigd.session.durable import rename_new
 from rigd.view import APPLICATION_ID
+from rigd.view.sdk import settle_sdk
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -36,12 +38,11 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     RrdFileError
         If there is something of that name, or the file cannot be written.
     """
-    # Read when Rerun is first imported: what it has to say of a full disk is told here.
-    os.environ["RUST_LOG"] = "off"
+    settle_sdk()
     import rerun as rr
 
     check_new(path)
-    part = path.with_name(f".{path.name}.part-{os.getpid()}")
+    part = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
     stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
     try:
         with _told(path, part):
@@ -61,15 +62,24 @@ def check_new(path: Path) -> None:
     """Raise RrdFileError if something has that name, or it is no name of such a file."""
     if path.suffix != SUFFIX:
         raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
-    if os.path.lexists(path):
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return  # the folder is made, or why not is told, when the file is written
+    except OSError as error:
         raise RrdFileError(
-            f"{path} exists; choose another name or move it away, nothing is overwritten."
-        )
+            f"{path} cannot be written: {error.strerror}. Choose another name."
+        ) from None
+    raise RrdFileError(
+        f"{path} exists; choose another name or move it away, nothing is overwritten."
+    )
 
 
 def check_rrd_file(path: Path) -> None:
     """Raise RrdFileError if a file is no recording of Rerun's, as far as its beginning tells."""
     try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
         with path.open("rb") as file:
             found = file.read(len(_MAGIC))
     except OSError as error:

@@ -180,7 +180,8 @@ def resident_mb(pid: int) -> float:
 
 
 def _viewer(address: LiveAddress) -> Viewer:
-    return Viewer(address, ("--headless", "--window-size", "640x400"))
+    scratch = Path(tempfile.gettempdir())
+    return Viewer(address, scratch, ("--headless", "--window-size", "640x400"))
 
 
 def main() -> None:

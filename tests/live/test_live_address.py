@@ -106,3 +106,44 @@ def test_a_port_whose_last_connections_are_still_closing_is_free():
             server.accept()[0].close()  # the end that closes first is the one that waits
             assert client.recv(1) == b""
     assert free_port(place[1]) == place[1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"pid": "1\0"},
+        {"pid": 1.0},
+        {"server": None},
+        {"rig": 7},
+        {"rig": "sim\x1b[2J"},
+        {"rig": "sim\n$(reboot)"},
+        {"grpc_port": -5},
+        {"grpc_port": "9876; reboot"},
+        {"page_port": 70_000},
+        {"page_port": True},
+        {"colour": "red"},
+    ],
+)
+def test_what_is_no_address_is_not_believed(address, wrong):
+    announce(address)
+    (file,) = files()
+    file.write_text(json.dumps(json.loads(file.read_text()) | wrong))
+    assert running() == []
+    assert find("antenna can") is None
+
+
+@pytest.mark.parametrize("text", [b"", b"[" * 100_000, b"[1]", b"7", b"\xff", b" " * 10_000])
+def test_what_no_address_can_be_is_none(address, text):
+    announce(address)
+    (file,) = files()
+    file.write_bytes(text)
+    assert running() == []
+
+
+def test_nobody_waits_for_who_never_writes(address):
+    announce(address)
+    (file,) = files()
+    os.mkfifo(file.with_name("live-sim.json"))
+    file.unlink()
+    file.symlink_to("live-sim.json")
+    assert running() == []

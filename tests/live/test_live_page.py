@@ -3,19 +3,21 @@
 import http.client
 import json
 import re
+import socket
+import threading
 
 import pytest
 
-from rigd.live.page import kept_here
+from rigd.live.page import PageServer, kept_here
 
 pytestmark = pytest.mark.xdist_group("realtime")
 
 
-def get(port: int, path: str):
+def get(port: int, path: str, host: str | None = None):
     """Ask the publisher's page server, as a browser does."""
     link = http.client.HTTPConnection("127.0.0.1", port, timeout=30.0)
     try:
-        link.request("GET", path)
+        link.request("GET", path, headers={} if host is None else {"Host": host})
         answer = link.getresponse()
         return answer, answer.read()
     finally:
@@ -65,3 +67,45 @@ def test_links_to_other_computers_are_left_out():
     assert 'href="favicon.ico"' in kept
     assert "fonts.example" not in kept
     assert kept.count("live.json") == 1
+
+
+@pytest.fixture
+def page():
+    """A page of nothing."""
+    server = PageServer(0, lambda: None, lambda: 0)
+    yield server
+    server.close()
+
+
+def test_a_page_of_another_name_reads_nothing(page):
+    """Whose name was made to lead to this computer."""
+    assert get(page.port, "/live.json", "evil.example")[0].status == 403
+    assert get(page.port, "/live.json", f"evil.example:{page.port}")[0].status == 403
+    for host in ("127.0.0.1", "localhost", "localhost:12345"):  # of whatever port the tunnel has
+        assert get(page.port, "/live.json", host)[0].status == 503
+
+
+def test_who_only_connects_takes_but_the_room_there_is(page):
+    idle = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(60)]
+    try:
+        for connection in idle[16:]:
+            connection.settimeout(30.0)
+            assert connection.recv(1) == b""
+        assert sum(t.name.startswith("Thread-") for t in threading.enumerate()) < 40
+    finally:
+        for connection in idle:
+            connection.close()
+
+
+def test_a_connection_does_not_last_for_ever(monkeypatch, page):
+    monkeypatch.setattr("rigd.live.page._LONGEST_S", 0.2)
+    with socket.create_connection(("127.0.0.1", page.port), 30.0) as connection:
+        connection.sendall(b"GET / HTTP/1.0\r\n")  # the end of it never comes
+        assert connection.recv(1) == b""
+
+
+def test_a_page_that_is_closed_leaves_no_thread_at_work(page):
+    page.close()
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.1", page.port), 1.0)
+    assert not [t for t in threading.enumerate() if "serve_forever" in t.name]

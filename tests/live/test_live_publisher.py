@@ -116,19 +116,19 @@ def test_stays_open_for_as_long_as_asked(start_publisher):
     assert publisher.process.wait(60.0) == 0
 
 
-def test_interrupt_is_the_supervisors_business(publisher, gone):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_is_the_supervisors_business(publisher, gone, number):
     server = publisher.server_pid
-    for pid in (publisher.process.pid, server):
-        os.kill(pid, signal.SIGINT)
+    os.kill(publisher.process.pid, number)
+    os.kill(server, signal.SIGINT)
     time.sleep(0.3)
     assert publisher.process.poll() is None
     assert not gone(server)
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
-def test_a_killed_publisher_leaves_no_server(publisher, gone, eventually, end):
+def test_a_killed_publisher_leaves_no_server(publisher, gone, eventually):
     server = publisher.server_pid
-    publisher.process.send_signal(end)
+    publisher.process.kill()
     assert eventually(lambda: gone(server))
 
 

@@ -2,15 +2,19 @@
 
 import os
 import signal
+import threading
+import time
 
 import numpy as np
 import pytest
 
+from rigd.engine.board import Word
 from rigd.engine.signals import StopRequest
 from rigd.excitation.named import make_excitation
 from rigd.live.address import find
 from rigd.profile import load_profile
 from rigd.session import read_session
+from rigd.supervisor import live_view
 from rigd.supervisor.orders import Order
 from rigd.supervisor.rig import Rig
 
@@ -26,22 +30,33 @@ def rig(write_profile, runtime_folder):
 
 
 @pytest.fixture
-def run(rig, tmp_path):
-    """Run a session under the virtual clock; returns its result and what the operator was told."""
+def order(rig, tmp_path):
+    """Return the order for a session."""
 
-    def run(name: str, duration_s: float = 5.0, meanwhile=lambda progress: None):
+    def order(name: str, duration_s: float = 5.0) -> Order:
         profile = rig._profile
         excitation = make_excitation(
             "hold", {"duration_s": duration_s, "rest_s": 0.0}, profile.rig.rate_hz
         )
-        order = Order(profile, excitation, tmp_path / f"{name}.mcap")
-        told = [rig.show(order)]
+        return Order(profile, excitation, tmp_path / f"{name}.mcap")
+
+    return order
+
+
+@pytest.fixture
+def run(rig, order):
+    """Run a session under the virtual clock; returns its result and what the operator was told."""
+
+    def run(name: str, duration_s: float = 5.0, meanwhile=lambda progress: None):
+        given = order(name, duration_s)
+        stop = StopRequest()
+        told = [rig.show(given, stop)]
 
         def watch(progress, events) -> None:
             told.extend(event.message for event in events)
             meanwhile(progress)
 
-        return rig.run(order, StopRequest(), watch), told
+        return rig.run(given, stop, watch), told
 
     return run
 
@@ -68,6 +83,26 @@ def test_a_series_has_one_view_which_gets_every_sample(rig, run, save, eventuall
             and np.allclose(torque_nm[:, 0], samples["coupling_torque_nm"], rtol=0.0, atol=1e-12)
             for time_ns, torque_nm in shown
         )
+
+
+def test_a_view_that_does_not_begin_holds_no_stop_up(rig, order):
+    (pid,) = [process.pid for process in rig.status().processes if process.name == "live"]
+    os.kill(pid, signal.SIGSTOP)
+    stop = StopRequest()
+    threading.Timer(0.3, stop.request).start()
+    began_s = time.monotonic()
+    told = rig.show(order("held up"), stop)
+    assert stop.requested
+    assert time.monotonic() - began_s < live_view._PATIENCE_S
+    assert told.startswith("The live view takes its time to start")
+
+
+def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
+    run("first")
+    board = rig._crew.channels.board
+    assert board[Word.GO]
+    rig.show(order("second"), StopRequest())
+    assert board[Word.GO] == 0
 
 
 def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run, eventually):

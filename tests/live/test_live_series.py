@@ -59,6 +59,20 @@ def test_sessions_leave_nothing_behind(publisher, eventually):
     assert resident_mb(pid) < before_mb + 10.0
 
 
+def test_a_server_that_has_seen_many_sessions_makes_room(start_publisher, receive, eventually):
+    publisher = start_publisher(first="from rigd.live import outlet; outlet._MOST_SESSIONS = 2")
+    first = publisher.address
+    publisher.finish()
+    run_session(publisher, "second", eventually)
+    run_session(publisher, "third", eventually)
+    address = publisher.next_address()
+    assert address.server != first.server
+    assert address.grpc_port == first.grpc_port
+    *_, (recording, columns) = receive(publisher)()
+    assert recording.recording_id == "recording of third"
+    assert columns("/signals", "angle_mrad")[0].size > 100
+
+
 def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_on(
     start_producer, start_publisher, receive, eventually
 ):

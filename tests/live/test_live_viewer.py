@@ -14,8 +14,8 @@ NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vu
 
 
 @pytest.fixture
-def viewer(publisher, eventually):
-    window = Viewer(publisher.address, ("--headless", "--window-size", "320x200"))
+def viewer(publisher, tmp_path, eventually):
+    window = Viewer(publisher.address, tmp_path, ("--headless", "--window-size", "320x200"))
     if not eventually(lambda: window.control_url or window.exit_code is not None):
         pytest.fail(window.last_words)
     yield window

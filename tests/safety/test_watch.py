@@ -137,10 +137,10 @@ def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
     assert watch.check(0.0, 0.0, REST) is None
     assert watch.warning
     lag, disk = watch.take_notices()
-    assert "recorder's lag of 7.2 s is past its warning level; its limit is 12 s" in lag
+    assert "recorder's lag of 7.2 s is past its warning level of 6 s; its limit is 12 s" in lag
     assert (
-        "free space of the session's disk of 400 MB is past its warning level; its limit is 50 MB"
-        in disk
+        "free space of the session's disk of 400 MB is past its warning level of 500 MB; its limit "
+        "is 50 MB" in disk
     )
 
 
@@ -175,7 +175,8 @@ def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
     assert not watch.warning
     [notice] = watch.take_notices()
     assert notice.startswith(
-        "The run of missed ticks of 22 ticks is past its warning level; its limit is 25 ticks"
+        "The run of missed ticks of 22 ticks is past its warning level of 20 ticks; its limit is "
+        "25 ticks"
     )
 
 
