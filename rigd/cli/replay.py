@@ -37,7 +37,8 @@ def replay(
     Example: rigd replay sessions/20261120-101500-chirp.mcap
     """
     if save is not None:
-        _save(path, save, web=web)
+        with ended_gently():
+            _save(path, save, web=web)
         return
     if not web and not has_screen():
         elsewhere = (

@@ -43,3 +43,20 @@ class LiveSession:
     subject: Subject
     recording_id: str
     begins: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LiveEnd:
+    """The end of a session that is shown.
+
+    Attributes
+    ----------
+    ends
+        How many records each ring had then, as :attr:`LiveSession.begins`.
+    outcome, reason
+        How the session ended, if that is known.
+    """
+
+    ends: tuple[int, ...]
+    outcome: str = ""
+    reason: str = ""

@@ -111,10 +111,11 @@ class Outlet:
 
     def close(self) -> None:
         """End the server, and what leads to it."""
-        if self._announced is not None:
-            withdraw(self._announced)
-        self._page.close()
         self._program.kill()
+        self._page.close()
+        if self._announced is not None:
+            with contextlib.suppress(OSError):  # who looks there sees that its process has ended
+                withdraw(self._announced)
 
     def _replace(self) -> None:
         """Start another server: on the same port, where viewers and tunnels look for it.

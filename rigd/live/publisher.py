@@ -8,7 +8,6 @@ ends when its standard input does, and takes the server along.
 import os
 import signal
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
@@ -19,9 +18,11 @@ from rigd.engine.process import Message, Parent
 from rigd.live.backlog import Backlog
 from rigd.live.feed import Feed
 from rigd.live.intake import Intake
+from rigd.live.job import LiveEnd
 from rigd.live.outlet import Outlet
 from rigd.live.program import RerunError
 from rigd.live.vitals import Vitals
+from rigd.view.notes import outcome_note
 from rigd.view.sdk import settle_sdk
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ class _Publisher:
                 break
             if message is not None:
                 self._obey(message)
-        self._finish([ring.written for ring in self._channels.rings])
+        self._finish(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
 
     def linger(self, linger_s: float) -> None:
         """Leave viewers the time to show the last of it, and to look at it."""
@@ -110,16 +111,16 @@ class _Publisher:
             self._finish(message["finish"])
 
     def _begin(self, session: "LiveSession") -> None:
-        self._finish(session.begins)
+        self._finish(LiveEnd(session.begins))
         self._shown = _Shown(session, self._channels)
         self._outlet.begin_session()
         self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
         self._step()
         self._parent.send(shown=session.recording_id)
 
-    def _finish(self, ends: Sequence[int]) -> None:
+    def _finish(self, end: LiveEnd) -> None:
         if self._shown is not None and not self._shown.over:
-            self._shown.finish(ends)
+            self._shown.finish(end)
             self._step()
 
     def _step(self) -> None:
@@ -170,11 +171,15 @@ class _Shown:
         self.backlog.put(drawings, harvest.samples)
         self._board[Word.LIVE_DROPPED] = self.dropped
 
-    def finish(self, ends: Sequence[int]) -> None:
+    def finish(self, end: LiveEnd) -> None:
         """Take the rest of it, and what can only be known at its end."""
-        self.intake.end(ends)
+        self.intake.end(end.ends)
         self.gather()
-        self.backlog.owe(self.intake.picture.finish())
+        picture = self.intake.picture
+        if end.outcome:
+            note = outcome_note(self.intake.t_ns, end.outcome, end.reason)
+            self.backlog.owe(picture.events([note]))
+        self.backlog.owe(picture.finish())
         self.over = True
 
     def send(self, feed: Feed, *, connected: bool) -> None:

@@ -1,6 +1,7 @@
 """Rerun's native viewer, as a window on a live view."""
 
 import contextlib
+import threading
 from pathlib import Path
 from typing import Final
 
@@ -10,6 +11,7 @@ from rigd.live.program import RerunProgram
 
 _MOST_MEMORY: Final = "2GiB"
 """Then the oldest is forgotten; the same computer may be running the loop."""
+_ANSWER_S: Final = 5.0
 _HOSTS: Final = ("127.0.0.1", "localhost")
 
 
@@ -35,6 +37,7 @@ class Viewer:
 
     def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
         self._connections = 0
+        self._connecting: threading.Thread | None = None
         self._program = RerunProgram(
             (
                 *("--connect", self._next_url(address)),
@@ -74,24 +77,18 @@ class Viewer:
         of the same place. Earlier sessions are forgotten: it would go to the first of them instead
         of staying with the one that is shown.
         """
-        from rerun.experimental import ViewerClient
-
-        if not self.control_url:
+        if not self.control_url or (self._connecting and self._connecting.is_alive()):
             return False
         self._connections += 1
         url = self._next_url(address)
-        try:
-            client = ViewerClient.connect(self.control_url)
-            state = client.get_state()
-            earlier = [r.store_id for r in state.recordings if r.store_id != state.active_recording]
-            if earlier:
-                client.close(store_ids=earlier)
-            with contextlib.suppress(ConnectionError):  # nothing came from there
-                client.close(url)
-            client.open(url)
-        except (OSError, RuntimeError):  # it is busy, or about to end
-            return False
-        return True
+        done: list[bool] = []
+        # A window that is frozen never answers, and who waits for it in here hears no Ctrl-C.
+        self._connecting = threading.Thread(
+            target=_have_it_connect, args=(self.control_url, url, done), daemon=True
+        )
+        self._connecting.start()
+        self._connecting.join(_ANSWER_S)
+        return any(done)
 
     def close(self) -> None:
         """Close the window."""
@@ -99,3 +96,21 @@ class Viewer:
 
     def _next_url(self, address: LiveAddress) -> str:
         return proxy_url(_HOSTS[self._connections % len(_HOSTS)], address.grpc_port)
+
+
+def _have_it_connect(control_url: str, url: str, done: list[bool]) -> None:
+    """Have a viewer go on to another server; `done` gets an item if it did."""
+    from rerun.experimental import ViewerClient
+
+    try:
+        client = ViewerClient.connect(control_url)
+        state = client.get_state()
+        earlier = [r.store_id for r in state.recordings if r.store_id != state.active_recording]
+        if earlier:
+            client.close(store_ids=earlier)
+        with contextlib.suppress(ConnectionError):  # nothing came from there
+            client.close(url)
+        client.open(url)
+    except (OSError, RuntimeError):  # it is busy, or about to end
+        return
+    done.append(True)

@@ -10,7 +10,7 @@ from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import LIVE, Pulse
 from rigd.engine.signals import StopRequest
 from rigd.live.address import LiveAddress
-from rigd.live.job import LiveJob, LiveSession
+from rigd.live.job import LiveEnd, LiveJob, LiveSession
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.orders import Order
 from rigd.view.subject import Subject
@@ -93,11 +93,12 @@ class LiveView:
         told, self._untold = self._untold, []
         return told
 
-    def finish(self) -> None:
-        """Take note of the end of the session that is shown."""
+    def finish(self, outcome: str, reason: str) -> None:
+        """Take note of the end of the session that is shown; how it ended may be unknown."""
         if self._session is not None:
             self._session = None
-            self._send(finish=[ring.written for ring in self._crew.channels.rings])
+            ends = tuple(ring.written for ring in self._crew.channels.rings)
+            self._send(finish=LiveEnd(ends, outcome, reason))
 
     def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
         """Listen until something is met, or cannot be any more, or there is no time for it."""

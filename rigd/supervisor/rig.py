@@ -145,11 +145,14 @@ class Rig:
         _wipe(crew.channels.board)
         crew.channels.clear()
         session = Session(order, crew, self._told, self._view, watcher, listens)
+        outcome = reason = ""
         try:
-            return session.run(stop)
+            result = session.run(stop)
+            outcome, reason = result.outcome, result.reason
+            return result
         finally:
             if self._view is not None:
-                self._view.finish()
+                self._view.finish(outcome, reason)
             if session.device_failed:
                 self._await_end()
 

@@ -20,3 +20,11 @@ class Note:
     t_ns: int
     level: str
     message: str
+
+
+def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
+    """Return the last line of a session's log: how it ended, at the time of its last sample."""
+    return Note(t_ns, _LEVELS.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip())
+
+
+_LEVELS = {"complete": "info", "fault": "error"}

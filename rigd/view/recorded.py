@@ -12,7 +12,7 @@ from rigd.session import Session, SessionError
 from rigd.session.format import Status
 from rigd.view.health import Health
 from rigd.view.layout import blueprint
-from rigd.view.notes import Note
+from rigd.view.notes import Note, outcome_note
 from rigd.view.picture import Picture
 from rigd.view.plots import TIMELINE
 from rigd.view.subject import Subject
@@ -30,8 +30,6 @@ _MOST_SPAN: Final = 10
 _LAST_UTC_NS: Final = 2**63 - 1
 _PROFILE: Final = "profile.toml"
 """Attachment that tells the nominal damping."""
-_LEVELS: Final = {"complete": "info", "fault": "error"}
-"""Of the log, for outcomes; any other is a warning."""
 
 
 def subject_of_session(session: Session) -> Subject:
@@ -187,9 +185,7 @@ def _notes(session: Session) -> Iterator[Note]:
     if session.outcome is not None:
         outcome = session.outcome.get("outcome", "unknown")
         reason = session.outcome.get("reason", "")
-        level = _LEVELS.get(outcome, "warning")
-        message = f"Outcome: {outcome}. {reason}".rstrip()
-        yield Note(int(session.samples["t_ns"][-1]), level, message)
+        yield outcome_note(int(session.samples["t_ns"][-1]), outcome, reason)
 
 
 def _counts(samples: Records) -> npt.NDArray[np.int64]:

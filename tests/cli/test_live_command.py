@@ -188,6 +188,14 @@ def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read
     assert rigd_here("live", "--web").returncode == 1
 
 
+def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
+    monkeypatch.setattr("rigd.service.live_views.daemons", lambda: {"sim": True})
+    done = rigd_here("live")
+    assert done.returncode == 1
+    assert "The daemon of the rig sim has no live view at the moment" in done.stderr
+    assert "rigd live --wait" in done.stderr
+
+
 def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd, eventually):
     serve = start_rigd("serve", "--profile", "sim", "--fast")
     assert eventually(lambda: rigd_here("status").returncode == 0)

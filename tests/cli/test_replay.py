@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -22,7 +23,7 @@ import pytest
 from analysis.estimate import estimate
 from analysis.record import load_record
 from analysis.settings import WelchSettings
-from rigd.session import SessionWriter, Status, read_session
+from rigd.session import SessionError, SessionWriter, Status, read_session
 from rigd.session.format import (
     SAMPLE_SIZE,
     TIMING_SIZE,
@@ -386,11 +387,34 @@ def test_files_that_cannot_be_shown_are_told(rigd_here, short, write, tmp_path):
     refused(rigd_here("replay", sparse, *out), 1, "only 100 of the 99001 ticks")
     still = write("still.mcap", np.arange(100), metadata={"beam_length_m": "0"})
     refused(rigd_here("replay", still, *out), 1, "beam_length_m is 0 m")
+    quick = write("quick.mcap", np.arange(100), metadata={"rate_hz": "1e9"})
+    refused(rigd_here("replay", quick, *out), 1, "rate_hz is 1e+09 Hz, but must be from 1 to")
     false = tmp_path / "false.rrd"
     false.write_text("no recording")
     refused(rigd_here("replay", false, "--web"), 1, "no recording of Rerun's")
     refused(rigd_here("replay", tmp_path / "none.rrd", "--web"), 1, "none.rrd cannot be read")
+    os.mkfifo(tmp_path / "pipe.rrd")
+    refused(rigd_here("replay", tmp_path / "pipe.rrd", "--web"), 1, "pipe.rrd is not a file")
+    long = tmp_path / f"{'x' * 300}.rrd"
+    refused(rigd_here("replay", short, "--save", long), 2, "cannot be written: File name too long")
     assert not (tmp_path / "out.rrd").exists()
+
+
+def test_what_is_set_for_programs_of_ones_own_is_no_matter(rigd_here, short, tmp_path, monkeypatch):
+    monkeypatch.setenv("RERUN", "off")
+    monkeypatch.setenv("_RERUN_TEST_FORCE_SAVE", str(tmp_path / "elsewhere.rrd"))
+    monkeypatch.setenv("RERUN_FLUSH_NUM_BYTES", "one")
+    out = tmp_path / f"{'x' * 250}.rrd"  # as long as a name can be
+    done = rigd_here("replay", short, "--save", out)
+    assert done.returncode == 0, done.stderr
+    assert chunks(out)["/signals"]
+    assert not (tmp_path / "elsewhere.rrd").exists()
+
+
+def test_a_start_after_all_times_is_told(short):
+    late = replace(read_session(short), start_utc_ns=2**63)
+    with pytest.raises(SessionError, match="start_utc_ns is 9223372036854775808 ns, after"):
+        subject_of_session(late)
 
 
 def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
@@ -417,6 +441,9 @@ def test_without_a_screen_it_says_what_else_there_is(rigd_here, short, monkeypat
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     refused(rigd_here("replay", short), 1, "no screen", "--web", "--save")
+    recording = rigd_here("replay", "seen.rrd")
+    refused(recording, 1, "no screen", "--web")
+    assert "--save" not in recording.stderr
 
 
 def test_a_window_that_cannot_be_opened_is_told(rerun_program, short, tmp_path):

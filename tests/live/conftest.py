@@ -22,7 +22,7 @@ from rigd.engine.process import packed_object
 from rigd.engine.ring import Ring, shared_memory_fd
 from rigd.engine.topics import TOPICS
 from rigd.live.address import LiveAddress
-from rigd.live.job import LiveJob, LiveSession
+from rigd.live.job import LiveEnd, LiveJob, LiveSession
 from rigd.session.format import pack_sample_into, pack_timing_into
 from rigd.view.subject import Subject
 
@@ -144,7 +144,8 @@ class Publisher:
 
     def finish(self) -> None:
         """Tell it that the session is over."""
-        self.send("finish", [ring.written for ring in self.producer.channels.rings])
+        ends = tuple(ring.written for ring in self.producer.channels.rings)
+        self.send("finish", LiveEnd(ends, "stopped", "The test is over."))
 
     def send(self, name: str, value: object) -> None:
         send_object(self.process.stdin, name, value)

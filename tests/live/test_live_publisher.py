@@ -83,6 +83,7 @@ def test_every_record_arrives_in_the_units_of_the_plots(publisher, producer, rec
     assert np.allclose(age_ms, [0.5, 1.5])
     _, lines = columns("/events", "TextLog:text")
     assert lines[0] == ["Record starts"]
+    assert lines[-1] == ["Outcome: stopped. The test is over."]
     health_ns, dropped = columns("/health", "backlog_samples")
     assert len(health_ns) >= 1
     assert dropped[-1, 1] == 0

@@ -47,9 +47,9 @@ def order(rig, tmp_path):
 def run(rig, order):
     """Run a session under the virtual clock; returns its result and what the operator was told."""
 
-    def run(name: str, duration_s: float = 5.0, meanwhile=lambda progress: None):
+    def run(name: str, duration_s: float = 5.0, meanwhile=lambda progress: None, stop=None):
         given = order(name, duration_s)
-        stop = StopRequest()
+        stop = stop or StopRequest()
         told = [rig.show(given, stop)]
 
         def watch(progress, events) -> None:
@@ -103,6 +103,24 @@ def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
     assert board[Word.GO]
     rig.show(order("second"), StopRequest())
     assert board[Word.GO] == 0
+
+
+def test_how_a_session_ended_is_shown(rig, run, save, eventually):
+    stop_at = StopRequest()
+
+    def stop(progress) -> None:
+        if progress.tick > 1000:
+            stop_at.request()
+
+    run("before")
+    saver = save(rig.status().live_view.proxy_url)
+    result, _ = run("stopped", 60.0, stop, stop_at)
+    assert eventually(saver.has_all)
+    rig.disconnect()
+    *_, (_, columns) = saver.recordings()
+    _, lines = columns("/events", "TextLog:text")
+    assert lines[-1] == [f"Outcome: {result.outcome}. {result.reason}"]
+    assert result.outcome == "stopped"
 
 
 def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run, eventually):

@@ -70,3 +70,15 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s, sockets, eve
     assert eventually(lambda: shown_s() > then_s)
     assert eventually(current)
     assert publisher.producer.refused == 0
+
+
+def test_a_window_that_does_not_answer_is_waited_for_by_nobody(
+    publisher, viewer, shown_s, eventually, monkeypatch
+):
+    assert eventually(lambda: shown_s() > 0.5)
+    monkeypatch.setattr("rigd.live.viewer._ANSWER_S", 0.5)
+    os.kill(viewer.pid, signal.SIGSTOP)
+    assert not viewer.connect(publisher.address)
+    assert not viewer.connect(publisher.address), "one at a time"
+    os.kill(viewer.pid, signal.SIGCONT)
+    assert eventually(lambda: viewer.connect(publisher.address))
