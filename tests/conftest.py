@@ -2,6 +2,8 @@
 
 import atexit
 import contextlib
+import fcntl
+import json
 import os
 import re
 import shutil
@@ -203,3 +205,23 @@ def start_simulator(runtime_folder, tmp_path):
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+@pytest.fixture(scope="session")
+def paper_session(tmp_path_factory, request):
+    """The paper's session on the simulated rig as shipped: its file, and what the command told.
+
+    Made once for all workers, by whoever comes first.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if hasattr(request.config, "workerinput"):
+        folder = folder.parent
+    told = folder / "paper_session.json"
+    with (folder / "paper_session.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not told.exists():
+            command = [RIGD, "run", "chirp", "--fast", "--json", "--output", folder / "paper"]
+            done = subprocess.run(command, check=True, capture_output=True, text=True)
+            told.write_text(done.stdout)
+    (session,) = json.loads(told.read_text())["sessions"]
+    return Path(session["path"]), session

@@ -6,8 +6,6 @@ them: encoder steps of 7e-5 rad, torque noise of 5e-3 N·m and steps of 1.25e-4 
 """
 
 import csv
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -121,15 +119,9 @@ def synthetic_frf(sweep, plant) -> FrequencyResponse:
 
 
 @pytest.fixture(scope="session")
-def shipped_frf(tmp_path_factory) -> FrequencyResponse:
+def shipped_frf(paper_session) -> FrequencyResponse:
     """Welch's estimate of a session that the rig recorded with the simulation as shipped."""
-    folder = tmp_path_factory.mktemp("rig")
-    rigd = Path(sys.executable).with_name("rigd")
-    subprocess.run(
-        [rigd, "run", "chirp", "--fast", "--output", folder], check=True, capture_output=True
-    )
-    (path,) = folder.glob("*.mcap")
-    session = read_session(path)
+    session = read_session(paper_session[0])
     samples = session.samples[slice(*session.segments["sweep"])]
     return Sweep(samples["angle_rad"], samples["coupling_torque_nm"]).welch()
 

@@ -25,12 +25,12 @@ def the_session(done):
     return session
 
 
-def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(rigd, tmp_path):
-    session = the_session(rigd("run", "chirp", "--fast", "--json", "--output", "out"))
+def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_session):
+    path, session = paper_session
     assert session["outcome"] == "complete"
     assert session["scheduled"] == session["recorded"] == 136_000
     assert session["missed"] == session["lost"] == session["late"] == 0
-    record = read_session(tmp_path / session["path"])
+    record = read_session(path)
     assert record.outcome["outcome"] == "complete"
     assert record.outcome["recorded"] == "136000"
     assert record.segments == {
@@ -47,9 +47,9 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(rigd, t
     chirp = 0.025 * np.sin(2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 240))
     reference = samples["angle_reference_rad"] - samples["angle_reference_rad"][0]
     assert np.abs(reference[1000:121_000] - chirp).max() < 1e-12
-    assert read_controls(tmp_path / session["path"]).size == 13_600
+    assert read_controls(path).size == 13_600
     assert record.attachments["profile.toml"].decode().startswith("# The simulated rig")
-    assert not list((tmp_path / "out").glob("*.part"))
+    assert not list(path.parent.glob("*.part"))
 
     assert np.abs(samples["torque_command_nm"]).max() < 0.9
     spectrum = np.abs(np.fft.rfft(samples["coupling_torque_nm"][1000:121_000]))

@@ -1,6 +1,5 @@
 """Everything that is shown of a session, from the samples of a whole one."""
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -25,13 +24,8 @@ RIGD = Path(sys.executable).parent / "rigd"
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    """The paper's session on the simulated rig."""
-    folder = tmp_path_factory.mktemp("session")
-    command = [RIGD, "run", "chirp", "--profile", "sim", "--fast", "--output", folder]
-    subprocess.run(command, check=True, capture_output=True, timeout=100)
-    (path,) = folder.glob("*.mcap")
-    return path
+def path(paper_session):
+    return paper_session[0]
 
 
 @pytest.fixture(scope="module")
