@@ -51,8 +51,8 @@ def subject_of_session(session: Session) -> Subject:
     first, end = int(ticks[0]), int(ticks[-1]) + 1
     if session.start_utc_ns > _LAST_UTC_NS:
         raise SessionError(
-            f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, which "
-            "Rerun cannot show. Whoever writes the file must correct it."
+            f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
+            "which Rerun cannot show. Whoever writes the file must correct it."
         )
     if end - first > _MOST_SPAN * len(ticks):
         raise SessionError(
