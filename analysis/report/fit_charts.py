@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle
 from typing import TYPE_CHECKING, Final
 
@@ -41,6 +41,8 @@ _HALF: Final = (640.0, 262.0)
 _LINES: Final[dict[str, tuple[Color, float]]] = {"const": (ORANGE, 3.0), "omega": (VERMILION, 1.5)}
 """Colour and width; the narrower lies over the wider, for the two are often alike."""
 _MORE_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
+_MOST_IN_WORDS: Final = 2
+"""Models whose keys on a narrow chart say that what they name are weights."""
 _GROUPS: Final = 400
 """Of points along the axis, two kept of each: enough for the pixels of a view."""
 _DOT: Final = 1.0
@@ -235,6 +237,12 @@ def _type_page(
             )
 
     used = [keys[model.fit.weighting] for model in models]
+    # Shorter on the narrow charts: in full they would run into the title of the axis.
+    form = "weights {}" if len(models) <= _MOST_IN_WORDS else "{}"
+    short = [
+        replace(keys[model.fit.weighting], label=form.format(model.fit.weighting))
+        for model in models
+    ]
     residuals = [
         Line(
             _plain(model.fit.weighting),
@@ -256,12 +264,14 @@ def _type_page(
         (
             Graph(
                 "Phase",
-                _chart(analysis, f"{entity}/phase", _HALF, _PHASE),
+                _chart(analysis, f"{entity}/phase", _HALF, _PHASE, MEASURED, *short),
                 tuple(lines(phase_deg, dotted=True)),
             ),
             Graph(
                 "Residual, measured − model",
-                _chart(analysis, f"{entity}/residual", _HALF, _decibels(analysis), _SIZE_DB),
+                _chart(
+                    analysis, f"{entity}/residual", _HALF, _decibels(analysis), _SIZE_DB, *short
+                ),
                 (Line("measured", _SIZE_DB, magnitude_db(measured)), *residuals),
             ),
         ),

@@ -182,6 +182,24 @@ class Chart:
             static=static,
         )
 
+    def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
+        """Write a text into the middle of the frame; an empty one takes it away."""
+        import rerun as rr
+
+        left, top, right, bottom = self.frame
+        middle = [(left + right) / 2, (top + bottom) / 2 - _LABEL_DROP]
+        stream.log(
+            f"{self.entity}/note",
+            rr.Points2D(
+                [middle] if text else [],
+                labels=[text] if text else [],
+                colors=[color],
+                radii=0.0,
+                show_labels=True,
+                draw_order=40.0,
+            ),
+        )
+
     def draw_shade(self, stream: "RecordingStream", name: str) -> None:
         """Draw what `move_shade` moves: two-dimensional views fill nothing but images."""
         import rerun as rr

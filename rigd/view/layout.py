@@ -3,7 +3,8 @@
 Rerun's plots have no axis titles: the unit stands in the title of the view and in the legend.
 """
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 from rigd.view import antenna, plots
 from rigd.view.log import EVENTS
@@ -15,6 +16,8 @@ from rigd.view.summary import SUMMARY
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import VisualizerComponentMapping
+    from rerun.datatypes import EntityPath
 
 WINDOW_S = 10.0
 """Time shown up to the cursor; a viewer's load grows with it, not with the session."""
@@ -24,6 +27,58 @@ CLOSE_UP_S = 2.0
 
 HISTORY_S = 60.0
 """Time shown of what comes a few times a second only."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeView:
+    """A plot over time in one of the tabs.
+
+    Attributes
+    ----------
+    source, plot
+        What it shows.
+    window_s
+        Time shown up to the cursor.
+    height
+        Of what its axes enclose, in points, in a window of 1280 × 800.
+    """
+
+    source: Source
+    plot: Plot
+    window_s: float
+    height: float
+
+    @property
+    def ticks(self) -> str:
+        """What Rerun calls the values that stand beside the axis and are to be in the picture."""
+        return f"{self.plot.component}_ticks_{self.window_s:g}_s"
+
+
+_THREE_ROWS: Final = 189.0
+_FOUR_ROWS: Final = 131.0
+"""Heights of the plots of a tab."""
+
+OVERVIEW: Final = tuple(
+    TimeView(plots.SIGNALS, plot, WINDOW_S, _THREE_ROWS)
+    for plot in (plots.ANGLE, plots.COUPLING_TORQUE, plots.TRACKING_ERROR)
+)
+SIGNALS: Final = tuple(
+    TimeView(plots.SIGNALS, plot, CLOSE_UP_S, _THREE_ROWS)
+    for plot in (
+        plots.ANGLE,
+        plots.TRACKING_ERROR,
+        plots.COUPLING_TORQUE,
+        plots.TORQUE_COMMAND,
+        plots.FORCES,
+        plots.TORQUES,
+    )
+)
+HEALTH: Final = (
+    TimeView(plots.SIGNALS, plots.LOOP, WINDOW_S, _FOUR_ROWS),
+    TimeView(plots.READINGS, plots.AGES, WINDOW_S, _FOUR_ROWS),
+    *(TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROWS) for plot in plots.HEALTH.plots),
+)
+TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
 
 TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
 
@@ -54,12 +109,7 @@ def _overview() -> "rrb.Container":
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Vertical(
-            *(
-                _plot(plots.SIGNALS, plot, WINDOW_S)
-                for plot in (plots.ANGLE, plots.COUPLING_TORQUE, plots.TRACKING_ERROR)
-            )
-        ),
+        rrb.Vertical(*map(_plot, OVERVIEW)),
         rrb.Vertical(
             _chart(
                 "Frequency response, torque over angle",
@@ -78,20 +128,7 @@ def _overview() -> "rrb.Container":
 def _signals() -> "rrb.Container":
     import rerun.blueprint as rrb
 
-    return rrb.Grid(
-        *(
-            _plot(plots.SIGNALS, plot, CLOSE_UP_S)
-            for plot in (
-                plots.ANGLE,
-                plots.TRACKING_ERROR,
-                plots.COUPLING_TORQUE,
-                plots.TORQUE_COMMAND,
-                plots.FORCES,
-                plots.TORQUES,
-            )
-        ),
-        grid_columns=2,
-    )
+    return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
 
 
 def _frequency_response() -> "rrb.Container":
@@ -117,12 +154,7 @@ def _health() -> "rrb.Container":
     import rerun.blueprint as rrb
 
     return rrb.Horizontal(
-        rrb.Grid(
-            _plot(plots.SIGNALS, plots.LOOP, WINDOW_S),
-            _plot(plots.READINGS, plots.AGES, WINDOW_S),
-            *(_plot(plots.HEALTH, plot, HISTORY_S) for plot in plots.HEALTH.plots),
-            grid_columns=2,
-        ),
+        rrb.Grid(*map(_plot, HEALTH), grid_columns=2),
         _summary(),
         column_shares=[7, 2],
     )
@@ -134,11 +166,11 @@ def _events() -> "rrb.Container":
     return rrb.Vertical(_log())
 
 
-def _plot(source: Source, plot: Plot, window_s: float) -> "rrb.TimeSeriesView":
+def _plot(view: TimeView) -> "rrb.TimeSeriesView":
     import rerun as rr
     import rerun.blueprint as rrb
-    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
+    plot = view.plot
     lines = rr.SeriesLines(
         names=[curve.label for curve in plot.curves],
         colors=[curve.color for curve in plot.curves],
@@ -146,21 +178,36 @@ def _plot(source: Source, plot: Plot, window_s: float) -> "rrb.TimeSeriesView":
         # The default averages what falls on one pixel, and so understates peaks.
         aggregation_policy="MinMax",
     )
-    values = VisualizerComponentMapping(
-        "Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=plot.component
+    # Not seen, but within the axis. The legend has one entry for all that is called the same.
+    ticks = rr.SeriesPoints(
+        names=[plot.curves[0].label], colors=[plot.curves[0].color], marker_sizes=[0.0]
     )
-    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-window_s)
+    visualizers: dict[EntityPath | str, rrb.Visualizer] = {
+        view.source.entity: lines.visualizer(mappings=[_values(plot.component)])
+    }
+    if plot.span is None:
+        visualizers[view.source.ticks] = ticks.visualizer(mappings=[_values(view.ticks)])
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-view.window_s)
     end = rrb.TimeRangeBoundary.cursor_relative()
     return rrb.TimeSeriesView(
         name=plot.title,
-        origin=source.entity,
-        overrides={source.entity: lines.visualizer(mappings=[values])},
+        origin=view.source.entity,
+        contents=[str(entity) for entity in visualizers],
+        overrides=visualizers,
         # The title says it all where there is but one curve.
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot.curves) > 1),
         # Left to itself it shows a minute round the cursor, half of it yet to come.
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
         axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
         time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
+    )
+
+
+def _values(component: str) -> "VisualizerComponentMapping":
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+
+    return VisualizerComponentMapping(
+        "Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=component
     )
 
 

@@ -11,11 +11,12 @@ import numpy.typing as npt
 from rigd.spectral import RunningSpectrogram
 from rigd.view.antenna import Antenna
 from rigd.view.health import Health, health_record
-from rigd.view.layout import blueprint
+from rigd.view.layout import TIME_VIEWS, blueprint
 from rigd.view.log import send_note
 from rigd.view.notes import Note
-from rigd.view.plots import HEALTH, READINGS, SIGNALS, Source
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, Source, send_columns
 from rigd.view.response_charts import LAST_HZ, ResponseCharts
+from rigd.view.scale import Scale
 from rigd.view.spectrogram_chart import SpectrogramChart
 from rigd.view.subject import Subject
 from rigd.view.summary import send_summary
@@ -68,6 +69,7 @@ class Picture:
         self._charts_due = _Periodically(_CHARTS_S)
         self._samples = _Gathering(subject.rate_hz)
         self._timings = _Gathering(subject.rate_hz)
+        self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
         self._t_ns = 0
 
     def frame(self) -> list[Drawing]:
@@ -76,6 +78,7 @@ class Picture:
         return [
             lambda stream: stream.send_recording_name(name),
             lambda stream: stream.send_blueprint(self._layout()),
+            *(drawing for scale in self._scales.values() for drawing in scale.frame()),
             self.response_charts.draw_frames,
             self.response_charts.draw,
             self._spectrogram_chart.draw_frame,
@@ -100,7 +103,7 @@ class Picture:
     def health(self, t_ns: int, health: Health) -> list[Drawing]:
         """Take a reading of the health, a few times a second."""
         return [
-            _sending(HEALTH, health_record(t_ns, health)),
+            *self._plot(HEALTH, health_record(t_ns, health)),
             partial(send_summary, subject=self._subject, t_ns=t_ns, health=health),
         ]
 
@@ -118,13 +121,20 @@ class Picture:
         self._t_ns = int(samples["t_ns"][-1])
         self._response.feed(samples)
         self._columns += self._spectrogram.feed(samples["tick"], samples["coupling_torque_nm"])
-        drawings = [_sending(SIGNALS, samples), *self._antenna.samples(samples)]
+        drawings = [*self._plot(SIGNALS, samples), *self._antenna.samples(samples)]
         if self._charts_due(self._t_ns):
             drawings += self._charts()
         return drawings
 
     def _draw_timings(self, timings: Records | None) -> list[Drawing]:
-        return [] if timings is None else [_sending(READINGS, timings)]
+        return [] if timings is None else self._plot(READINGS, timings)
+
+    def _plot(self, source: Source, records: Records) -> list[Drawing]:
+        t_ns, columns = records["t_ns"].astype(np.int64), source.columns(records)
+        return [
+            partial(send_columns, entity=source.entity, t_ns=t_ns, columns=columns),
+            *self._scales[source].draw(t_ns, columns),
+        ]
 
     def _charts(self) -> list[Drawing]:
         drawings: list[Drawing] = []
@@ -173,7 +183,3 @@ class _Gathering:
         """Return all that wait, None if nothing does."""
         parts, self._parts = self._parts, []
         return np.concatenate(parts) if parts else None
-
-
-def _sending(source: Source, records: Records) -> Drawing:
-    return lambda stream: source.send(stream, records)

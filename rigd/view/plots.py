@@ -1,6 +1,6 @@
 """What is plotted over time: which curves, in which units, and how each is drawn."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final
@@ -82,6 +82,11 @@ class Source:
     entity: str
     plots: tuple[Plot, ...]
 
+    @property
+    def ticks(self) -> str:
+        """Where Rerun keeps values that the axes must hold besides."""
+        return f"{self.entity}/ticks"
+
     def columns(self, records: Records) -> dict[str, Values]:
         """Return values (n, curves of the plot) by the plot's component, from records (n,)."""
         return {
@@ -89,15 +94,20 @@ class Source:
             for plot in self.plots
         }
 
-    def send(self, stream: "RecordingStream", records: Records) -> None:
-        """Send what is made of records (n,) to Rerun, by columns."""
-        import rerun as rr
 
-        time = rr.TimeColumn(TIMELINE, duration=records["t_ns"].astype("timedelta64[ns]"))
-        columns = self.columns(records).items()
-        stream.send_columns(
-            self.entity, [time], [_column(name, values) for name, values in columns], strict=True
-        )
+def send_columns(
+    stream: "RecordingStream",
+    entity: str,
+    t_ns: npt.NDArray[np.int64],
+    columns: Mapping[str, Values],
+) -> None:
+    """Send values (n, k) by component, which were at times (n,) of the session, to an entity."""
+    import rerun as rr
+
+    time = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
+    stream.send_columns(
+        entity, [time], [_column(name, values) for name, values in columns.items()], strict=True
+    )
 
 
 def _column(component: str, values: Values) -> "ComponentColumn":
@@ -203,7 +213,7 @@ BUS_LOAD = Plot(
 )
 BUS_ERRORS = Plot(
     "bus_errors",
-    "Bus errors (count since the start)",
+    "Bus errors since the devices were connected (count)",
     (Curve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
 )
 SENSOR_STATUS = Plot(

@@ -42,9 +42,13 @@ SIZES: Final = {
 MEASURED_KEY: Final = Key("measured", SKY_BLUE)
 MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
 COHERENCE_KEY: Final = Key("coherence", GREEN)
-NOT_EXCITED_KEY: Final = Key("not excited", GREY, is_area=True)
+NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
+"""Where the reference has not been, as far as the estimate has used it."""
 
-_SHADES: Final = ("not_excited_below", "not_excited_above")
+NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
+NO_COHERENCE: Final = "Of a single segment there is no coherence"
+
+_SHADES: Final = ("not_estimated_below", "not_estimated_above")
 _GROUPS: Final = 200
 """Of points along the axis, two kept of each: enough for the pixels of a view."""
 _PHASE_FROM_DEG: Final = -90.0
@@ -114,6 +118,7 @@ class ResponseCharts:
         self._t_ns = 0
         self._curves: dict[str, Sequence[Real]] = {}
         self._excited_hz = (LAST_HZ, LAST_HZ)
+        self._note = NO_COHERENCE_YET
 
     def chart(self, entity: str) -> Chart:
         """Return the chart that Rerun keeps at a place."""
@@ -146,6 +151,8 @@ class ResponseCharts:
         }
         ends = grid[excited][[0, -1]] if excited.any() else (LAST_HZ, LAST_HZ)
         self._excited_hz = float(ends[0]), float(ends[1])
+        missing = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
+        self._note = missing if response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
         """Draw what was last taken, at its time."""
@@ -156,6 +163,7 @@ class ResponseCharts:
             ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
             for name, first_hz, last_hz in zip(_SHADES, ends_hz[::2], ends_hz[1::2], strict=True):
                 chart.move_shade(stream, name, first_hz, last_hz)
+        self.chart(COHERENCE).draw_note(stream, self._note, COHERENCE_KEY.color)
 
 
 def magnitude_db(response: Complex) -> Real:
@@ -205,4 +213,4 @@ def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
     ticks, lines = decades(FIRST_HZ, LAST_HZ)
     frequency = Axis("Frequency (Hz)", FIRST_HZ, LAST_HZ, ticks, lines, logarithmic=True)
     width, height = SIZES[entity]
-    return Chart(entity, width, height, frequency, y, (*keys, NOT_EXCITED_KEY))
+    return Chart(entity, width, height, frequency, y, (*keys, NOT_ESTIMATED_KEY))

@@ -120,6 +120,26 @@ def test_each_model_and_its_residual_lie_over_the_measured_response(paper_analys
             assert_on_curve(chunks, f"{entity}/{page}", name, grid_hz, values, tolerance)
 
 
+@pytest.mark.parametrize("page", ["magnitude", "phase", "residual"])
+def test_legends_have_the_colour_of_every_curve(written, page):
+    chunks, _ = written
+    entity = f"/fits/type_VI/{page}"
+    curves = {"measured", "model_const", "model_omega"}
+    colors = {value(chunks[f"{entity}/{name}"], name_of_colors(page, name))[0] for name in curves}
+    assert len(colors) == 3
+    assert set(value(chunks[f"{entity}/legend"], "LineStrips2D:colors")) == colors
+    labels = value(chunks[f"{entity}/labels"], "Points2D:labels")
+    assert {label.split()[-1] for label in labels[-3:]} in (
+        {"measured", "const", "omega"},
+        {"|measured|", "const", "omega"},
+    )
+
+
+def name_of_colors(page: str, curve: str) -> str:
+    dotted = page == "phase" and curve == "measured"
+    return "Points2D:colors" if dotted else "LineStrips2D:colors"
+
+
 def test_the_estimate_of_the_fits_is_shown_with_its_coherence(paper_analysis, written):
     chunks, _ = written
     response = paper_analysis.response

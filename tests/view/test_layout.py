@@ -3,14 +3,15 @@
 import pytest
 
 from rigd.view import plots
-from rigd.view.layout import CLOSE_UP_S, HISTORY_S, TABS, WINDOW_S, blueprint
+from rigd.view.layout import CLOSE_UP_S, HISTORY_S, TABS, TIME_VIEWS, WINDOW_S, blueprint
 from rigd.view.plots import TIMELINE
 from rigd.view.response_charts import SIZES
 
 
 def leaves(part):
     children = getattr(part, "contents", None)
-    if isinstance(children, list | tuple):
+    # Those of a view are entities.
+    if isinstance(children, list | tuple) and not isinstance(children[0], str):
         return [leaf for child in children for leaf in leaves(child)]
     return [part]
 
@@ -28,13 +29,12 @@ def tabs():
 
 @pytest.fixture
 def time_series(tabs):
-    """Views of plots over time, with their only visualizer."""
+    """Views of plots over time, with the visualizer of their curves."""
     return [
-        (view, visualizer)
+        (view, view.visualizer_overrides[view.origin])
         for views in tabs.values()
         for view in views
         if view.class_identifier == "TimeSeries"
-        for visualizer in view.visualizer_overrides.values()
     ]
 
 
@@ -51,7 +51,8 @@ def test_every_plot_has_a_view_with_all_its_curves(time_series):
     seen = set()
     for view, visualizer in time_series:
         source = sources[view.origin]
-        assert list(view.visualizer_overrides) == [source.entity]
+        assert {*view.visualizer_overrides} <= {source.entity, source.ticks}
+        assert view.contents == list(view.visualizer_overrides)
         (mapping,) = visualizer.mappings
         (plot,) = [p for p in source.plots if p.component == mapping.source_component]
         seen.add(plot)
@@ -64,6 +65,22 @@ def test_every_plot_has_a_view_with_all_its_curves(time_series):
         legend = view.properties["PlotLegend"].as_component_batches()
         assert component(legend, "visible") == [len(plot.curves) > 1]
     assert seen == {plot for source in sources.values() for plot in source.plots}
+
+
+def test_ticks_are_among_the_values_but_not_seen(time_series):
+    shown = []
+    for view, lines in time_series:
+        for entity in {*view.visualizer_overrides} - {view.origin}:
+            ticks = view.visualizer_overrides[entity]
+            assert component(ticks.overrides, "marker_sizes") == [0.0]
+            # The legend has one entry for what is called alike.
+            for name in ("names", "colors"):
+                assert component(ticks.overrides, name) == component(lines.overrides, name)[:1]
+            (mapping,) = ticks.mappings
+            shown.append((entity, mapping.source_component))
+    free = [view for view in TIME_VIEWS if view.plot.span is None]
+    assert sorted(shown) == sorted((view.source.ticks, view.ticks) for view in free)
+    assert len(set(shown)) == len(shown)
 
 
 def test_plots_show_a_window_up_to_the_cursor(time_series):

@@ -142,6 +142,7 @@ def test_everything_has_its_place(subject, make_samples, shown):
     ):
         assert found[entity].times_ns[component] == records["t_ns"].tolist()
         assert found[entity].batches <= 31
+        assert found[f"{entity}/ticks"].batches <= 20
     assert found["/events"].last("TextLog:text") == "1 tick was missed."
     assert found["/events"].last("TextLog:level") == "WARN"
     assert found["/events"].times_ns["TextLog:text"] == [1_000_000]

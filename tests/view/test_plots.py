@@ -9,7 +9,7 @@ import pytest
 
 from rigd.session.format import TIMING_DTYPE
 from rigd.view.health import Health, health_record
-from rigd.view.plots import HEALTH, READINGS, SIGNALS
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, send_columns
 
 SOURCES = (SIGNALS, READINGS, HEALTH)
 PLOTS = [plot for source in SOURCES for plot in source.plots]
@@ -96,12 +96,12 @@ def test_colours_differ_and_stand_out_from_dark_and_light(plot):
 
 def test_rerun_gets_the_columns_at_the_time_of_the_session(shown, make_samples):
     samples = make_samples(50, first_tick=100, angle_rad=np.linspace(-1e-3, 1e-3, 50))
-    found = shown([lambda stream: SIGNALS.send(stream, samples)])
+    expected = SIGNALS.columns(samples)
+    found = shown([lambda stream: send_columns(stream, "/signals", samples["t_ns"], expected)])
     signals = found["/signals"]
     assert signals.batches == 1
     assert signals.times_ns["angle_mrad"] == samples["t_ns"].tolist()
-    expected = SIGNALS.columns(samples)["angle_mrad"]
-    assert np.array(signals.values["angle_mrad"]) == pytest.approx(expected)
+    assert np.array(signals.values["angle_mrad"]) == pytest.approx(expected["angle_mrad"])
     assert signals.kinds["angle_mrad"] == "rerun.components.Scalar"
 
 

@@ -1,4 +1,4 @@
-"""What the charts of the frequency response show: units, delays, the model, what is not excited."""
+"""What the charts of the frequency response show: units, delays, the model, what is not known."""
 
 from dataclasses import replace
 
@@ -111,7 +111,7 @@ def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     at_20_hz = chart.place(20.0, chart.y.first)[0]
 
     def shaded(found, name) -> tuple[float, float]:
-        shade = found[f"{MAGNITUDE}/not_excited_{name}"]
+        shade = found[f"{MAGNITUDE}/not_estimated_{name}"]
         x, _, _ = shade.last("Transform3D:translation")
         width, _, _ = shade.last("Transform3D:scale")
         return x, x + width
@@ -123,6 +123,23 @@ def test_band_not_yet_excited_is_shaded_and_empty(subject, shown):
     assert strip[:, 0].max() == pytest.approx(at_20_hz, abs=0.5)
     times_ns = after[f"{MAGNITUDE}/measured"].times_ns["LineStrips2D:strips"]
     assert times_ns == [20_000_000_000]
+
+
+def test_an_empty_coherence_chart_says_why(subject, shown):
+    charts = ResponseCharts(subject)
+
+    def note() -> list[str]:
+        return shown([charts.draw])[f"{COHERENCE}/note"].values["Points2D:labels"][-1]
+
+    assert note() == ["Coherence begins with the second segment"]
+    known = estimate(subject)
+    single = replace(known, response=replace(known.response, coherence=None))
+    charts.update(1_000_000_000, single)
+    assert note() == ["Coherence begins with the second segment"]
+    charts.update(2_000_000_000, replace(single, final=True))
+    assert note() == ["Of a single segment there is no coherence"]
+    charts.update(3_000_000_000, known)
+    assert note() == []
 
 
 def test_without_a_nominal_model_none_is_drawn(subject, shown):
