@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import os
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from analysis.commands.default_command import DEFAULT, DefaultCommandGroup
+from analysis.commands.exchange import IMPORT_EPILOG, export_app, import_command
+from analysis.commands.welch_options import (
+    Band,
+    Estimator,
+    Frf,
+    Nfft,
+    Overlap,
+    Segment,
+    welch_settings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -18,9 +29,6 @@ if TYPE_CHECKING:
     from analysis.settings import WelchSettings
     from analysis.welch_route import WelchAnalysis
 
-_MAX_NFFT = 2**22
-"""Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
-
 _FIGURE_STEPS = 4
 """How many times longer a figure takes than another step, roughly."""
 
@@ -28,7 +36,8 @@ _EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
 
 Writes figures, tables and JSON into session.report/ beside the file (session.report-2/ if that
-exists). Exit code: 0 done, 1 a file could not be analysed, 2 wrong use, 130 stopped by Ctrl-C."""
+exists). Records of other programs: analyze import --help; results for them: analyze export --help.
+Exit code: 0 done, 1 a file could not be analysed, 2 wrong use, 130 stopped by Ctrl-C."""
 
 
 class Method(Enum):
@@ -38,17 +47,15 @@ class Method(Enum):
     ALL = "all"
 
 
-class Frf(Enum):
-    """Estimators of the frequency response."""
-
-    H1 = "h1"
-    H2 = "h2"
-    HV = "hv"
-    FFT = "fft"
-
-
 # Plain messages of one or two sentences, not boxes: they end up in logs.
-app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+app = typer.Typer(
+    cls=DefaultCommandGroup,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command("import", epilog=IMPORT_EPILOG)(import_command)
+app.add_typer(export_app, name="export")
 
 
 def main() -> None:
@@ -59,7 +66,7 @@ def main() -> None:
     app()
 
 
-@app.command(epilog=_EPILOG)
+@app.command(DEFAULT, epilog=_EPILOG)
 def analyze(
     files: Annotated[
         list[Path],
@@ -78,29 +85,11 @@ def analyze(
             help="Weightings of the cost: const, omega (1/omega), omega^K for any power K.",
         ),
     ] = "const,omega",
-    band: Annotated[
-        str, typer.Option(metavar="F0,F1", help="Band that is fitted, in Hz, ends included.")
-    ] = "0.5875,50",
-    frf: Annotated[
-        Frf,
-        typer.Option(
-            help="Estimate that is fitted: Welch's H1, H2 or Hv, or one FFT of the whole record."
-        ),
-    ] = Frf.H1,
-    segment: Annotated[
-        int | None,
-        typer.Option(min=2, help="Welch segment, samples.  [default: 17.266 s, the paper's]"),
-    ] = None,
-    overlap: Annotated[
-        int | None,
-        typer.Option(min=0, help="Overlap, samples.  [default: 15 % of the segment]"),
-    ] = None,
-    nfft: Annotated[
-        int | None,
-        typer.Option(
-            min=2, max=_MAX_NFFT, help="Length of the transform, samples.  [default: 160 s]"
-        ),
-    ] = None,
+    band: Band = "0.5875,50",
+    frf: Estimator = Frf.H1,
+    segment: Segment = None,
+    overlap: Overlap = None,
+    nfft: Nfft = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -128,7 +117,7 @@ def analyze(
     del method  # There is one so far, so both choices come to the same.
     from analysis.report.folder import OutputError, OutputExistsError, check_new_file
 
-    settings = _settings(types, weights, band, frf, segment, overlap, nfft)
+    settings = welch_settings(types, weights, band, frf, segment, overlap, nfft)
     try:
         to_stdout = json is not None and str(json) == "-"
         if json is not None and not to_stdout:
@@ -271,85 +260,6 @@ def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
             f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
         )
     check_rerun_file(rerun)
-
-
-def _settings(
-    types: str,
-    weights: str,
-    band: str,
-    frf: Frf,
-    segment: int | None,
-    overlap: int | None,
-    nfft: int | None,
-) -> WelchSettings:
-    """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2)."""
-    from analysis.settings import WelchSettings
-
-    if segment is not None and overlap is not None and overlap >= segment:
-        raise typer.BadParameter(
-            f"{overlap} samples must be fewer than those of a segment, {segment}.",
-            param_hint="--overlap",
-        )
-    if segment is not None and nfft is not None and nfft < segment:
-        raise typer.BadParameter(
-            f"{nfft} samples must be no fewer than those of a segment, {segment}.",
-            param_hint="--nfft",
-        )
-    return WelchSettings(
-        estimator=frf.value,
-        segment_length=segment,
-        overlap=overlap,
-        nfft=nfft,
-        band_hz=_band(band),
-        types=_types(types),
-        weightings=_weightings(weights),
-    )
-
-
-def _band(text: str) -> tuple[float, float]:
-    try:
-        first_hz, last_hz = (float(part) for part in text.split(","))
-    except ValueError:
-        first_hz = last_hz = math.nan
-    if not 0.0 < first_hz < last_hz < math.inf:
-        raise typer.BadParameter(
-            f"'{text}' is not two frequencies in Hz with 0 < F0 < F1, such as 0.5875,50.",
-            param_hint="--band",
-        )
-    return first_hz, last_hz
-
-
-def _types(text: str) -> tuple[str, ...]:
-    from analysis.structures import STRUCTURES
-
-    names = _listed(text.upper())
-    unknown = [name for name in names if name not in STRUCTURES]
-    if unknown or not names:
-        raise typer.BadParameter(
-            f"there is no model type '{(unknown or [text])[0]}'; "
-            f"choose from {', '.join(STRUCTURES)}.",
-            param_hint="--types",
-        )
-    return names
-
-
-def _weightings(text: str) -> tuple[str, ...]:
-    from analysis.weights import WeightingError, weighting_name
-
-    try:
-        names = tuple(weighting_name(name) for name in _listed(text))
-    except WeightingError as error:
-        raise typer.BadParameter(str(error), param_hint="--weights") from error
-    if not names:
-        raise typer.BadParameter(
-            "no weighting was named; choose from const, omega, omega^K.", param_hint="--weights"
-        )
-    return names
-
-
-def _listed(text: str) -> tuple[str, ...]:
-    """Names of a comma-separated list, each once, in the order given."""
-    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
 def _standard_error() -> Console:

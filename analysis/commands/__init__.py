@@ -1,0 +1,1 @@
+"""Commands of `analyze` beside the analysis itself."""

@@ -1,0 +1,126 @@
+"""Options on how the frequency response is estimated and what is fitted to it."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+if TYPE_CHECKING:
+    from analysis.settings import WelchSettings
+
+_MAX_NFFT: Final = 2**22
+"""Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
+
+
+class Frf(Enum):
+    """Estimators of the frequency response."""
+
+    H1 = "h1"
+    H2 = "h2"
+    HV = "hv"
+    FFT = "fft"
+
+
+Band = Annotated[
+    str, typer.Option(metavar="F0,F1", help="Band that is fitted, in Hz, ends included.")
+]
+Estimator = Annotated[
+    Frf,
+    typer.Option(
+        help="Estimate that is fitted: Welch's H1, H2 or Hv, or one FFT of the whole record."
+    ),
+]
+Segment = Annotated[
+    int | None,
+    typer.Option(min=2, help="Welch segment, samples.  [default: 17.266 s, the paper's]"),
+]
+Overlap = Annotated[
+    int | None,
+    typer.Option(min=0, help="Overlap, samples.  [default: 15 % of the segment]"),
+]
+Nfft = Annotated[
+    int | None,
+    typer.Option(min=2, max=_MAX_NFFT, help="Length of the transform, samples.  [default: 160 s]"),
+]
+
+
+def welch_settings(
+    types: str,
+    weights: str,
+    band: str,
+    frf: Frf,
+    segment: int | None,
+    overlap: int | None,
+    nfft: int | None,
+) -> WelchSettings:
+    """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2)."""
+    from analysis.settings import WelchSettings
+
+    if segment is not None and overlap is not None and overlap >= segment:
+        raise typer.BadParameter(
+            f"{overlap} samples must be fewer than those of a segment, {segment}.",
+            param_hint="--overlap",
+        )
+    if segment is not None and nfft is not None and nfft < segment:
+        raise typer.BadParameter(
+            f"{nfft} samples must be no fewer than those of a segment, {segment}.",
+            param_hint="--nfft",
+        )
+    return WelchSettings(
+        estimator=frf.value,
+        segment_length=segment,
+        overlap=overlap,
+        nfft=nfft,
+        band_hz=_band(band),
+        types=_types(types),
+        weightings=_weightings(weights),
+    )
+
+
+def _band(text: str) -> tuple[float, float]:
+    try:
+        first_hz, last_hz = (float(part) for part in text.split(","))
+    except ValueError:
+        first_hz = last_hz = math.nan
+    if not 0.0 < first_hz < last_hz < math.inf:
+        raise typer.BadParameter(
+            f"'{text}' is not two frequencies in Hz with 0 < F0 < F1, such as 0.5875,50.",
+            param_hint="--band",
+        )
+    return first_hz, last_hz
+
+
+def _types(text: str) -> tuple[str, ...]:
+    from analysis.structures import STRUCTURES
+
+    names = _listed(text.upper())
+    unknown = [name for name in names if name not in STRUCTURES]
+    if unknown or not names:
+        raise typer.BadParameter(
+            f"there is no model type '{(unknown or [text])[0]}'; "
+            f"choose from {', '.join(STRUCTURES)}.",
+            param_hint="--types",
+        )
+    return names
+
+
+def _weightings(text: str) -> tuple[str, ...]:
+    from analysis.weights import WeightingError, weighting_name
+
+    try:
+        names = tuple(weighting_name(name) for name in _listed(text))
+    except WeightingError as error:
+        raise typer.BadParameter(str(error), param_hint="--weights") from error
+    if not names:
+        raise typer.BadParameter(
+            "no weighting was named; choose from const, omega, omega^K.", param_hint="--weights"
+        )
+    return names
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    """Names of a comma-separated list, each once, in the order given."""
+    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))

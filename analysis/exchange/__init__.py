@@ -1,0 +1,1 @@
+"""Records of other programs in, records and frequency responses out."""

@@ -1,0 +1,129 @@
+"""Channels of a CSV file: columns with names in the first line, or by number."""
+
+from __future__ import annotations
+
+import csv
+from array import array
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.exchange.errors import ExchangeError
+from analysis.exchange.source import (
+    MAX_SAMPLES,
+    SourceChannel,
+    check_samples,
+    no_such_channel,
+    printable,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+    from typing import TextIO
+
+_MAX_LINE: Final = 65_536
+"""Longest line, characters: hundreds of columns. A longer one is not split into its cells."""
+
+_SEPARATORS: Final = ("\t", ";", ",")
+
+
+def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+    """Read columns of a CSV file in UTF-8, as `analysis.exchange.source.read_source` asks for.
+
+    The separator is a tab, a semicolon or a comma: the first of them that the first line has. A
+    column is named as the first line names it, or ``#3`` for the third. An empty cell reads as NaN.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            return _read(path, _bounded_lines(path, stream), names)
+    except UnicodeDecodeError as error:
+        raise ExchangeError(
+            f"{path}: is not text in UTF-8 (byte {error.start}); save it as CSV in UTF-8."
+        ) from error
+    except csv.Error as error:
+        raise ExchangeError(f"{path}: is not a CSV file ({error}).") from error
+
+
+def _read(path: Path, lines: Iterator[str], names: Sequence[str]) -> Mapping[str, SourceChannel]:
+    first = next((line for line in lines if line.strip()), None)
+    if first is None:
+        raise ExchangeError(f"{path}: is empty.")
+    separator = next((mark for mark in _SEPARATORS if mark in first), ",")
+    cells = [cell.strip() for cell in next(csv.reader([first], delimiter=separator))]
+    headless = all(_is_number(cell) for cell in cells)
+    header = [f"#{number}" for number in range(1, len(cells) + 1)] if headless else cells
+    columns = {name: _column(path, name, header) for name in names}
+    values = {name: array("d") for name in columns}
+    wanted = [(column, values[name].append, name) for name, column in columns.items()]
+    if headless:
+        for column, append, _ in wanted:
+            append(float(cells[column]))
+    reader = csv.reader(lines, delimiter=separator)
+    for row in reader:
+        if not row:
+            continue
+        for column, append, name in wanted:
+            try:
+                append(float(row[column]))
+            except (ValueError, IndexError):
+                append(_odd_cell(path, row, column, name, separator, len(values[name])))
+        if len(values[name]) > MAX_SAMPLES:
+            check_samples(path, "The file", len(values[name]))
+    return {name: SourceChannel(np.frombuffer(column)) for name, column in values.items()}
+
+
+def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:
+    while line := stream.readline(_MAX_LINE + 1):
+        if len(line) > _MAX_LINE:
+            raise ExchangeError(
+                f"{path}: has a line of more than {_MAX_LINE} characters, so it is no table of a "
+                "few channels with a line for each sample; export the session's channels alone."
+            )
+        yield line
+
+
+def _column(path: Path, name: str, header: Sequence[str]) -> int:
+    count = header.count(name)
+    if count == 1:
+        return header.index(name)
+    if count > 1:
+        raise ExchangeError(
+            f"{path}: {count} columns are named '{name}'; give the column's number, such as "
+            f"#{header.index(name) + 1} for the first of them."
+        )
+    number = name.removeprefix("#")
+    if name != number and number.isdecimal() and 0 < int(number) <= len(header):
+        return int(number) - 1
+    raise no_such_channel(path, name, header)
+
+
+def _odd_cell(
+    path: Path, row: Sequence[str], column: int, name: str, separator: str, before: int
+) -> float:
+    """Return NaN for an empty cell, and say what is wrong with any other that is no number."""
+    place = f"sample {before + 1} of the column '{name}'"
+    if column >= len(row):
+        raise ExchangeError(
+            f"{path}: {place} is missing: its line has {len(row)} columns and that one is number "
+            f"{column + 1}; every line needs the same columns."
+        )
+    cell = row[column].strip()
+    if not cell:
+        return float("nan")
+    if separator != "," and _is_number(cell.replace(",", ".", 1)):
+        raise ExchangeError(
+            f"{path}: {place} is '{cell}', with a decimal comma; save the file with decimal points."
+        )
+    raise ExchangeError(
+        f"{path}: {place} is '{printable(cell, 40)}' and not a number; below the line with the "
+        "names only numbers may stand."
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

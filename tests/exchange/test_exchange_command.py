@@ -1,0 +1,175 @@
+"""`analyze import` and `analyze export` beside `analyze FILE`: options, messages, exit codes."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rigd.session import read_session
+
+N = 3000
+
+
+@pytest.fixture
+def source(csv_of):
+    return csv_of(
+        t=np.arange(N) / 1000,
+        q=np.sin(np.arange(N) / 50),
+        T=np.random.default_rng(0).normal(size=N),
+    )
+
+
+@pytest.fixture
+def arguments(source, profile, tmp_path):
+    return ["import", source, tmp_path / "a.mcap", "--profile", profile]
+
+
+MAPPING = ("--angle", "q:deg", "--torque", "T:N.mm", "--time", "t:s")
+
+
+def test_an_import_says_what_it_made(analyze, arguments, tmp_path):
+    result = analyze(*arguments, *MAPPING, "--sweep", "0.5,2.5", "--note", "first")
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    assert "3000 samples at 1000 Hz" in result.stdout
+    assert "whole record" not in result.stdout
+    session = read_session(tmp_path / "a.mcap")
+    assert session.segments == {"sweep": (500, 2500)}
+    assert session.metadata["note"] == "first"
+    again = analyze(*arguments, *MAPPING)
+    assert again.exit_code == 2
+    assert "exists" in again.stderr
+    assert "nothing is overwritten" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--angle", "q:deg"), ("--torque",)),
+        (("--angle", "q:deg", "--torque", "T:N.mm"), ("--time", "--rate-hz")),
+        ((*MAPPING, "--rate-hz", "1000"), ("--time", "--rate-hz")),
+        ((*MAPPING, "--angle", "q"), ("--angle", "CHANNEL:UNIT", "never guessed")),
+        ((*MAPPING, "--tz", "T:nm"), ("--tz", "'nm'", "N.m, mN.m")),
+        ((*MAPPING, "--sweep", "3"), ("--sweep", "1,121")),
+        ((*MAPPING, "--rest", "2,1"), ("--rest",)),
+        ((*MAPPING, "--ring-down", "0,inf"), ("--ring-down",)),
+        ((*MAPPING, "--torque-delay-s", "nan"), ("--torque-delay-s",)),
+        ((*MAPPING, "--angle-delay-s", "5"), ("--angle-delay-s",)),
+    ],
+)
+def test_wrong_use_is_explained_and_makes_nothing(analyze, arguments, tmp_path, options, words):
+    result = analyze(*arguments, *options)
+    assert result.exit_code == 2, result.output
+    for word in words:
+        assert word in result.stderr
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((*MAPPING, "--angle", "angle:deg"), ("record.csv", "no channel 'angle'", "'q'")),
+        ((*MAPPING, "--sweep", "0,5"), ("record.csv", "which lasts 3 s")),
+        ((*MAPPING, "--profile", "absent.toml"), ("absent.toml", "cannot be read")),
+    ],
+)
+def test_a_file_that_cannot_be_imported_is_explained(analyze, arguments, tmp_path, options, words):
+    result = analyze(*arguments, *options)
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith("Error: ")
+    for word in words:
+        assert word in result.stderr
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+def test_a_session_has_its_ending(analyze, source, profile, tmp_path):
+    result = analyze("import", source, tmp_path / "a.csv", "--profile", profile, *MAPPING)
+    assert result.exit_code == 2
+    assert ".mcap" in result.stderr
+
+
+def test_doubts_are_told_on_standard_error(analyze, source, arguments):
+    source.write_text(source.read_text().replace("t,q,T", "t,q_rad,T"))
+    result = analyze(*arguments, *MAPPING, "--angle", "q_rad:deg")
+    assert result.exit_code == 0
+    assert result.stderr.startswith("Warning: The name 'q_rad'")
+    assert "the whole record counts as the sweep" in result.stdout
+
+
+@pytest.fixture
+def session(analyze, arguments, tmp_path):
+    assert analyze(*arguments, *MAPPING).exit_code == 0
+    return tmp_path / "a.mcap"
+
+
+@pytest.mark.parametrize(
+    ("out", "options", "code", "words"),
+    [
+        ("a.xlsx", (), 2, ("a.xlsx", ".csv, .mat, .uff")),
+        ("a.csv", ("--binary",), 2, ("--binary", ".uff")),
+        ("record.csv", (), 2, ("record.csv exists", "nothing is overwritten")),
+        ("absent/a.csv", (), 1, ("absent/a.csv cannot be written",)),
+    ],
+)
+def test_what_cannot_be_exported_is_explained(
+    analyze, session, tmp_path, out, options, code, words
+):
+    before = sorted(tmp_path.iterdir())
+    for what in ("record", "frf"):
+        own = () if what == "record" else ("--segment", "1000")
+        result = analyze("export", what, session, tmp_path / out, *options, *own)
+        assert result.exit_code == code, result.output
+        for word in words:
+            assert word in result.stderr
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_the_analysis_own_messages_are_those_of_an_export(analyze, session, tmp_path):
+    result = analyze("export", "frf", session, tmp_path / "f.csv")
+    assert result.exit_code == 1
+    assert "fewer than one Welch segment" in result.stderr
+    result = analyze("export", "frf", session, tmp_path / "f.csv", "--band", "1")
+    assert result.exit_code == 2
+    assert "--band" in result.stderr
+    result = analyze("export", "record", tmp_path / "absent.mcap", tmp_path / "r.csv")
+    assert result.exit_code == 1
+    assert "absent.mcap cannot be read" in result.stderr
+    assert not list(tmp_path.glob("[fr].csv"))
+
+
+def test_a_disk_that_fills_up_leaves_no_part_of_a_file(analyze, session, tmp_path, monkeypatch):
+    def full(_table, stream):
+        stream.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("analysis.exchange.write_csv.write_csv", full)
+    result = analyze("export", "record", session, tmp_path / "r.csv")
+    assert result.exit_code == 1
+    assert "r.csv cannot be written: No space left on device" in result.stderr
+    assert not (tmp_path / "r.csv").exists()
+
+
+def test_the_analysis_stands_beside_its_subcommands(analyze):
+    text = analyze("--help").stdout
+    assert "[OPTIONS] {FILE}..." in text or "[OPTIONS] FILE..." in text
+    assert "analyze import --help" in " ".join(text.split())
+    assert analyze().exit_code == 2
+    assert "FILE" in analyze().stderr
+    for name in ("import", "export", "default"):
+        result = analyze(f"./{name}")
+        assert (result.exit_code, "cannot be read" in result.stderr) == (1, True)
+    assert "default cannot be read" in analyze("default").stderr
+    assert analyze("--types", "I", "import").exit_code == 1  # a file of that name, not the command
+
+
+def test_the_commands_load_no_library_before_they_run(analyze):
+    code = (
+        "import sys, analysis.cli; "
+        "print(sorted({'numpy', 'scipy', 'matplotlib', 'nptdms', 'pyuff'} & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "[]\n"

@@ -1,0 +1,87 @@
+"""The examples of docs/exchange.md run as written, on files as the document describes them."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from analysis.exchange.bounded_memory import MAX_MEMORY
+from analysis.exchange.source import MAX_SAMPLES
+from analysis.exchange.specimen import read_specimen
+from analysis.exchange.units import UNITS
+from rigd.session import read_session
+
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "exchange.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def foreign_files(simulated, tmp_path):
+    """The simulated session as four other programs would have recorded it, with 1 s of rest."""
+    nptdms = pytest.importorskip("nptdms", reason="the document imports a TDMS file")
+    pyuff = pytest.importorskip("pyuff", reason="the document imports a universal file")
+    samples = read_session(simulated).samples
+    place = np.clip(np.arange(-500, 21_500), 0, None)
+    angle, torque = samples["angle_rad"][place], samples["coupling_torque_nm"][place]
+    time_s = np.arange(len(place)) * 1e-3
+    np.savetxt(
+        tmp_path / "log.csv", np.column_stack([1e3 * time_s, np.degrees(angle), 1e3 * torque]),
+        "%.17g", ";", header="t;Shaft [deg];Tz", comments="",
+    )  # fmt: skip
+    wrench = np.column_stack([samples[name][place] for name in ("fx_n", "fy_n", "fz_n")] * 2)
+    wrench[:, 5] = torque
+    log = {"t": time_s, "angle": angle, "wrench": wrench}
+    scipy.io.savemat(tmp_path / "log.mat", {"log": log}, oned_as="column")
+    with nptdms.TdmsWriter(str(tmp_path / "log.tdms")) as writer:
+        for name, values, unit in (("Angle", np.degrees(angle), "deg"), ("Tz", -torque, "Nm")):
+            properties = {"unit_string": unit, "wf_increment": 1e-3}
+            writer.write_segment([nptdms.ChannelObject("Rig", name, values, properties)])
+    for title, values in (("Angle", angle), ("Tz", torque)):
+        function = pyuff.prepare_58(
+            binary=0, func_type=1, rsp_node=1, rsp_dir=1, ref_node=1, ref_dir=1, data=values,
+            x=time_s, id1=title, rsp_ent_name="R", ref_ent_name="R", abscissa_spacing=1,
+            abscissa_spec_data_type=17, ordinate_spec_data_type=1, orddenom_spec_data_type=0,
+        )  # fmt: skip
+        pyuff.UFF(str(tmp_path / "log.uff")).write_sets(function, "add")
+    return angle, torque
+
+
+def test_every_example_runs_as_written(analyze, foreign_files, tmp_path, monkeypatch, capsys):
+    angle, torque = foreign_files
+    (profile,), shells, (python,) = blocks("toml"), blocks("sh"), blocks("python")
+    (tmp_path / "beam.toml").write_text(profile)
+    monkeypatch.chdir(tmp_path)
+    for line in "".join(shells).splitlines():
+        program, *arguments = shlex.split(line)
+        result = analyze(*arguments)
+        assert (program, result.exit_code, result.stderr) == ("analyze", 0, ""), result.output
+    for name in ("csv", "mat", "tdms", "uff"):
+        session = read_session(tmp_path / f"from_{name}.mcap")
+        np.testing.assert_allclose(session.samples["angle_rad"], angle, rtol=1e-10)
+        np.testing.assert_allclose(session.samples["coupling_torque_nm"], torque, rtol=1e-10)
+        assert session.metadata["imported_from"] == f"log.{name}"
+        assert session.segments["sweep"] == (1000, 21000)
+        assert session.events == []
+    assert (tmp_path / "from_csv.report").is_dir()
+    exec(python, {})
+    frequency_hz, decibels = re.findall(r"[\d.]+", capsys.readouterr().out)
+    assert float(frequency_hz) == pytest.approx(16.1, abs=0.3)  # second mode of the paper's antenna
+    assert 25 < float(decibels) < 40
+
+
+def test_the_document_has_every_unit_and_the_limits(tmp_path):
+    for quantity, units in UNITS.items():
+        (row,) = re.findall(rf"^\| {quantity} \| (.*) \|$", DOCUMENT, re.MULTILINE)
+        assert re.findall(r"`([^`]+)`", row) == list(units)
+    assert MAX_SAMPLES == 3_000_000
+    assert "more than 3 million samples" in DOCUMENT
+    assert f"no more than {MAX_MEMORY / 1e6:.0f} MB" in DOCUMENT
+    (profile,) = blocks("toml")
+    (tmp_path / "beam.toml").write_text(profile)
+    assert read_specimen(tmp_path / "beam.toml").beam.length_m == 0.98

@@ -1,0 +1,142 @@
+"""Files that claim what they do not hold, or hold what nobody can: refused, in bounded memory."""
+
+import resource
+import struct
+import subprocess
+import sys
+import zlib
+
+import pytest
+
+from analysis.exchange.bounded_memory import bounded_memory
+
+READ = """
+import sys
+from pathlib import Path
+from analysis.exchange.errors import ExchangeError
+from analysis.exchange.source import read_source
+try:
+    read_source(Path(sys.argv[1]), [sys.argv[2]])
+    print("read")
+except ExchangeError as error:
+    print(error)
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(int(status["VmHWM"].split()[0]) // 1024)
+"""
+
+
+def refused(path, name):
+    """Read in a process of its own; return the message and the most memory it took, in MB."""
+    command = [sys.executable, "-c", READ, path, name]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert result.stderr == ""
+    *message, megabytes = result.stdout.splitlines()
+    assert message[0].startswith(str(path)), message
+    return "\n".join(message), int(megabytes)
+
+
+def test_ten_million_columns(tmp_path):
+    path = tmp_path / "wide.csv"
+    line = b"1," * 10_000_000 + b"\n"
+    path.write_bytes(line + line)
+    message, megabytes = refused(path, "#1")
+    assert "a line of more than" in message
+    assert megabytes < 100
+
+
+def test_a_quotation_that_never_ends(tmp_path):
+    path = tmp_path / "quote.csv"
+    path.write_bytes(b'a,b\n"' + b"1,2\n" * 1_000_000)
+    message, megabytes = refused(path, "a")
+    assert "not a CSV file" in message
+    assert megabytes < 100
+
+
+def mat_element(dims, claimed, payload):
+    """A variable `a` of MATLAB's version 5 that claims so many bytes of doubles."""
+    body = struct.pack("<4I", 6, 8, 6, 0) + struct.pack("<2I2i", 5, 8, *dims)
+    body += struct.pack("<2I8s", 1, 1, b"a") + struct.pack("<2I", 9, claimed) + payload
+    return body
+
+
+MAT_HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49)
+
+
+@pytest.mark.parametrize("dims", [(1, 2**28), (1, 1000)])
+def test_two_gigabytes_in_two_megabytes(tmp_path, dims):
+    """Of zeros, compressed; the dimensions say so, or do not."""
+    size = 2**31
+    body = mat_element(dims, size, b"")
+    packer = zlib.compressobj(9)
+    data = packer.compress(struct.pack("<2I", 14, len(body) + size) + body)
+    data += packer.flush(zlib.Z_FULL_FLUSH)  # what follows can be repeated as it is
+    data += (size >> 20) * (packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH))
+    path = tmp_path / "bomb.mat"
+    path.write_bytes(MAT_HEADER + struct.pack("<2I", 15, len(data)) + data)
+    message, megabytes = refused(path, "a")
+    assert "cut the session out" in message or "800 MB" in message
+    assert megabytes < 900
+
+
+@pytest.mark.parametrize(("dims", "claimed"), [((1, 2**30), 0xFFFFFFF0), ((1, 10), 0xFFFFFFF0)])
+def test_four_gigabytes_that_are_not_there(tmp_path, dims, claimed):
+    body = mat_element(dims, claimed, bytes(80))
+    path = tmp_path / "claim.mat"
+    path.write_bytes(MAT_HEADER + struct.pack("<2I", 14, len(body)) + body)
+    _, megabytes = refused(path, "a")
+    assert megabytes < 200
+
+
+def test_a_universal_file_of_nothing_but_marks(tmp_path):
+    pytest.importorskip("pyuff", reason="UFF58 needs pyuff")
+    path = tmp_path / "marks.uff"
+    path.write_bytes(b"    -1\n" * 3_000_000)
+    message, megabytes = refused(path, "#1")
+    assert "more than 10000 data sets" in message
+    assert megabytes < 200
+
+
+def lead_in(contents, length):
+    return struct.pack("<4sIIQQ", b"TDSm", contents, 4713, length, length)
+
+
+def tdms_object(number):
+    name = f"/'g'/'c{number}'".encode()
+    return struct.pack(f"<I{len(name)}sII", len(name), name, 0xFFFFFFFF, 0)
+
+
+def test_a_tdms_file_of_ten_million_channels(tmp_path):
+    pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
+    path = tmp_path / "wide.tdms"
+    contents = struct.pack("<I", 10_000_000) + tdms_object(1) * 1_000_000
+    path.write_bytes(lead_in(6, len(contents)) + contents)
+    message, megabytes = refused(path, "g/c1")
+    assert "list more than" in message
+    assert megabytes < 200
+
+
+def test_a_tdms_file_that_lists_its_channels_again_and_again(tmp_path):
+    pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
+    path = tmp_path / "often.tdms"
+    contents = struct.pack("<I", 20_000) + b"".join(map(tdms_object, range(20_000)))
+    again = lead_in(2, 4) + struct.pack("<I", 0)
+    path.write_bytes(lead_in(6, len(contents)) + contents + 20_000 * again)
+    message, megabytes = refused(path, "g/c1")
+    assert "list more than" in message
+    assert megabytes < 200
+
+
+def test_a_tdms_file_that_claims_a_text_of_four_gigabytes(tmp_path):
+    pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
+    path = tmp_path / "text.tdms"
+    path.write_bytes(lead_in(6, 100) + struct.pack("<II", 1, 0xFFFFFFF0) + b"abc")
+    _, megabytes = refused(path, "g/c1")
+    assert megabytes < 200
+
+
+def test_the_bound_on_memory_holds_and_goes():
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    with pytest.raises(MemoryError), bounded_memory(200_000_000):
+        bytearray(400_000_000)
+    assert resource.getrlimit(resource.RLIMIT_AS) == before
+    bytearray(400_000_000)

@@ -1,0 +1,307 @@
+"""What becomes of a record: numbers, flags, gaps, provenance, and doubts that are told."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from analysis.exchange.errors import ExchangeError
+from analysis.exchange.import_plan import ImportPlan
+from analysis.exchange.import_record import import_record
+from analysis.exchange.mapping import parse_choice
+from analysis.exchange.specimen import Specimen, read_specimen
+from analysis.record import load_record
+from rigd.beam import Beam, Damping, transfer
+from rigd.session import SessionError, SessionExistsError, Status, read_session
+
+BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+N = 4000
+TIME_S = np.arange(N) / 1000
+ANGLE = 0.02 * np.sin(2 * np.pi * 1.3 * TIME_S**2)
+TORQUE = np.random.default_rng(0).normal(size=N)
+
+
+def test_units_are_applied_and_everything_is_said(csv_of, make_plan, tmp_path):
+    source = csv_of(
+        t=1e3 * TIME_S + 250, angle=np.degrees(ANGLE), torque=1e3 * TORQUE, fx=TORQUE, tz=TORQUE
+    )
+    plan = make_plan(
+        angle="angle:deg",
+        torque="torque:mN.m",
+        time="t:ms",
+        others={"fx_n": parse_choice("fx:kN", "force"), "tz_nm": parse_choice("#5:N.cm", "torque")},
+        segments_s={"rest": (0, 0.5), "sweep": (0.5, 3.5), "ring_down": (3.5, 4)},
+        angle_delay_s=1e-4,
+        torque_delay_s=-2e-4,
+        note="bench 3",
+    )
+    done = import_record(source, tmp_path / "bench.mcap", plan)
+    session = read_session(done.path)
+    samples = session.samples
+    assert (done.samples, done.rate_hz, done.warnings) == (N, 1000.0, ())
+    np.testing.assert_allclose(samples["angle_rad"], ANGLE, rtol=1e-15)
+    np.testing.assert_allclose(samples["coupling_torque_nm"], TORQUE, rtol=1e-15)
+    np.testing.assert_allclose(samples["fx_n"], 1e3 * TORQUE, rtol=1e-15)
+    np.testing.assert_allclose(samples["tz_nm"], 1e-2 * TORQUE, rtol=1e-15)
+    for untold in ("angle_reference_rad", "torque_command_nm", "fy_n", "status", "work_ns"):
+        assert not samples[untold].any()
+    np.testing.assert_array_equal(samples["tick"], np.arange(N))
+    np.testing.assert_array_equal(samples["t_ns"], 1_000_000 * np.arange(N))
+    assert session.segments == {"rest": (0, 500), "sweep": (500, 3500), "ring_down": (3500, 4000)}
+    assert session.start_utc_ns == source.stat().st_mtime_ns
+    assert session.outcome == {
+        "scheduled": str(N), "recorded": str(N), "missed": "0", "lost": "0"
+    }  # fmt: skip
+    assert (
+        session.metadata
+        | {
+            "id": "bench",
+            "imported_from": "record.csv",
+            "import_format": "CSV",
+            "import_sha256": hashlib.sha256(source.read_bytes()).hexdigest(),
+            "import_time": "t:ms",
+            "import_angle_rad": "angle:deg",
+            "import_coupling_torque_nm": "torque:mN.m",
+            "import_fx_n": "fx:kN",
+            "import_tz_nm": "#5:N.cm",
+            "angle_delay_s": "0.0001",
+            "torque_delay_s": "-0.0002",
+            "note": "bench 3",
+            "beam_length_m": "0.98",
+        }
+        == session.metadata
+    )
+    record = load_record(done.path)
+    assert (record.beam, record.sweep) == (BEAM, slice(500, 3500))
+    assert record.warnings == ()
+
+
+def test_a_rate_that_is_stated_stands_in_for_times(csv_of, make_plan, tmp_path):
+    source = csv_of(angle=ANGLE, torque=TORQUE)
+    done = import_record(source, tmp_path / "a.mcap", make_plan(rate_hz=819.2))
+    session = read_session(done.path)
+    assert session.metadata["rate_hz"] == "819.2"
+    assert session.metadata["import_time"] == "rate stated"
+    np.testing.assert_array_equal(
+        session.samples["t_ns"], [round(tick * 10**9 / 819.2) for tick in range(N)]
+    )
+
+
+def test_gaps_become_missing_ticks(csv_of, make_plan, tmp_path):
+    kept = np.delete(np.arange(N), [100, 101, 102, 2000])
+    source = csv_of(t=TIME_S[kept], angle=ANGLE[kept], torque=TORQUE[kept])
+    done = import_record(source, tmp_path / "a.mcap", make_plan(time="t:s"))
+    session = read_session(done.path)
+    np.testing.assert_array_equal(session.samples["tick"], kept)
+    after_gap = np.flatnonzero(session.samples["status"])
+    assert session.samples["tick"][after_gap].tolist() == [103, 2001]
+    assert (session.samples["status"][after_gap] == Status.AFTER_LOST).all()
+    assert session.outcome["lost"] == "4"
+    assert any("4 samples are missing in 2 gaps" in warning for warning in done.warnings)
+    assert load_record(done.path).gaps.missing_ticks == 4
+
+
+def test_values_that_are_none_are_held_and_flagged(csv_of, make_plan, tmp_path):
+    angle, torque = ANGLE.copy(), TORQUE.copy()
+    angle[[0, 1, 500]] = np.nan, np.inf, -np.inf
+    torque[[500, 600, 601]] = np.nan
+    done = import_record(
+        csv_of(angle=angle, torque=torque), tmp_path / "a.mcap", make_plan()
+    )  # fmt: skip
+    session = read_session(done.path)
+    samples = session.samples
+    assert samples["tick"][0] == 2
+    assert np.isfinite(samples["angle_rad"]).all()
+    assert np.isfinite(samples["coupling_torque_nm"]).all()
+    stale = {int(s["tick"]): Status(int(s["status"])) for s in samples if s["status"]}
+    assert stale == {
+        2: Status.AFTER_LOST,
+        500: Status.ANGLE_STALE | Status.WRENCH_STALE,
+        600: Status.WRENCH_STALE,
+        601: Status.WRENCH_STALE,
+    }
+    by_tick = dict(
+        zip(samples["tick"].tolist(), samples["coupling_torque_nm"].tolist(), strict=True)
+    )
+    assert by_tick[600] == by_tick[601] == TORQUE[599]
+    words = " ".join(done.warnings)
+    assert "first 2 samples were left out" in words
+    assert "1 samples of 'angle'" in words
+    assert "3 samples of 'torque'" in words
+    record = load_record(done.path)
+    assert (record.gaps.sweep_stale_angles, record.gaps.sweep_stale_torques) == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"torque": np.where(np.arange(N) % 5 == 0, np.nan, TORQUE)}, ("'torque'", "800 of 4000")),
+        ({"angle": np.full(N, np.nan)}, ("'angle'", "4000 of 4000")),
+        ({"ref": np.where(np.arange(N) == 7, np.nan, 0.0)}, ("'ref'", "sample 8", "leave this")),
+        ({"ref": np.full(N, 1e308)}, ("'ref'", "not finite in 4000")),
+    ],
+)
+def test_too_many_or_the_wrong_values_missing_are_refused(
+    csv_of, make_plan, tmp_path, change, words
+):
+    columns = {"angle": ANGLE, "torque": TORQUE, "ref": np.zeros(N)} | change
+    plan = make_plan(others={"angle_reference_rad": parse_choice("ref:rev", "angle")})
+    with pytest.raises(ExchangeError) as refusal:
+        import_record(csv_of(**columns), tmp_path / "a.mcap", plan)
+    for word in ("record.csv", *words):
+        assert word in str(refusal.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["record.csv"]
+
+
+@pytest.mark.parametrize("segment", [(0, 4.01), (-1, 2), (2, 2), (3, 2)])
+def test_a_segment_outside_the_record_is_refused(csv_of, make_plan, tmp_path, segment):
+    source = csv_of(angle=ANGLE, torque=TORQUE)
+    with pytest.raises(ExchangeError, match="which lasts 4 s"):
+        import_record(source, tmp_path / "a.mcap", make_plan(segments_s={"sweep": segment}))
+
+
+def test_a_unit_that_the_file_contradicts_is_refused(csv_of, make_plan, tmp_path):
+    source = csv_of(**{"Angle [deg]": ANGLE, "torque": TORQUE})
+    with pytest.raises(ExchangeError, match=r"is in deg, and rad was stated"):
+        import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:rad"))
+    import_record(source, tmp_path / "a.mcap", make_plan(angle="Angle [deg]:deg"))
+    import_record(source, tmp_path / "b.mcap", make_plan(angle="#1:rad"))
+
+
+def test_a_name_that_sounds_like_another_unit_is_told(csv_of, make_plan, tmp_path):
+    source = csv_of(angle_deg=ANGLE, torque=TORQUE)
+    done = import_record(source, tmp_path / "a.mcap", make_plan(angle="angle_deg:rad"))
+    assert "sounds like deg" in done.warnings[0]
+
+
+def test_what_a_file_says_of_rate_and_unit_is_compared(make_plan, tmp_path):
+    tdms = pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
+    source = tmp_path / "a.tdms"
+
+    def channels(**properties):
+        with tdms.TdmsWriter(str(source)) as writer:
+            writer.write_segment(
+                [
+                    tdms.ChannelObject("g", "angle", ANGLE, properties),
+                    tdms.ChannelObject("g", "torque", TORQUE, {"wf_increment": 1e-3}),
+                ]
+            )
+
+    options = {"angle": "g/angle:deg", "torque": "g/torque:N.m"}
+    channels(unit_string="rad")
+    with pytest.raises(ExchangeError, match="is in rad, and deg was stated"):
+        import_record(source, tmp_path / "a.mcap", make_plan(**options))
+    channels(unit_string="V")
+    done = import_record(source, tmp_path / "a.mcap", make_plan(**options))
+    assert "says 'V' of 'g/angle'" in done.warnings[0]
+    with pytest.raises(ExchangeError, match="'g/torque' was sampled at 1000 Hz, and 500 Hz was"):
+        import_record(source, tmp_path / "b.mcap", make_plan(**options, rate_hz=500.0))
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """A sweep from 0.5 to 20 Hz and the torque of the damped beam for it, with noise of 5 mN·m."""
+    time_s = np.arange(30_000) / 1000
+    angle = 0.025 * np.sin(2 * np.pi * (0.5 + 19.5 / 60 * time_s) * time_s)
+    angle *= np.minimum(1, np.minimum(time_s, time_s[::-1]))
+    s = 1 / 30 + 2j * np.pi * np.fft.rfftfreq(1 << 17, 1e-3)
+    decay = np.exp(-time_s / 30)
+    g = transfer(s, BEAM, Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594))
+    torque = np.fft.irfft(g * np.fft.rfft(angle * decay, 1 << 17), 1 << 17)[: len(angle)] / decay
+    return angle, torque + 5e-3 * np.random.default_rng(1).normal(size=len(angle))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, ()),
+        ({"angle": "angle:deg"}, ("57", "check the units")),
+        ({"torque": "torque:mN.m"}, ("0.00", "check the units")),
+        ({"torque": "torque:lbf.in"}, ("0.11", "check the units")),
+        ({"reverse_torque": True}, ("opposite sign", "--reverse-torque")),
+    ],
+)
+def test_the_beam_tells_wrong_units_and_a_wrong_sign(
+    csv_of, make_plan, tmp_path, motion, options, words
+):
+    source = csv_of(angle=motion[0], torque=motion[1])
+    done = import_record(source, tmp_path / "a.mcap", make_plan(**options))
+    assert len(done.warnings) == bool(words)
+    for word in words:
+        assert word in done.warnings[0]
+    assert [event.message for event in read_session(done.path).events] == list(done.warnings)
+
+
+def test_a_reaction_is_reversed(csv_of, make_plan, tmp_path, motion):
+    source = csv_of(angle=motion[0], torque=-motion[1])
+    done = import_record(source, tmp_path / "a.mcap", make_plan(reverse_torque=True))
+    assert done.warnings == ()
+    session = read_session(done.path)
+    np.testing.assert_array_equal(session.samples["coupling_torque_nm"], motion[1])
+    assert session.metadata["import_coupling_torque_nm"] == "torque:N.m, reversed"
+
+
+def test_nothing_is_overwritten_and_nothing_left_behind(csv_of, make_plan, tmp_path, monkeypatch):
+    source = csv_of(angle=ANGLE, torque=TORQUE)
+    import_record(source, tmp_path / "a.mcap", make_plan())
+    before = (tmp_path / "a.mcap").read_bytes()
+    with pytest.raises(SessionExistsError):
+        import_record(source, tmp_path / "a.mcap", make_plan())
+    assert (tmp_path / "a.mcap").read_bytes() == before
+    with pytest.raises(SessionError, match="cannot be written"):
+        import_record(source, tmp_path / "absent" / "a.mcap", make_plan())
+    monkeypatch.setattr("rigd.session.SessionWriter.close", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        import_record(source, tmp_path / "b.mcap", make_plan())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "record.csv"]
+
+
+def test_a_plan_is_complete():
+    choice = parse_choice("a:rad", "angle")
+    both = {"angle_rad": choice, "coupling_torque_nm": choice}
+    with pytest.raises(ValueError, match="coupling_torque_nm"):
+        ImportPlan({"angle_rad": choice}, Specimen(BEAM), rate_hz=1.0)
+    for times in ({}, {"rate_hz": 1.0, "time": choice}):
+        with pytest.raises(ValueError, match="either"):
+            ImportPlan(both, Specimen(BEAM), **times)
+
+
+def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
+    assert read_specimen(profile) == Specimen(BEAM, 0.0)
+    path = tmp_path / "beam.toml"
+    path.write_text(
+        "[beam]\nlength_m = 1\ndensity_kg_per_m = 5e-3\nbending_stiffness_n_m2 = 0.1\n"
+        "[sensor]\ntool_inertia_kg_m2 = { value = 1e-5, source = 'measured' }\n"
+    )
+    specimen = read_specimen(path)
+    assert (specimen.beam.length_m, specimen.tool_inertia_kg_m2) == (1.0, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ("no beam.length_m", "in m", "[beam]")),
+        ("beam = 3", ("beam is not a section",)),
+        ("[beam]\nlength_m = 'long'", ("beam.length_m is 'long'", "number in m")),
+        ("[beam]\nlength_m = true", ("beam.length_m is True",)),
+        ("[beam]\nlength_m = 0", ("beam.length_m is 0 m", "positive")),
+        ("[beam]\nlength_m = nan", ("beam.length_m is nan",)),
+        ("[beam]\nlength_m = {value = 1}\ndensity_kg_per_m = {}", ("beam.density_kg_per_m",)),
+        ("[sensor]\ntool_inertia_kg_m2 = -1.0", ("sensor.tool_inertia_kg_m2", "negative")),
+        ("[beam", ("not a TOML file",)),
+        ("a = " + "[" * 100_000, ("not a TOML file",)),
+        ("#" * 1_000_001, ("too large",)),
+    ],
+)
+def test_what_is_no_specimen_is_refused(tmp_path, text, words):
+    path = tmp_path / "beam.toml"
+    path.write_text(text)
+    with pytest.raises(ExchangeError) as refusal:
+        read_specimen(path)
+    for word in ("beam.toml", *words):
+        assert word in str(refusal.value)
+
+
+def test_a_specimen_that_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(ExchangeError, match="cannot be read"):
+        read_specimen(tmp_path / "absent.toml")

@@ -1,0 +1,79 @@
+"""Units are the user's word, in any usual spelling, and their sizes are right."""
+
+import math
+
+import pytest
+
+from analysis.exchange.errors import ExchangeError
+from analysis.exchange.mapping import parse_choice
+from analysis.exchange.units import UNITS, canonical_unit, factor, unit_in_brackets, unit_in_suffix
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit", "size"),
+    [
+        ("angle", "deg", math.radians(1)),
+        ("angle", "°", math.radians(1)),
+        ("angle", "mrad", 1e-3),
+        ("angle", "µrad", 1e-6),
+        ("angle", "arcsec", math.radians(1 / 3600)),
+        ("angle", "rev", 2 * math.pi),
+        ("torque", "Nm", 1.0),
+        ("torque", "N·m", 1.0),
+        ("torque", "N*m", 1.0),
+        ("torque", "mN.m", 1e-3),
+        ("torque", "Nmm", 1e-3),
+        ("torque", "N.cm", 1e-2),
+        ("torque", "lbf.in", 0.1129848290276167),  # NIST SP 811
+        ("torque", "ozf.in", 7.061551814226043e-3),
+        ("force", "lbf", 4.4482216152605),
+        ("time", "ms", 1e-3),
+        ("time", " s ", 1.0),
+    ],
+)
+def test_a_unit_has_its_size(quantity, unit, size):
+    assert factor(quantity, unit) == pytest.approx(size, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit"),
+    [("torque", "nm"), ("torque", "N"), ("angle", "Deg"), ("angle", ""), ("time", "min")],
+)
+def test_what_is_no_unit_of_the_quantity_is_refused_with_those_that_are(quantity, unit):
+    with pytest.raises(ExchangeError, match="choose from") as refusal:
+        factor(quantity, unit)
+    for name in UNITS[quantity]:
+        assert name in str(refusal.value)
+
+
+def test_capitals_tell_milli_from_mega():
+    assert canonical_unit("mNm") == "mN.m"
+    assert canonical_unit("MNm") is None
+
+
+def test_no_two_units_share_a_spelling():
+    names = [name for units in UNITS.values() for name in units]
+    assert [canonical_unit(name) for name in names] == names
+
+
+def test_a_choice_is_taken_apart_at_its_last_colon():
+    choice = parse_choice("Rig: motor/Angle:deg", "angle")
+    assert (choice.channel, choice.unit) == ("Rig: motor/Angle", "deg")
+    assert str(choice) == "Rig: motor/Angle:deg"
+
+
+@pytest.mark.parametrize("text", ["angle", ":deg", "  :deg", "angle:", "angle:furlong"])
+def test_a_choice_without_channel_or_unit_is_refused(text):
+    with pytest.raises(ExchangeError, match="deg"):
+        parse_choice(text, "angle")
+
+
+def test_units_are_found_in_names():
+    assert unit_in_brackets("Angle [deg]") == "deg"
+    assert unit_in_brackets("Tz (N·mm) ") == "N.mm"
+    assert unit_in_brackets("Tz (raw)") is None
+    assert unit_in_brackets("Tz") is None
+    assert unit_in_suffix("coupling_torque_nm") == "N.m"
+    assert unit_in_suffix("angle_deg") == "deg"
+    assert unit_in_suffix("angle") is None
+    assert unit_in_suffix("motor_angle") is None
