@@ -90,9 +90,9 @@ def run(seconds: float, *, live: bool) -> tuple[Measurement, str, float]:
         loops.connected(profile, live=live) as (rig, crew),
     ):
         order = Order(profile, excitation, Path(folder) / "bench.mcap")
-        meters = []
+        meters, stop = [], StopRequest()
         if live:
-            rig.show(order)
+            rig.show(order, stop)
             pid = crew[LIVE].pid
             meters = [Meter(pid), Meter(child_of(pid))]
 
@@ -101,7 +101,7 @@ def run(seconds: float, *, live: bool) -> tuple[Measurement, str, float]:
                 for meter in meters:
                     meter.look()
 
-        result = rig.run(order, StopRequest(), watch)
+        result = rig.run(order, stop, watch)
         if live:
             publisher, server = meters
             percent = publisher.percent
