@@ -91,6 +91,8 @@ class Record:
         (n,) angle asked for and angle measured at the output shaft.
     torque_nm
         (n,) coupling torque, positive when the motor pushes the beam.
+    angle_known, torque_known
+        (n,) whether the value was measured at that very tick, and within the sensor's range.
     rate_hz
         Ticks per second.
     beam
@@ -120,6 +122,8 @@ class Record:
     reference_rad: NDArray[np.float64]
     angle_rad: NDArray[np.float64]
     torque_nm: NDArray[np.float64]
+    angle_known: NDArray[np.bool_]
+    torque_known: NDArray[np.bool_]
     rate_hz: float
     beam: Beam
     angle_delay_s: float
@@ -201,6 +205,8 @@ def load_record(path: Path) -> Record:
         reference_rad=_filled(samples["angle_reference_rad"], index, missing),
         angle_rad=_filled(samples["angle_rad"], index, missing | stale_angle),
         torque_nm=_filled(samples["coupling_torque_nm"], index, missing | stale_torque),
+        angle_known=~(missing | stale_angle),
+        torque_known=~(missing | stale_torque | ((status & Status.WRENCH_SATURATED) != 0)),
         rate_hz=rate_hz,
         beam=_beam(session),
         angle_delay_s=session.number("angle_delay_s", 0.0),

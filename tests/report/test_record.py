@@ -55,6 +55,8 @@ def test_missing_ticks_are_interpolated_and_counted(tmp_path, write_session, sho
         record.torque_nm[2000:2003], before + (after - before) * np.array([1, 2, 3]) / 4
     )
     assert any("4 missing ticks" in warning for warning in record.warnings)
+    np.testing.assert_array_equal(record.angle_known, present)
+    np.testing.assert_array_equal(record.torque_known, present)
 
 
 def test_stale_values_are_interpolated_in_their_channel_only(
@@ -73,6 +75,8 @@ def test_stale_values_are_interpolated_in_their_channel_only(
     assert record.torque_nm[3000] == torque[3000]
     assert record.torque_nm.max() < 1.0
     assert record.flags == {"angle stale": 1, "wrench stale": 2}
+    assert np.flatnonzero(~record.angle_known).tolist() == [3000]
+    assert np.flatnonzero(~record.torque_known).tolist() == [3100, 3101]
 
 
 def test_flags_in_the_sweep_are_counted_and_warned_of(tmp_path, write_session, short_signals):
@@ -82,6 +86,8 @@ def test_flags_in_the_sweep_are_counted_and_warned_of(tmp_path, write_session, s
     record = load_record(write_session(tmp_path / "a.mcap", short_signals, status=status))
     assert record.flags == {"wrench saturated": 3, "late tick": 3}
     assert any("clipped" in warning for warning in record.warnings)
+    assert record.angle_known.all()
+    assert np.flatnonzero(~record.torque_known).tolist() == [600, 601, 602]
 
 
 def test_a_stopped_sweep_is_cut_to_what_was_recorded(tmp_path, write_session, short_signals):

@@ -1,0 +1,151 @@
+"""A record brought into the band of interest, and what of it can be compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.whole_record.decimation import Decimation, fast_length_below
+from analysis.whole_record.free_decay import DecaySpectra
+from analysis.whole_record.measurement import MeasurementError
+from analysis.whole_record.prediction import Prediction
+from rigd.beam import undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.whole_record.measurement import Measurement
+    from analysis.whole_record.plant import Plant
+
+_FEWEST_BINS: Final = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One record in one band, ready to be compared with any plant.
+
+    Attributes
+    ----------
+    angle_rad, torque_nm : ndarray, shape (m,)
+        Both channels in the band at the decimated rate; unknown torque filled by what is expected.
+    decimation : Decimation
+    kept : slice
+        Samples that are compared.
+    prediction : Prediction
+    bins : slice
+        Bins of the residual's transform that lie in the band.
+    frequency_hz : ndarray, shape (K,)
+    visible_modes : int
+        Modes of the nominal beam within the band, whose free decay is projected out.
+    """
+
+    measurement: Measurement
+    angle_rad: NDArray[np.float64]
+    torque_nm: NDArray[np.float64]
+    decimation: Decimation
+    kept: slice
+    prediction: Prediction
+    bins: slice
+    frequency_hz: NDArray[np.float64]
+    visible_modes: int
+    decays: DecaySpectra
+
+    @classmethod
+    def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
+        """Bring a measurement into the band.
+
+        The mean of the residual is never compared: it is the torque sensor's zero.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used, or is too short for the band.
+        """
+        lowest_hz, highest_hz = band_hz
+        if not 0 <= lowest_hz < highest_hz <= 0.4 * measurement.rate_hz:
+            raise MeasurementError(
+                f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
+                f"or beyond 0.4 of the sampling rate ({0.4 * measurement.rate_hz:g} Hz); "
+                "choose another."
+            )
+        measurement.check(highest_hz)
+        decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
+        angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
+        inside = decimation.inside(measurement.angle_rad.size)
+        samples = inside.stop - inside.start
+        if samples > 0:
+            samples = fast_length_below(samples)
+        all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
+        first = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
+        bins = slice(first, int(np.searchsorted(all_hz, highest_hz, side="right")))
+        if bins.stop - bins.start < _FEWEST_BINS:
+            raise MeasurementError(
+                f"{measurement.name}: {measurement.angle_rad.size / measurement.rate_hz:.3g} s of "
+                f"record are too short for the band {lowest_hz:g}-{highest_hz:g} Hz: "
+                f"{max(bins.stop - bins.start, 0)} frequencies, at least {_FEWEST_BINS} are "
+                "needed; record longer or widen the band."
+            )
+        kept = slice(inside.start, inside.start + samples)
+        frequency_hz = all_hz[bins]
+        beam = measurement.beam
+        known, torque = measurement.torque_known, measurement.torque_nm
+        ticks = np.arange(torque.size)
+        interpolated = torque if known.all() else np.interp(ticks, ticks[known], torque[known])
+        return cls(
+            measurement=measurement,
+            angle_rad=angle_rad,
+            torque_nm=decimation.apply(interpolated),
+            decimation=decimation,
+            kept=kept,
+            prediction=Prediction(angle_rad, decimation.rate_hz, kept),
+            bins=bins,
+            frequency_hz=frequency_hz,
+            visible_modes=int(
+                np.sum(undamped_frequencies_rad_s(beam, 50) < 2 * np.pi * highest_hz)
+            ),
+            decays=DecaySpectra(samples, decimation.rate_hz, 2 * np.pi * frequency_hz),
+        )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return int(self.kept.stop - self.kept.start)
+
+    def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
+        return np.fft.rfft(values)[..., self.bins]
+
+    def filled(self, plant: Plant) -> Comparison:
+        """Put what `plant` predicts where the torque is unknown, so that it does not count there.
+
+        The squares that remain have their minimum where that of the known samples is, once the
+        fit has settled.
+        """
+        known = self.measurement.torque_known
+        if known.all():
+            return self
+        torque = self.measurement.torque_nm.copy()
+        torque[~known] = self.prediction.torque_between(
+            plant, self.decimation.factor, self._places(~known)
+        )[0]
+        return replace(self, torque_nm=self.decimation.apply(torque))
+
+    def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
+        """Compute what unknown torques would have given to the gradient's spectra, (k, K)."""
+        unknown = ~self.measurement.torque_known
+        lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
+        if unknown.any():
+            _, gradient = self.prediction.torque_between(
+                plant, self.decimation.factor, self._places(unknown), wrt
+            )
+            for row, values in zip(lost, gradient, strict=True):
+                only = np.zeros(unknown.size)
+                only[unknown] = values
+                row[:] = self.spectrum(self.decimation.apply(only)[self.kept])
+        return lost
+
+    def _places(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Ticks counted from the first decimated sample on."""
+        return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor

@@ -1,0 +1,158 @@
+"""The noise in the torque, from the residual of a fit: a smooth spectrum, and lines (hum)."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_BLOCKS: Final = 24
+_FEWEST_BINS: Final = 40
+_MEDIAN_OVER_MEAN: Final = float(np.log(2.0))
+
+_LINE: Final = 20.0
+"""Power over that of the noise from which a bin stands out: chance does it once in 5e8 bins."""
+
+_GUARD: Final = 16
+"""Bins to either side of a line that tell when it was there: parts of 1/32 of the record."""
+
+_EIGHTHS: Final = 8
+_STEADY: Final = 0.3
+"""Least power in any eighth of the record, relative to the mean, of a line that is always there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """An oscillation of one frequency, all through the record, that the motor did not cause."""
+
+    frequency_hz: float
+    amplitude_nm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What is taken for noise.
+
+    Attributes
+    ----------
+    power : ndarray, shape (K,)
+        Expected ``|residual|²`` of each bin.
+    counts : ndarray of bool, shape (K,)
+        Bins that are compared; False at the lines.
+    lines : tuple of Line
+    """
+
+    power: NDArray[np.float64]
+    counts: NDArray[np.bool_]
+    lines: tuple[Line, ...]
+
+    @property
+    def weight(self) -> NDArray[np.float64]:
+        """Factor that gives both parts of the residual variance 1, and nought at the lines."""
+        weight: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
+        return weight
+
+
+def noise_of(
+    residual: NDArray[np.complex128],
+    frequency_hz: NDArray[np.float64],
+    samples: int,
+    share: float = 1.0,
+) -> Noise:
+    """Tell noise and hum from what a residual holds.
+
+    Parameters
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Transform of `samples` samples in N·m, on neighbouring bins.
+    frequency_hz : ndarray, shape (K,)
+    samples : int
+    share : float
+        Share of the samples at which the residual is known; it is nought at the others.
+    """
+    power = smooth_power(residual) / share
+    counts = np.ones(power.size, dtype=bool)
+    lines = []
+    for part in _standing_out(residual, power):
+        if not _steady(residual, part):
+            continue
+        counts[part] = False
+        own = np.abs(residual[part]) ** 2
+        lines.append(
+            Line(
+                frequency_hz=float(own @ frequency_hz[part] / own.sum()),
+                amplitude_nm=float(2 * np.sqrt(own.sum()) / (samples * share)),
+            )
+        )
+    return Noise(power, counts, tuple(lines))
+
+
+def smooth_power(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Smooth power of a residual's spectrum, shape (K,): the expected ``|residual|²`` of each bin.
+
+    The power of noise in one bin is exponentially distributed, so its mean is the median over
+    ln 2; the median of a block of bins does not see what a wrong model leaves at a mode or a hum
+    at one frequency, which are no noise. Between the blocks' middles the logarithm is interpolated.
+    Blocks are narrower at low frequency, where drift makes the spectrum steep.
+
+    Parameters
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Spectrum on neighbouring bins.
+    """
+    power = residual.real**2 + residual.imag**2
+    edges = _edges(power.size)
+    logs = np.array(
+        [
+            np.log(max(float(np.median(power[a:b])), np.finfo(float).tiny) / _MEDIAN_OVER_MEAN)
+            for a, b in itertools.pairwise(edges)
+        ]
+    )
+    middles = (edges[:-1] + edges[1:] - 1) / 2
+    smooth: NDArray[np.float64] = np.exp(np.interp(np.arange(power.size), middles, logs))
+    return smooth
+
+
+def _edges(bins: int) -> NDArray[np.intp]:
+    """Borders of the blocks: widths grow with frequency, from `_FEWEST_BINS` up."""
+    places = bins * np.linspace(0, 1, _BLOCKS + 1) ** 2
+    edges = [0]
+    for place in places[1:-1]:
+        if place - edges[-1] >= _FEWEST_BINS and bins - place >= _FEWEST_BINS:
+            edges.append(round(float(place)))
+    return np.array([*edges, bins])
+
+
+def _standing_out(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
+    """Find groups of bins far above the noise, each with its skirts.
+
+    A line leaks into its neighbours as 1 / distance; at three times the distance at which it
+    stands out it is down to the noise.
+    """
+    bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE * power)
+    if bins.size == 0:
+        return []
+    groups = np.split(bins, np.flatnonzero(np.diff(bins) > _GUARD // 2) + 1)
+    parts = []
+    for group in groups:
+        first, last = int(group[0]), int(group[-1])
+        skirt = max(last - first, 2)
+        parts.append(slice(max(first - skirt, 0), last + skirt + 1))
+    return parts
+
+
+def _steady(residual: NDArray[np.complex128], part: slice) -> bool:
+    """Whether what stands out was there all the time.
+
+    What a wrong model leaves at a mode is there when the sweep passes it, and rings down.
+    """
+    around = residual[max(part.start - _GUARD, 0) : part.stop + _GUARD]
+    length = _EIGHTHS * (-(-4 * around.size // _EIGHTHS))
+    envelope = np.abs(np.fft.ifft(around, length)) ** 2
+    eighths = envelope.reshape(_EIGHTHS, -1).mean(axis=1)
+    return bool(eighths.min() > _STEADY * eighths.mean())

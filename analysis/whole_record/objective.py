@@ -1,0 +1,156 @@
+"""The sum of squares that is minimised: whitened residual, free decay projected out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.levenberg_marquardt import NormalEquations
+from analysis.whole_record.free_decay import Pole, mode_poles
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.whole_record.comparison import Comparison
+    from analysis.whole_record.unknowns import Unknowns
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Residual, prediction minus measurement, and its derivatives at one point.
+
+    Attributes
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Not whitened.
+    jacobian : ndarray of complex, shape (k, K)
+        By the unknowns.
+    poles : tuple of Pole
+        Differentiated by the unknowns.
+    columns : ndarray of complex, shape (m, K)
+        Spectra of their free decays.
+    """
+
+    residual: NDArray[np.complex128]
+    jacobian: NDArray[np.complex128]
+    poles: tuple[Pole, ...]
+    columns: NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Projected:
+    """A linearisation whitened, with what free decay explains taken out.
+
+    Attributes
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Real and imaginary parts of variance 1 where the noise is as assumed.
+    jacobian : ndarray of complex, shape (k, K)
+    amplitudes : ndarray, shape (m,)
+        Of the free decays, in N·m, at the first sample compared.
+    amplitude_gram : ndarray, shape (m, m)
+        Inverse covariance of the amplitudes.
+    """
+
+    residual: NDArray[np.complex128]
+    jacobian: NDArray[np.complex128]
+    amplitudes: NDArray[np.float64]
+    amplitude_gram: NDArray[np.float64]
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(np.vdot(self.residual, self.residual).real)
+
+    def normal_equations(self) -> NormalEquations:
+        """As the descent wants them."""
+        conjugate = self.jacobian.conj()
+        return NormalEquations(
+            cost=self.cost,
+            gradient=(conjugate @ self.residual).real,
+            hessian=(conjugate @ self.jacobian.T).real,
+        )
+
+
+class Objective:
+    """Sum of squares of one structure on one record, as a function of the unknowns.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    unknowns : Unknowns
+    """
+
+    __slots__ = ("_recent", "comparison", "unknowns")
+
+    def __init__(self, comparison: Comparison, unknowns: Unknowns) -> None:
+        self.comparison = comparison
+        self.unknowns = unknowns
+        self._recent: dict[bytes, Linearisation] = {}
+
+    def linearise(self, x: NDArray[np.float64]) -> Linearisation:
+        """Residual and derivatives at `x`; the last two points cost nothing again.
+
+        A new noise spectrum begins where the last descent ended.
+        """
+        key = x.tobytes()
+        if key not in self._recent:
+            if len(self._recent) == 2:
+                del self._recent[next(iter(self._recent))]
+            self._recent[key] = self._linearise(x)
+        return self._recent[key]
+
+    def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
+        comparison, unknowns = self.comparison, self.unknowns
+        plant, names = unknowns.plant(x), unknowns.gradient_names
+        torque, gradient = comparison.prediction.torque(plant, names)
+        chain = unknowns.gradient_by_unknowns(x)
+        poles = tuple(
+            Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
+            for pole in mode_poles(plant, comparison.visible_modes, names)
+        )
+        return Linearisation(
+            residual=comparison.spectrum(torque - comparison.torque_nm[comparison.kept]),
+            jacobian=chain.T @ comparison.spectrum(gradient),
+            poles=poles,
+            columns=comparison.decays.columns(poles),
+        )
+
+    def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
+        """Whiten, and take out what free decay explains (variable projection).
+
+        The amplitudes that fit best at each point are linear in the residual; the Jacobian is
+        Kaufman's (BIT 15 (1975) 49-57), with the poles' motion.
+
+        Parameters
+        ----------
+        at : Linearisation
+        weight : ndarray, shape (K,), or float
+            That of `Noise`, or 1 not to whiten.
+        """
+        residual, jacobian = at.residual * weight, at.jacobian * weight
+        if not at.poles:
+            return Projected(residual, jacobian, np.zeros(0), np.zeros((0, 0)))
+        columns = at.columns * weight
+        scale = np.sqrt(np.sum(columns.real**2 + columns.imag**2, axis=1))
+        scale[scale == 0] = 1.0  # a decay that is over at once
+        columns /= scale[:, None]
+        conjugate = columns.conj()
+        gram = (conjugate @ columns.T).real
+        inverse = np.linalg.inv(gram + 1e-12 * np.eye(scale.size))
+        amplitudes = -inverse @ (conjugate @ residual).real
+        jacobian += weight * self.comparison.decays.gradient(at.poles, amplitudes / scale)
+        return Projected(
+            residual=residual + amplitudes @ columns,
+            jacobian=jacobian - ((jacobian.conj() @ columns.T).real @ inverse) @ columns,
+            amplitudes=amplitudes / scale,
+            amplitude_gram=gram * np.outer(scale, scale),
+        )
+
+    def normal_equations(
+        self, x: NDArray[np.float64], weight: NDArray[np.float64]
+    ) -> NormalEquations:
+        """Sum of squares at `x`, with what a Gauss-Newton step needs."""
+        return self.project(self.linearise(x), weight).normal_equations()

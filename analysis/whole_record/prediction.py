@@ -1,0 +1,100 @@
+"""Torque predicted from the measured angle: exact causal convolution with the beam of Eq. 25."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.whole_record.decimation import fast_length
+from analysis.whole_record.response import ResponseGrid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.whole_record.plant import Plant
+
+_PADDED: Final = 1.5
+_DECAY: Final = 9.0
+"""sigma times the padded duration: what wraps round shrinks by exp(-9), to 1e-4 of what a beam
+still does after a whole record; rounding and what the decimation left beyond the band grow by
+exp(9 / 1.5) = 400."""
+
+
+class Prediction:
+    """Response of the exact model to one angle, and its derivatives.
+
+    A finite convolution by discrete transforms wraps round, and a lightly damped beam rings longer
+    than any padding. So the angle is multiplied with exp(-sigma t) before it is transformed, which
+    is its Laplace transform on s = sigma + j omega; there it is multiplied with the response, and
+    after the way back the exponential is undone: what wrapped round has decayed.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (n,)
+        From rest, band-limited: nothing left at half the rate.
+    rate_hz : float
+    kept : slice
+        Samples of which the prediction is wanted.
+    """
+
+    __slots__ = ("_growth", "_kept", "_length", "_response", "_sigma", "_spectrum", "rate_hz")
+
+    def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, kept: slice) -> None:
+        self.rate_hz = rate_hz
+        self._kept = kept
+        self._length = fast_length(int(np.ceil(_PADDED * angle_rad.size)))
+        self._sigma = sigma = _DECAY * rate_hz / self._length
+        time_s = np.arange(angle_rad.size) / rate_hz
+        bins = np.arange(self._length // 2 + 1)
+        self._response = ResponseGrid(sigma + 2j * np.pi * rate_hz / self._length * bins)
+        self._spectrum = np.fft.rfft(angle_rad * np.exp(-sigma * time_s), self._length)
+        self._growth = np.exp(sigma * time_s[kept])
+
+    def torque(
+        self, plant: Plant, wrt: Sequence[str] = ()
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Torque in N·m at the samples kept, and its derivatives.
+
+        Parameters
+        ----------
+        plant : Plant
+            Where to evaluate.
+        wrt : sequence of str
+            As `ResponseGrid.evaluate` takes them.
+
+        Returns
+        -------
+        torque : ndarray, shape (m,)
+        gradient : ndarray, shape (k, m)
+        """
+        spectra = self._response.evaluate(plant, wrt, self._spectrum)
+        in_time = np.fft.irfft(spectra, self._length)[:, self._kept] * self._growth
+        return in_time[0], in_time[1:]
+
+    def torque_between(
+        self, plant: Plant, factor: int, places: NDArray[np.intp], wrt: Sequence[str] = ()
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Predict the same at a multiple of the rate, at some places only.
+
+        Parameters
+        ----------
+        factor : int
+            Rate, in multiples of `rate_hz`.
+        places : ndarray of int, shape (p,)
+            In samples of that rate from the angle's first sample on.
+
+        Returns
+        -------
+        torque : ndarray, shape (p,)
+        gradient : ndarray, shape (k, p)
+        """
+        growth = np.exp(self._sigma * places / (factor * self.rate_hz))
+        spectra = self._response.evaluate(plant, wrt, self._spectrum)
+        at = np.empty((len(spectra), places.size))
+        for row, spectrum in zip(at, spectra, strict=True):
+            row[:] = np.fft.irfft(spectrum, factor * self._length)[places]
+        at *= factor * growth
+        return at[0], at[1:]

@@ -1,0 +1,135 @@
+"""Response from measured angle to measured torque: the beam, its clamp and the instruments' delay.
+
+::
+
+    H(s) = (G(s) + sum_i G_i(s) + J_tool s²) exp(-s tau)
+
+G is Eq. 25. A real link is not quite uniform, which moves its modes one by one: G_i replaces mode i
+of the sum that G is (`rigd.beam.modes`) by one of another stiffness. With p the inertial and c the
+elastic factor, ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, k⁴ the mode's
+stiffness and d its offset::
+
+    G_i = a² EI p² c k⁴ d / ((c k⁴ (1 + d) + p) (c k⁴ + p))
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, participation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from analysis.whole_record.plant import Plant
+
+FIRST_OFFSET: Final = 2
+"""Mode whose offset comes first: that of mode 1 is 0, its frequency is what rho/EI says."""
+
+
+def offset_name(mode: int) -> str:
+    """Name of a mode's offset among the parameters."""
+    return f"stiffness_offset_{mode}"
+
+
+class ResponseGrid:
+    """H and its derivatives on one grid of s.
+
+    Parameters
+    ----------
+    s : array_like of complex, shape (n,)
+        Laplace variable in rad/s, not 0.
+    """
+
+    __slots__ = ("_beam", "_log_s", "_s", "_s_squared")
+
+    def __init__(self, s: ArrayLike) -> None:
+        self._s = np.asarray(s, dtype=np.complex128)
+        self._s_squared = self._s * self._s
+        self._log_s = np.log(self._s)
+        self._beam = TransferGrid(self._s)
+
+    def evaluate(
+        self,
+        plant: Plant,
+        wrt: Sequence[str] = (),
+        angle: NDArray[np.complex128] | float = 1.0,
+    ) -> NDArray[np.complex128]:
+        """Torque for an angle, and its derivatives.
+
+        Parameters
+        ----------
+        plant : Plant
+            Where to evaluate.
+        wrt : sequence of str
+            Names from `rigd.beam.PARAMETERS`, "delay_s", "tool_inertia_kg_m2" and those of
+            offsets; each derivative holds all others constant.
+        angle : ndarray of complex, shape (n,), or float
+            Transform of the angle.
+
+        Returns
+        -------
+        ndarray of complex, shape (1 + k, n)
+            The torque's transform, then the derivatives in the order of `wrt`.
+        """
+        of_beam = [name for name in wrt if name in PARAMETERS]
+        rows: dict[str, NDArray[np.complex128]] = {}
+        if of_beam:
+            response, gradient = self._beam.evaluate_with_gradient(
+                plant.beam, plant.damping, of_beam
+            )
+            rows.update(zip(of_beam, gradient, strict=True))
+        else:
+            response = self._beam.evaluate(plant.beam, plant.damping)
+        if plant.stiffness_offsets:
+            response += self._offset_modes(plant, rows)
+        response += plant.tool_inertia_kg_m2 * self._s_squared
+        rows["tool_inertia_kg_m2"] = self._s_squared
+        if "delay_s" in wrt:
+            rows["delay_s"] = -self._s * response
+        late = np.exp(-plant.delay_s * self._s) * angle
+        found = np.empty((1 + len(wrt), late.size), dtype=np.complex128)
+        for out, row in zip(found, [response, *(rows[name] for name in wrt)], strict=True):
+            np.multiply(row, late, out=out)
+        return found
+
+    def _offset_modes(
+        self, plant: Plant, rows: dict[str, NDArray[np.complex128]]
+    ) -> NDArray[np.complex128]:
+        """Sum of all G_i, shape (n,); their derivatives are added to `rows`."""
+        damping, ratio = plant.damping, plant.beam.density_over_stiffness
+        stiffness = plant.beam.bending_stiffness_n_m2
+        s_alpha = np.exp(damping.alpha * self._log_s)
+        s_lambda = np.exp(damping.lambda_ * self._log_s)
+        c = 1 + damping.zeta * s_alpha
+        p = ratio * self._s_squared + damping.gamma * s_lambda
+        total, by_p, by_c = np.zeros((3, self._s.size), dtype=np.complex128)
+        last = FIRST_OFFSET + len(plant.stiffness_offsets) - 1
+        shares = participation(plant.beam, last)[FIRST_OFFSET - 1 :] * stiffness
+        of_modes = (clamped_free_eigenvalues(last)[FIRST_OFFSET - 1 :] / plant.beam.length_m) ** 4
+        for i, (share, k, offset) in enumerate(
+            zip(shares, of_modes, plant.stiffness_offsets, strict=True)
+        ):
+            before, after = 1 / (c * k + p), 1 / (c * (k * (1 + offset)) + p)
+            by_offset = (share * k) * p * p * c * after
+            total += by_offset * before * offset
+            rows[offset_name(FIRST_OFFSET + i)] = by_offset * after
+            by_p += (share * k * k) * (((1 + offset) * after) ** 2 - before**2)
+            by_c += (share * k) * ((1 + offset) * after**2 - before**2)
+        by_p *= c * c
+        by_c *= p * p
+        slopes = {
+            "zeta": lambda: by_c * s_alpha,
+            "alpha": lambda: by_c * (damping.zeta * self._log_s * s_alpha),
+            "gamma": lambda: by_p * s_lambda,
+            "lambda": lambda: by_p * (damping.gamma * self._log_s * s_lambda),
+            "ln_density_over_stiffness": lambda: by_p * (ratio * self._s_squared),
+            "ln_stiffness": lambda: total,
+        }
+        for name in slopes.keys() & rows.keys():
+            rows[name] = rows[name] + slopes[name]()
+        return total

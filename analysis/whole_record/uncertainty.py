@@ -1,0 +1,155 @@
+"""Covariance of what was estimated, and of what follows from it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.whole_record.plant import LOGARITHMIC
+from analysis.whole_record.result import DampingSize, ModeEstimate, Ringing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.whole_record.free_decay import Pole
+    from analysis.whole_record.objective import Projected
+
+_NORMAL_95: Final = 1.959963984540054
+_WORST_CONDITION: Final = 1e13
+
+
+def covariance_of_unknowns(
+    jacobian: NDArray[np.complex128], scatter: float, held: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Covariance of the unknowns that the data determine.
+
+    Parameters
+    ----------
+    jacobian : ndarray of complex, shape (k, K)
+        Of the whitened residual.
+    scatter : float
+        Variance of the whitened residual's parts.
+    held : ndarray of bool, shape (k,)
+        Unknowns at a bound.
+
+    Returns
+    -------
+    covariance : ndarray, shape (k, k)
+        Zero in rows and columns of the others.
+    determined : ndarray of bool, shape (k,)
+    """
+    hessian = (jacobian.conj() @ jacobian.T).real
+    scale = np.sqrt(np.diag(hessian))
+    determined = ~held & (scale > 0) & np.isfinite(scale)
+    covariance = np.zeros_like(hessian)
+    if not determined.any():
+        return covariance, determined
+    block = np.ix_(determined, determined)
+    unit = np.outer(scale[determined], scale[determined])
+    scaled = hessian[block] / unit
+    if np.linalg.cond(scaled) > _WORST_CONDITION:
+        return covariance, np.zeros_like(determined)
+    covariance[block] = scatter * np.linalg.inv(scaled) / unit
+    return covariance, determined
+
+
+def interval(name: str, value: float, std: float) -> tuple[float, float]:
+    """95 % confidence interval; `std` is of the logarithm where that is what was estimated."""
+    half = _NORMAL_95 * std
+    if name in LOGARITHMIC:
+        return value * math.exp(-half), value * math.exp(half)
+    return value - half, value + half
+
+
+def half_normal_interval(unbounded: float, std: float) -> tuple[float, float]:
+    """95 % interval of what cannot be negative, where its estimate would be and is held at 0."""
+    return 0.0, max(unbounded + _NORMAL_95 * std, 0.0)
+
+
+def damping_size(
+    coefficient: str,
+    order: str,
+    values: dict[str, float],
+    names: Sequence[str],
+    covariance: NDArray[np.float64],
+) -> DampingSize | None:
+    """Size of the damping at the frequency where it is uncorrelated with its order.
+
+    Parameters
+    ----------
+    coefficient, order : str
+        "zeta" and "alpha", or "gamma" and "lambda".
+    values : dict
+    names : sequence of str
+        Determined parameters.
+    covariance : ndarray, shape (k, k)
+        Theirs, coefficients as logarithms.
+    """
+    if coefficient not in names:
+        return None
+    i = list(names).index(coefficient)
+    if order not in names:
+        return DampingSize(None, values[coefficient], values[coefficient] * covariance[i, i] ** 0.5)
+    j = list(names).index(order)
+    # ln size = ln coefficient + order ln omega has no covariance with the order at:
+    ln_omega = -covariance[i, j] / covariance[j, j]
+    variance = max(covariance[i, i] - covariance[i, j] ** 2 / covariance[j, j], 0.0)
+    size = values[coefficient] * math.exp(values[order] * ln_omega)
+    return DampingSize(math.exp(ln_omega), size, size * math.sqrt(variance))
+
+
+def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[ModeEstimate, ...]:
+    """Frequencies and damping ratios with standard deviations, by the delta method.
+
+    Parameters
+    ----------
+    poles : sequence of Pole
+        Differentiated by the unknowns; of over-damped modes both.
+    covariance : ndarray, shape (k, k)
+        Of the unknowns.
+    """
+    table = []
+    for number in dict.fromkeys(pole.mode for pole in poles):
+        first, *rest = (pole for pole in poles if pole.mode == number)
+        p, dp = first.at_rad_s, first.derivative
+        q, dq = (rest[0].at_rad_s, rest[0].derivative) if rest else (p.conjugate(), dp.conj())
+        natural = math.sqrt((p * q).real)
+        ratio = -(p + q).real / (2 * natural)
+        natural_slope = (q * dp + p * dq).real / (2 * natural)
+        ratio_slope = -(dp + dq).real / (2 * natural) - ratio * natural_slope / natural
+        frequency_slope = np.zeros(dp.size) if rest else dp.imag / (2 * np.pi)
+        table.append(
+            ModeEstimate(
+                number=number,
+                frequency_hz=abs(p.imag) / (2 * np.pi),
+                frequency_std_hz=_std(frequency_slope, covariance),
+                damping_ratio=ratio,
+                damping_ratio_std=_std(ratio_slope, covariance),
+            )
+        )
+    return tuple(table)
+
+
+def ringing(poles: Sequence[Pole], projected: Projected, scatter: float) -> Ringing:
+    """Amplitudes of the free decay by mode, and how far beyond chance they are."""
+    amplitudes: dict[int, float] = {}
+    place = 0
+    for pole in poles:
+        width = 2 if pole.oscillates else 1
+        size = float(np.linalg.norm(projected.amplitudes[place : place + width]))
+        amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), size)
+        place += width
+    a = projected.amplitudes
+    return Ringing(
+        amplitude_nm=tuple(amplitudes.values()),
+        chi_square=float(a @ projected.amplitude_gram @ a) / scatter,
+        degrees_of_freedom=a.size,
+    )
+
+
+def _std(slope: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    return math.sqrt(max(float(slope @ covariance @ slope), 0.0))

@@ -1,0 +1,234 @@
+"""The vector in which a whole-record fit searches, and the way from it to a plant.
+
+Damping of a low order acts as stiffness, damping of an order near 2 as inertia. With density and
+stiffness free, such damping and the beam can make up for each other over a long and curved
+valley, in which a descent takes hundreds of steps. So the unknowns are what a record shows
+directly; orders then change alone:
+
+* internal damping by its loss relative to the stiffness, ``ln(z sin(alpha pi/2))`` with
+  ``z = zeta omega_2^alpha`` at the undamped second mode, and ``alpha``;
+* external damping by its loss relative to the inertia, ``ln(g sin(lambda pi/2))`` with
+  ``g = gamma omega_1^lambda / (rho/EI omega_1²)`` at the undamped first mode, and ``lambda``;
+* the stiffness that counts with its damping, ``EI |1 + z exp(j alpha pi/2)|``, and likewise
+  density over stiffness, ``rho/EI |1 - g exp(j lambda pi/2)| / |1 + z exp(j alpha pi/2)|``, both
+  as logarithms relative to the nominal beam's;
+* the delay in ms, the tool's inertia relative to the nominal beam's, and the relative offsets of
+  the modes' stiffness.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.unknowns import ORDER_RANGE, SIZE_RANGE
+from analysis.whole_record.plant import SETTINGS, Plant
+from analysis.whole_record.response import FIRST_OFFSET, offset_name
+from rigd.beam import Beam, undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from analysis.structures import Structure
+    from analysis.whole_record.plant import Setting
+
+_BEAM_RANGE: Final = math.log(3.0)
+_DELAY_UNIT_S: Final = 1e-3
+_DELAY_RANGE_S: Final = 0.02
+_OFFSET_RANGE: Final = 0.5
+_GRADIENT_NAMES: Final[Mapping[str, str]] = {
+    "density_over_stiffness": "ln_density_over_stiffness",
+    "bending_stiffness_n_m2": "ln_stiffness",
+}
+_QUARTER_TURN: Final = math.pi / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Unknowns:
+    """Vector of unknowns of one structure: those of its damping, then the free settings.
+
+    Attributes
+    ----------
+    structure : Structure
+    nominal : Plant
+        Settings that are not free stay at its values; its damping does not matter.
+    free : tuple of str
+        Free settings, in the order of `SETTINGS`.
+    offsets : tuple of str
+        Free offsets of the modes' stiffness: "stiffness_offset_2", ….
+    omega_rad_s : tuple of float
+        Undamped first and second mode of the nominal beam.
+    """
+
+    structure: Structure
+    nominal: Plant
+    free: tuple[Setting, ...]
+    offsets: tuple[str, ...]
+    omega_rad_s: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...], modes: int = 1
+    ) -> Unknowns:
+        """Unknowns of a structure with some settings free, and the stiffness of all but mode 1.
+
+        Parameters
+        ----------
+        modes : int
+            How many modes count; with 1 the beam is uniform.
+        """
+        first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
+        ordered = tuple(name for name in SETTINGS if name in free)
+        offsets = tuple(offset_name(mode) for mode in range(FIRST_OFFSET, modes + 1))
+        return cls(structure, nominal, ordered, offsets, (first, second))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the vector's order."""
+        return (*self.structure.free, *self.free, *self.offsets)
+
+    @property
+    def gradient_names(self) -> tuple[str, ...]:
+        """The same as the prediction names what it differentiates by."""
+        return tuple(_GRADIENT_NAMES.get(name, name) for name in self.names)
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bounds, shape (k,)."""
+        size = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
+        delay = _DELAY_RANGE_S / _DELAY_UNIT_S
+        ranges = {
+            "zeta": size,
+            "alpha": ORDER_RANGE,
+            "gamma": size,
+            "lambda": ORDER_RANGE,
+            "density_over_stiffness": (-_BEAM_RANGE, _BEAM_RANGE),
+            "bending_stiffness_n_m2": (-_BEAM_RANGE, _BEAM_RANGE),
+            "delay_s": (-delay, delay),
+            "tool_inertia_kg_m2": (0.0, 1.0),
+        }
+        ranges |= dict.fromkeys(self.offsets, (-_OFFSET_RANGE, _OFFSET_RANGE))
+        low, high = zip(*(ranges[name] for name in self.names), strict=True)
+        return np.array(low), np.array(high)
+
+    def start(self, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vector with damping as `analysis.starts` gives it, settings at their nominal values.
+
+        Parameters
+        ----------
+        sizes : ndarray, shape (len(structure.free),)
+            ``ln z``, ``alpha``, ``ln g`` and ``lambda``, those that are free.
+        """
+        nominal = self.nominal
+        at: dict[str, float] = {
+            **dict(self.structure.fixed.items()),
+            **dict(zip(self.structure.free, sizes.tolist(), strict=True)),
+            "density_over_stiffness": 0.0,
+            "bending_stiffness_n_m2": 0.0,
+            "delay_s": nominal.delay_s / _DELAY_UNIT_S,
+            "tool_inertia_kg_m2": nominal.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
+            **dict.fromkeys(self.offsets, 0.0),
+        }
+        for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
+            if coefficient in self.names:
+                at[coefficient] += math.log(math.sin(_QUARTER_TURN * at[order]))
+        return np.array([at[name] for name in self.names])
+
+    def plant(self, x: NDArray[np.float64]) -> Plant:
+        """Everything the prediction depends on, at `x`."""
+        values = self._values(x)[0]
+        ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
+        return Plant(
+            beam=Beam(self.nominal.beam.length_m, ratio * stiffness, stiffness),
+            damping=self.structure.damping({name: values[name] for name in self.structure.free}),
+            delay_s=values["delay_s"],
+            tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
+            stiffness_offsets=tuple(values[name] for name in self.offsets),
+        )
+
+    def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
+
+        Those of `LOGARITHMIC` count as logarithms.
+        """
+        derivative: NDArray[np.float64] = self._values(x)[1]
+        return derivative
+
+    def gradient_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Differentiate what the prediction is differentiated by (`gradient_names`).
+
+        That is zeta and gamma themselves, not their logarithms.
+        """
+        values, derivative = self._values(x)
+        coefficients = ("zeta", "gamma")
+        units = [values[name] if name in coefficients else 1.0 for name in self.names]
+        scaled: NDArray[np.float64] = derivative * np.array(units)[:, None]
+        return scaled
+
+    def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
+        """All parameters at `x`, and `estimates_by_unknowns`."""
+        place = {name: i for i, name in enumerate(self.names)}
+        given: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
+        values: dict[str, float] = {**self.nominal.parameters, **dict(self.structure.fixed.items())}
+        derivative = np.eye(x.size)
+        first, second = self.omega_rad_s
+        # How much the damping adds to stiffness and inertia, as logarithms, and who moves that.
+        stiffening, inertial = np.zeros((2, x.size + 1))
+        if self.structure.internal:
+            values["alpha"] = order = given.get("alpha", values["alpha"])
+            ln_z, slope = _size(given["zeta"], order)
+            values["zeta"] = math.exp(ln_z - order * math.log(second))
+            stiffening = self._addition(ln_z, order, 1.0, "zeta", "alpha", slope)
+            if "alpha" in place:
+                derivative[place["zeta"], place["alpha"]] = slope - math.log(second)
+        if self.structure.external:
+            values["lambda"] = order = given.get("lambda", values["lambda"])
+            ln_g, slope = _size(given["gamma"], order)
+            inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
+            if "lambda" in place:
+                derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
+        for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
+            if name in place:
+                added = sign * stiffening - (inertial if sign > 0 else 0.0)
+                values[name] *= math.exp(given[name] + added[-1])
+                derivative[place[name]] += added[:-1]
+        if self.structure.external:
+            ratio = values["density_over_stiffness"]
+            values["gamma"] = ratio * math.exp(ln_g + (2 - values["lambda"]) * math.log(first))
+            if "density_over_stiffness" in place:
+                derivative[place["gamma"]] += derivative[place["density_over_stiffness"]]
+        units = dict.fromkeys(self.offsets, 1.0)
+        units |= {"delay_s": _DELAY_UNIT_S, "tool_inertia_kg_m2": self.nominal.beam.inertia_kg_m2}
+        for name in units.keys() & place.keys():
+            values[name] = given[name] * units[name]
+            derivative[place[name], place[name]] = units[name]
+        return values, derivative
+
+    def _addition(
+        self, ln_size: float, order: float, sign: float, coefficient: str, of: str, slope: float
+    ) -> NDArray[np.float64]:
+        """Slopes of ``ln |1 ± size exp(j order pi/2)|`` by the unknowns, and last the value.
+
+        `slope` is that of `ln_size` by the order at constant loss.
+        """
+        size, angle = sign * math.exp(ln_size), _QUARTER_TURN * order
+        square = 1 + 2 * size * math.cos(angle) + size * size
+        by_ln_size = size * (math.cos(angle) + size) / square
+        addition = np.zeros(len(self.names) + 1)
+        addition[self.names.index(coefficient)] = by_ln_size
+        if of in self.names:
+            turning = -_QUARTER_TURN * size * math.sin(angle) / square
+            addition[self.names.index(of)] = by_ln_size * slope + turning
+        addition[-1] = math.log(square) / 2
+        return addition
+
+
+def _size(ln_loss: float, order: float) -> tuple[float, float]:
+    """``ln size`` of a damping of that loss, and its slope by the order."""
+    angle = _QUARTER_TURN * order
+    return ln_loss - math.log(math.sin(angle)), -_QUARTER_TURN / math.tan(angle)

@@ -1,0 +1,142 @@
+"""Sessions of a plant whose parameters are known, made in the frequency domain.
+
+The torque is the exact beam's response to a chirp through a motor loop of 20 Hz, at the full rate
+and with zeros for three times as long again: another grid of s than the estimator's, and no band.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analysis.whole_record import Measurement
+from rigd.beam import Beam, Damping, clamped_free_eigenvalues, participation, transfer
+
+RATE_HZ = 1000.0
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+PLANTS = {
+    "VI": Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
+    "III": Damping(zeta=0.54e-4, alpha=1.0, gamma=0.02, lambda_=1.0),
+    "IV": Damping(zeta=2.49e-4, alpha=0.8, gamma=0.0, lambda_=0.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What the instruments would give, without noise."""
+
+    angle_rad: NDArray[np.float64]
+    torque_nm: NDArray[np.float64]
+
+    def measured(
+        self,
+        noise_nm: float = 0.0,
+        seed: int = 0,
+        beam: Beam = LINK,
+        unknown_angle: NDArray[np.intp] | None = None,
+        unknown_torque: NDArray[np.intp] | None = None,
+        rest_angle_rad: float | None = 0.0,
+    ) -> Measurement:
+        """As the estimator gets it; unknown values are nonsense in it."""
+        n = self.angle_rad.size
+        noise = np.random.default_rng(seed).normal(scale=noise_nm or 1.0, size=n)
+        angle = self.angle_rad.copy()
+        torque = self.torque_nm + (noise if noise_nm else 0.0)
+        angle_known, torque_known = np.ones((2, n), dtype=bool)
+        if unknown_angle is not None:
+            angle_known[unknown_angle] = False
+            angle[unknown_angle] = np.nan
+        if unknown_torque is not None:
+            torque_known[unknown_torque] = False
+            torque[unknown_torque] = 1e3
+        return Measurement(
+            name="session.mcap",
+            angle_rad=angle,
+            torque_nm=torque,
+            rate_hz=RATE_HZ,
+            beam=beam,
+            angle_known=angle_known,
+            torque_known=torque_known,
+            rest_angle_rad=rest_angle_rad,
+        )
+
+    def cut(self, first: int, end: int | None = None) -> "Session":
+        return Session(self.angle_rad[first:end], self.torque_nm[first:end])
+
+
+def beyond_uniform(s, beam, damping, offsets):
+    """Modes 2, 3, … with another stiffness in place of their own."""
+    p = beam.density_kg_per_m * s**2
+    p = p + damping.gamma * beam.bending_stiffness_n_m2 * s**damping.lambda_
+    q = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
+    shares = participation(beam, 1 + len(offsets))[1:]
+    of_modes = (clamped_free_eigenvalues(1 + len(offsets))[1:] / beam.length_m) ** 4
+    more = 0
+    for share, k, offset in zip(shares, of_modes, offsets, strict=True):
+        loose = k * (1 + offset)
+        more = more + share * p * q * (loose / (q * loose + p) - k / (q * k + p))
+    return more
+
+
+def response(reference, damping, beam, delay_s, tool_inertia_kg_m2, offsets):
+    n = reference.size
+    padded = 4 * n
+    decay = np.exp(-5.0 * np.arange(n) / n)
+    s = 5.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(padded, 1 / RATE_HZ)
+    loop = 2 * np.pi * 20
+    angle = np.fft.rfft(reference * decay, padded) / (1 + 1.4 * s / loop + (s / loop) ** 2)
+    g = transfer(s, beam, damping) + beyond_uniform(s, beam, damping, offsets)
+    torque = angle * (g + tool_inertia_kg_m2 * s**2)
+    torque *= np.exp(-s * delay_s)
+    return Session(*(np.fft.irfft(x, padded)[:n] / decay for x in (angle, torque)))
+
+
+@cache
+def session(
+    name: str,
+    beam: Beam = LINK,
+    delay_s: float = 0.0,
+    tool_inertia_kg_m2: float = 0.0,
+    shaken: bool = False,
+    offsets: tuple[float, ...] = (),
+) -> Session:
+    """One second of rest, 0.05-50 Hz in 60 s, 10 s of ring-down; if shaken, 5 s of that before."""
+    before = 5.0 if shaken else 0.0
+    t = np.arange(round((before + 71) * RATE_HZ)) / RATE_HZ - before - 1
+    phase = 2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 120)
+    reference = np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
+    reference[t < -2] += 0.01 * np.sin(2 * np.pi * 2.6 * (t[t < -2] + 1 + before))
+    reference[t < -2] += 0.002 * np.sin(2 * np.pi * 16 * (t[t < -2] + 1 + before))
+    return response(reference, PLANTS[name], beam, delay_s, tool_inertia_kg_m2, offsets)
+
+
+@pytest.fixture(scope="session")
+def sessions():
+    """Make a session of one of the `PLANTS`: see `session`."""
+    return session
+
+
+@pytest.fixture(scope="session")
+def plants():
+    return PLANTS
+
+
+def truth(name, beam=LINK, delay_s=0.0, tool_inertia_kg_m2=0.0):
+    damping = PLANTS[name]
+    return {
+        "zeta": damping.zeta,
+        "alpha": damping.alpha,
+        "gamma": damping.gamma,
+        "lambda": damping.lambda_,
+        "density_over_stiffness": beam.density_over_stiffness,
+        "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
+        "delay_s": delay_s,
+        "tool_inertia_kg_m2": tool_inertia_kg_m2,
+    }
+
+
+@pytest.fixture(scope="session")
+def true_parameters():
+    return truth

@@ -1,0 +1,299 @@
+"""Whole records of known plants: their parameters come back, with errors as large as stated."""
+
+import numpy as np
+import pytest
+
+from analysis.structures import STRUCTURES
+from analysis.whole_record import SETTINGS, MeasurementError, fit_record
+from rigd.beam import Beam, modes
+
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+OTHER = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)
+"""rho/EI off by 1 %, EI by 2 %."""
+
+
+def fit(measurement, name, **options):
+    (found,) = fit_record(measurement, [STRUCTURES[name]], **options).fits
+    return found
+
+
+def assert_exact(found, expected, relative=1e-6):
+    for name, value in expected.items():
+        absolute = 1e-4 * relative  # of what is nought: delay in s, inertia in kg m²
+        assert found.parameters[name] == pytest.approx(value, rel=relative, abs=absolute), name
+
+
+def assert_within(found, expected, errors=4.0):
+    for name, std in found.std.items():
+        assert std is not None
+        assert abs(found.parameters[name] - expected[name]) <= errors * std, name
+
+
+@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+def test_without_noise_the_plant_itself(sessions, true_parameters, name):
+    found = fit(sessions(name).measured(), name)
+    assert_exact(found, true_parameters(name))
+    assert found.parameters["tool_inertia_kg_m2"] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+def test_without_noise_beam_delay_and_clamp_that_nobody_declared(sessions, true_parameters, name):
+    undeclared = {"beam": OTHER, "delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}
+    found = fit(sessions(name, **undeclared).measured(), name)
+    assert_exact(found, true_parameters(name, **undeclared))
+    assert found.plant.beam.density_kg_per_m == pytest.approx(OTHER.density_kg_per_m)
+
+
+@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+def test_with_noise_within_its_own_error(sessions, true_parameters, name):
+    undeclared = {"beam": OTHER, "delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}
+    found = fit(sessions(name, **undeclared).measured(noise_nm=1e-2, seed=31), name)
+    assert_within(found, true_parameters(name, **undeclared))
+    assert found.parameters["delay_s"] == pytest.approx(3e-4, abs=1e-5)
+    assert 0 < found.std["delay_s"] < 2e-5
+    assert found.std["alpha"] == (0.0 if name == "III" else pytest.approx(3e-3, abs=3e-3))
+    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
+    assert not found.at_bounds
+    assert not found.ringing.significant
+
+
+def test_a_far_wrong_beam_is_found(sessions, true_parameters):
+    nominal = Beam(0.98, 4.7e-3 * 0.85, 0.090275 * 1.1)
+    found = fit(sessions("VI").measured(noise_nm=1e-2, seed=5, beam=nominal), "VI")
+    assert_within(found, true_parameters("VI"))
+
+
+def test_what_is_fixed_stays_and_more_is_known_of_the_rest(sessions):
+    measurement = sessions("VI").measured(noise_nm=1e-2, seed=7)
+    free = fit(measurement, "VI")
+    fixed = fit(measurement, "VI", fixed=SETTINGS)
+    assert fixed.parameters["density_over_stiffness"] == pytest.approx(LINK.density_over_stiffness)
+    assert fixed.parameters["delay_s"] == fixed.parameters["tool_inertia_kg_m2"] == 0
+    assert [fixed.std[name] for name in SETTINGS] == [0.0] * 4
+    assert fixed.std["zeta"] < 0.5 * free.std["zeta"]
+    assert fixed.determined == ("zeta", "alpha", "gamma", "lambda")
+    one = fit(measurement, "VI", fixed=["delay_s"])
+    assert one.std["delay_s"] == 0.0 < one.std["bending_stiffness_n_m2"]
+
+
+def test_errors_that_are_held_fixed_are_read_as_damping(sessions):
+    wrong = sessions("VI", beam=OTHER, delay_s=3e-4).measured()
+    found = fit(wrong, "VI", fixed=["density_over_stiffness"])
+    assert abs(found.parameters["alpha"] - 0.996) > 0.1
+
+
+@pytest.mark.parametrize("name", ["VI", "III", "IV"])
+def test_a_beam_that_rings_from_the_start(sessions, true_parameters, name):
+    shaken = sessions(name, shaken=True).cut(5000)
+    assert_exact(fit(shaken.measured(), name), true_parameters(name), relative=2e-5)
+    found = fit(shaken.measured(noise_nm=1e-2, seed=12), name)
+    assert_within(found, true_parameters(name))
+    assert found.ringing.significant
+    assert found.ringing.amplitude_nm[0] > 0.05
+
+
+def test_a_record_cut_out_of_the_sweep(sessions, true_parameters):
+    part = sessions("III").cut(3000, 58_000)
+    found = fit(part.measured(rest_angle_rad=None), "III")
+    assert_exact(found, true_parameters("III"), relative=1e-5)
+
+
+def test_unknown_ticks_do_not_count(sessions, true_parameters):
+    session = sessions("VI")
+    rng = np.random.default_rng(3)
+    n = session.angle_rad.size
+    scattered = rng.choice(n, n // 200, replace=False)
+    runs = (rng.choice(n // 100, 20, replace=False)[:, None] * 100 + np.arange(6)).ravel()
+    gap = np.arange(5000, 5600)
+    found = fit(session.measured(unknown_angle=runs, unknown_torque=scattered), "VI")
+    assert_exact(found, true_parameters("VI"), relative=1e-4)
+    torque = np.unique(np.concatenate((scattered, runs, gap)))
+    noisy = {"noise_nm": 1e-2, "seed": 8}
+    every = fit(session.measured(**noisy), "VI")
+    found = fit(session.measured(**noisy, unknown_angle=runs, unknown_torque=torque), "VI")
+    assert_within(found, true_parameters("VI"))
+    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
+    assert found.degrees_of_freedom < every.degrees_of_freedom
+    for name in ("zeta", "gamma"):
+        assert every.std[name] < found.std[name] < 1.5 * every.std[name]
+
+
+def test_coloured_noise_is_whitened(sessions, true_parameters):
+    session = sessions("VI")
+    rng = np.random.default_rng(4)
+    n = session.torque_nm.size
+    hz = np.fft.rfftfreq(n, 1e-3)
+    spectrum = np.fft.rfft(rng.normal(scale=1e-2, size=n)) * (0.2 + 3 / (1 + (hz / 3) ** 2))
+    noisy = type(session)(session.angle_rad, session.torque_nm + np.fft.irfft(spectrum, n))
+    analysis = fit_record(noisy.measured(), [STRUCTURES["VI"]])
+    (found,) = analysis.fits
+    assert_within(found, true_parameters("VI"))
+    density = 2 * 1e-4 / 1000 * (0.2 + 3 / (1 + (analysis.frequency_hz / 3) ** 2)) ** 2
+    middle = (analysis.frequency_hz > 5) & (analysis.frequency_hz < 45)
+    assert analysis.noise_nm2_per_hz[middle] == pytest.approx(density[middle], rel=0.6)
+    low, high = found.residual[:500], found.residual[-500:]
+    assert np.mean(np.abs(low) ** 2) == pytest.approx(2.0, rel=0.2)
+    assert np.mean(np.abs(high) ** 2) == pytest.approx(2.0, rel=0.2)
+
+
+def test_a_hum_is_named_and_moves_nothing(sessions):
+    session = sessions("VI")
+    t = np.arange(session.torque_nm.size) / 1000
+    humming = type(session)(
+        session.angle_rad, session.torque_nm + 0.05 * np.sin(2 * np.pi * 49.98 * t)
+    )
+    without = fit(session.measured(noise_nm=1e-2, seed=14), "VI")
+    analysis = fit_record(humming.measured(noise_nm=1e-2, seed=14), [STRUCTURES["VI"]])
+    (found,), (line,) = analysis.fits, analysis.lines
+    assert line.frequency_hz == pytest.approx(49.98, abs=0.01)
+    assert line.amplitude_nm == pytest.approx(0.05, rel=0.05)
+    assert (found.residual[~analysis.compared] == 0).all()
+    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
+    for name in without.determined:
+        difference = abs(found.parameters[name] - without.parameters[name])
+        assert difference < 0.7 * without.std[name]
+
+
+def test_what_a_wrong_structure_leaves_is_no_hum(sessions):
+    analysis = fit_record(sessions("VI").measured(noise_nm=1e-2, seed=9), [STRUCTURES["II"]])
+    assert analysis.lines == ()
+    assert analysis.fits[0].cost > 2 * analysis.fits[0].degrees_of_freedom
+
+
+def test_a_beam_that_is_not_uniform(sessions, true_parameters):
+    offsets = (0.006, -0.013)
+    session = sessions("III", offsets=offsets)
+    expected = {
+        **true_parameters("III"),
+        "stiffness_offset_2": offsets[0],
+        "stiffness_offset_3": offsets[1],
+    }
+    assert_exact(fit(session.measured(), "VII", uniform=False), expected)
+    measurement = session.measured(noise_nm=1e-2, seed=17)
+    found = fit(measurement, "VII", uniform=False)
+    assert_within(found, expected)
+    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
+    assert found.modes[1].frequency_hz == pytest.approx(100.55 * 1.003 / (2 * np.pi), rel=1e-3)
+    as_if = fit(measurement, "VI")  # what is not uniform passes for an order of the damping
+    assert abs(as_if.parameters["alpha"] - 1) > 10 * as_if.std["alpha"]
+
+
+@pytest.fixture(scope="module")
+def all_seven(sessions):
+    measurement = sessions("VI").measured(noise_nm=1e-2, seed=9)
+    return {found.structure.name: found for found in fit_record(measurement).fits}
+
+
+def test_more_freedom_never_costs(all_seven):
+    assert list(all_seven) == list(STRUCTURES)
+    for wider, narrower in [
+        ("III", "I"), ("III", "II"), ("IV", "I"), ("V", "II"), ("VII", "III"), ("VI", "VII"),
+        ("VI", "IV"), ("VI", "V"),
+    ]:  # fmt: skip
+        assert all_seven[wider].cost <= all_seven[narrower].cost * (1 + 1e-6)
+
+
+def test_the_wrong_structures_are_far_off(all_seven):
+    for name in ("I", "II", "III", "IV", "V"):
+        assert all_seven[name].cost > all_seven["VI"].cost + 100
+    assert all_seven["VII"].cost < all_seven["VI"].cost + 20  # alpha = 0.996
+
+
+def test_intervals_correlations_and_what_follows(all_seven, true_parameters):
+    found = all_seven["VI"]
+    for name in found.determined:
+        low, high = found.interval[name]
+        assert low < found.parameters[name] < high
+        assert high - low == pytest.approx(2 * 1.96 * found.std[name], rel=0.05)
+    at = found.determined.index
+    correlation = found.correlation
+    assert np.diag(correlation) == pytest.approx(1.0)
+    assert correlation[at("zeta"), at("alpha")] < -0.9
+    assert correlation[at("gamma"), at("lambda")] < -0.7
+    for size, coefficient, order in (
+        (found.internal, "zeta", "alpha"),
+        (found.external, "gamma", "lambda"),
+    ):
+        truth = true_parameters("VI")
+        expected = truth[coefficient] * size.omega_rad_s ** truth[order]
+        assert abs(size.value - expected) < 4 * size.std
+        assert size.std / size.value < 0.5 * found.std[coefficient] / found.parameters[coefficient]
+    assert all_seven["I"].internal.omega_rad_s is None
+    assert all_seven["I"].external is None
+
+
+def test_the_modal_table(all_seven, plants):
+    found = all_seven["VI"]
+    plant = modes(LINK, plants["VI"], 3)
+    fitted = modes(found.plant.beam, found.plant.damping, 3)
+    for row, expected, own in zip(found.modes, plant, fitted, strict=True):
+        assert row.number == own.number
+        assert row.frequency_hz == pytest.approx(own.frequency_hz, rel=1e-9)
+        assert row.damping_ratio == pytest.approx(own.damping_ratio, rel=1e-9)
+        assert abs(row.frequency_hz - expected.frequency_hz) < 4 * row.frequency_std_hz
+        assert abs(row.damping_ratio - expected.damping_ratio) < 4 * row.damping_ratio_std
+        assert 0 < row.frequency_std_hz < 1e-2
+        assert 0 < row.damping_ratio_std < 0.02 * row.damping_ratio
+
+
+def test_a_narrower_band(sessions, true_parameters):
+    measurement = sessions("III").measured(noise_nm=1e-2, seed=10)
+    analysis = fit_record(measurement, [STRUCTURES["VII"]], band_hz=(1.0, 20.0))
+    (found,) = analysis.fits
+    assert analysis.frequency_hz[[0, -1]] == pytest.approx([1.0, 20.0], abs=0.03)
+    assert len(found.modes) == 2
+    assert_within(found, true_parameters("III"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        ({"unknown_angle": np.arange(900, 920)}, "angle is missing.*20 ticks from tick 900"),
+        ({"unknown_torque": np.arange(900, 2901)}, "torque is missing.*2001 ticks.*tolerates"),
+        ({"unknown_torque": np.arange(0, 71_000, 10)}, "10 % of the torque"),
+    ],
+)
+def test_too_much_unknown(sessions, spoil, message):
+    with pytest.raises(MeasurementError, match=rf"session.mcap.*{message}"):
+        fit(sessions("VI").measured(**spoil), "III")
+
+
+def test_values_that_are_not_finite(sessions):
+    measurement = sessions("VI").measured()
+    measurement.torque_nm[70] = np.inf
+    with pytest.raises(MeasurementError, match="torque is inf N·m at tick 70"):
+        fit(measurement, "III")
+
+
+def test_nothing_moved(sessions):
+    measurement = sessions("VI").measured()
+    measurement.angle_rad[:] = 1.0
+    with pytest.raises(MeasurementError, match="angle never changes"):
+        fit(measurement, "III")
+
+
+def test_too_short_or_no_band(sessions):
+    session = sessions("VI")
+    with pytest.raises(MeasurementError, match=r"0\.9 s of record are too short"):
+        fit(session.cut(1000, 1900).measured(), "III")
+    with pytest.raises(MeasurementError, match=r"0\.2 s of record are too short"):
+        fit(session.cut(1000, 1200).measured(), "III")
+    for band in ((0.0, 500.0), (50.0, 10.0), (-1.0, 50.0)):
+        with pytest.raises(MeasurementError, match="choose another"):
+            fit(session.measured(), "III", band_hz=band)
+
+
+def test_lengths_that_differ(sessions):
+    session = sessions("VI")
+    whole, part = session.measured(), session.cut(0, 70_000).measured()
+    mixed = type(whole)(
+        **{name: getattr(whole, name) for name in whole.__dataclass_fields__}
+        | {"torque_nm": part.torque_nm}
+    )
+    with pytest.raises(MeasurementError, match="71000 and 70000 values"):
+        fit(mixed, "III")
+
+
+def test_no_such_setting(sessions):
+    with pytest.raises(ValueError, match="'mass'"):
+        fit(sessions("VI").measured(), "III", fixed=["mass"])

@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from analysis.whole_record import Plant
+from analysis.whole_record.free_decay import DecaySpectra, Pole, mode_poles
+from rigd.beam import Beam, Damping, poles
+
+BEAM = Beam(0.98, 4.7e-3, 0.090275)
+NAMES = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
+FRACTIONAL = Damping(7.1e-5, 0.996, 5.5e-2, 0.594)
+OVER_DAMPED = Damping(0.03, 1.0, 0.02, 1.0)
+
+
+def at(values):
+    ratio, stiffness = np.exp(values[4]), np.exp(values[5])
+    return Plant(Beam(0.98, ratio * stiffness, stiffness), Damping(*values[:4]))
+
+
+@pytest.mark.parametrize("damping", [FRACTIONAL, OVER_DAMPED])
+def test_poles_and_their_derivatives(damping):
+    values = [damping.zeta, damping.alpha, damping.gamma, damping.lambda_]
+    values = np.array(
+        [*values, np.log(BEAM.density_over_stiffness), np.log(BEAM.bending_stiffness_n_m2)]
+    )
+    found = mode_poles(at(values), 3, NAMES)
+    expected = poles(BEAM, damping, 3)
+    flat = [p for pair in expected for p in (pair[:1] if pair[0].imag else pair)]
+    assert [pole.at_rad_s for pole in found] == pytest.approx(flat)
+    for i, name in enumerate(NAMES):
+        if damping is OVER_DAMPED and name in ("alpha", "lambda"):
+            continue  # beside order 1 the real poles are no longer such
+        step = np.zeros(6)
+        step[i] = 1e-6 * (abs(values[i]) or 1.0)
+        after, before = (mode_poles(at(values + s), 3, ()) for s in (step, -step))
+        for pole, p, q in zip(found, after, before, strict=True):
+            slope = (p.at_rad_s - q.at_rad_s) / (2 * step[i])
+            assert pole.derivative[i] == pytest.approx(slope, rel=1e-4, abs=1e-6)
+            if name == "ln_stiffness":
+                assert pole.derivative[i] == 0
+
+
+def test_an_offset_moves_its_own_mode():
+    names = ("stiffness_offset_2", "stiffness_offset_3", "delay_s")
+    loose, after, before = (
+        mode_poles(Plant(BEAM, FRACTIONAL, stiffness_offsets=(0.03, -0.05 + h)), 3, names)
+        for h in (0.0, 1e-6, -1e-6)
+    )
+    uniform = mode_poles(Plant(BEAM, FRACTIONAL), 3, ())
+    ratio = [abs(p.at_rad_s) / abs(q.at_rad_s) for p, q in zip(loose, uniform, strict=True)]
+    assert ratio == pytest.approx([1, 1.03**0.5, 0.95**0.5], rel=1e-3)
+    slope = (after[2].at_rad_s - before[2].at_rad_s) / 2e-6
+    assert loose[2].derivative == pytest.approx([0, slope, 0], rel=1e-6)
+    assert loose[0].derivative == pytest.approx([0, 0, 0])
+
+
+def signal(pole, t):
+    wave = np.exp(pole.at_rad_s * t)
+    return [wave.real, wave.imag] if pole.oscillates else [wave.real]
+
+
+def test_spectra_are_those_of_the_decays():
+    samples, rate_hz = 500, 125.0
+    bins = slice(1, 120)
+    omega = 2 * np.pi * np.fft.rfftfreq(samples, 1 / rate_hz)[bins]
+    t = np.arange(samples) / rate_hz
+    spectra = DecaySpectra(samples, rate_hz, omega)
+    derivative = np.array([1 + 2j, -0.5j, 0.3])
+    some = [Pole(1, -0.15 + 16j, derivative), Pole(2, -4.0 + 0j, derivative.real + 0j)]
+    expected = np.fft.rfft([wave for pole in some for wave in signal(pole, t)])[:, bins]
+    assert spectra.columns(some) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+    amplitudes = np.array([0.7, -0.4, 1.2])
+    gradient = spectra.gradient(some, amplitudes)
+    for k in range(3):
+        after, before = (
+            [Pole(p.mode, p.at_rad_s + h * p.derivative[k], p.derivative) for p in some]
+            for h in (1e-6, -1e-6)
+        )
+        numeric = amplitudes @ (spectra.columns(after) - spectra.columns(before)) / 2e-6
+        assert gradient[k] == pytest.approx(numeric, rel=1e-5, abs=1e-5)
+
+
+def test_no_mode_no_column():
+    spectra = DecaySpectra(100, 125.0, np.array([1.0, 2.0]))
+    assert spectra.columns(()).shape == (0, 2)
+    assert mode_poles(Plant(BEAM, FRACTIONAL), 0, NAMES) == ()

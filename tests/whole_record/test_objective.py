@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+
+from analysis.structures import STRUCTURES
+from analysis.whole_record import SETTINGS, Plant
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.objective import Objective
+from analysis.whole_record.unknowns import Unknowns
+from rigd.beam import Beam, Damping
+
+NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())
+
+
+@pytest.fixture(scope="module")
+def objective(sessions):
+    measurement = sessions("VI", shaken=True).cut(5000).measured(noise_nm=1e-2)
+    comparison = Comparison.of(measurement, (0.0, 50.0))
+    return Objective(comparison, Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS))
+
+
+def test_the_gradient_is_that_of_the_cost(objective):
+    weight = np.linspace(1.0, 2.0, objective.comparison.frequency_hz.size)
+    x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
+    x[-1] = 0.01
+    here = objective.normal_equations(x, weight)
+    for k, step in enumerate(1e-6 * np.eye(x.size)):
+        after, before = (objective.normal_equations(x + s, weight).cost for s in (step, -step))
+        assert 2 * here.gradient[k] == pytest.approx((after - before) / 2e-6, rel=2e-4)
+
+
+def test_free_decay_does_not_count(objective):
+    x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
+    at = objective.linearise(x)
+    projected = objective.project(at, 2.0)
+    ringing = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.4])
+    with_more = type(at)(at.residual + ringing @ at.columns, at.jacobian, at.poles, at.columns)
+    again = objective.project(with_more, 2.0)
+    assert again.residual == pytest.approx(projected.residual, abs=1e-6)
+    assert again.amplitudes == pytest.approx(projected.amplitudes - ringing, abs=1e-8)
+    columns = at.columns * 2
+    assert np.abs((columns.conj() @ again.residual).real).max() < 1e-6 * np.abs(columns).max() ** 2
+
+
+def test_a_point_seen_lately_costs_nothing(objective):
+    x = objective.unknowns.start(np.array([-4.6, 1.0, -3.0, 0.8]))
+    assert objective.linearise(x) is objective.linearise(x.copy())

@@ -1,0 +1,76 @@
+"""Predicted torque: the synthesis' torque in the band, and derivatives that differences confirm."""
+
+import numpy as np
+import pytest
+
+from analysis.whole_record import Plant
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.decimation import Decimation
+from analysis.whole_record.prediction import Prediction
+from rigd.beam import PARAMETERS, Beam, Damping
+
+OFFSETS = ("stiffness_offset_2", "stiffness_offset_3")
+WRT = (*PARAMETERS, "delay_s", "tool_inertia_kg_m2", *OFFSETS)
+
+
+@pytest.fixture(scope="module")
+def plant(link):
+    return Plant(link, Damping(7.1e-5, 0.996, 5.5e-2, 0.594), 3e-4, 1e-5, (0.03, -0.05))
+
+
+@pytest.fixture(scope="module")
+def link():
+    return Beam(0.98, 4.7e-3, 0.090275)
+
+
+@pytest.mark.parametrize(
+    "more", [{}, {"delay_s": 3e-4, "tool_inertia_kg_m2": 1e-5}, {"offsets": (0.03, -0.05)}]
+)
+def test_the_torque_of_an_independent_synthesis(sessions, link, plant, more):
+    compared = Comparison.of(sessions("VI", **more).measured(), (0.0, 50.0))
+    renamed = {name.replace("offsets", "stiffness_offsets"): value for name, value in more.items()}
+    torque, _ = compared.prediction.torque(Plant(link, plant.damping, **renamed))
+    measured = compared.torque_nm[compared.kept]
+    assert np.sqrt(np.mean((torque - measured) ** 2)) < 1e-8 * measured.std()
+
+
+def moved(plant, name, step):
+    beam = plant.beam
+    ratio, stiffness = beam.density_over_stiffness, beam.bending_stiffness_n_m2
+    at = plant.parameters
+    match name:
+        case "ln_density_over_stiffness":
+            ratio *= np.exp(step)
+        case "ln_stiffness":
+            stiffness *= np.exp(step)
+        case _:
+            at[name] += step
+    return Plant(
+        Beam(beam.length_m, ratio * stiffness, stiffness),
+        Damping(at["zeta"], at["alpha"], at["gamma"], at["lambda"]),
+        at["delay_s"],
+        at["tool_inertia_kg_m2"],
+        tuple(at[name] for name in OFFSETS),
+    )
+
+
+@pytest.mark.parametrize("name", WRT)
+def test_derivatives(plant, name):
+    angle = np.random.default_rng(1).normal(size=400)
+    prediction = Prediction(angle, 125.0, slice(10, 390))
+    _, gradient = prediction.torque(plant, WRT)
+    step = 1e-5 * (plant.parameters.get(name) or 1.0)
+    after, _ = prediction.torque(moved(plant, name, step))
+    before, _ = prediction.torque(moved(plant, name, -step))
+    analytic = gradient[WRT.index(name)]
+    assert np.abs((after - before) / (2 * step) - analytic).max() < 1e-6 * np.abs(analytic).max()
+
+
+def test_between_the_samples_it_is_the_same(plant):
+    noise = np.random.default_rng(1).normal(size=3200)
+    angle = Decimation.to_band(1000.0, 50.0).apply(noise)
+    prediction = Prediction(angle, 125.0, slice(0, 400))
+    torque, gradient = prediction.torque(plant, WRT)
+    at, gradient_at = prediction.torque_between(plant, 8, np.arange(0, 3200, 8), WRT)
+    assert np.abs(at - torque).max() < 1e-3 * torque.std()
+    assert (np.abs(gradient_at - gradient).max(axis=1) < 1e-3 * gradient.std(axis=1)).all()

@@ -1,0 +1,103 @@
+import math
+
+import numpy as np
+import pytest
+
+from analysis.structures import STRUCTURES
+from analysis.whole_record import SETTINGS, Plant
+from analysis.whole_record.plant import LOGARITHMIC
+from analysis.whole_record.unknowns import Unknowns
+from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
+
+NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping(), 1e-4, 1e-5)
+SIZES = {"zeta": -2.0, "alpha": 0.7, "gamma": -1.0, "lambda": 1.3}
+
+
+def start(unknowns):
+    return unknowns.start(np.array([SIZES[name] for name in unknowns.structure.free]))
+
+
+@pytest.mark.parametrize("free", [SETTINGS, (), SETTINGS[:1], SETTINGS[1:3], SETTINGS[3:]])
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_derivatives(name, free):
+    unknowns = Unknowns.of(STRUCTURES[name], NOMINAL, free)
+    x = start(unknowns) + np.random.default_rng(8).normal(scale=0.1, size=len(unknowns.names))
+
+    def estimates(at, logarithmic):
+        values = unknowns.plant(at).parameters
+        return np.array(
+            [math.log(values[n]) if n in logarithmic else values[n] for n in unknowns.names]
+        )
+
+    for derivative, logarithmic in (
+        (unknowns.estimates_by_unknowns(x), LOGARITHMIC),
+        (unknowns.gradient_by_unknowns(x), LOGARITHMIC - {"zeta", "gamma"}),
+    ):
+        numeric = np.array(
+            [
+                (estimates(x + 1e-6 * e, logarithmic) - estimates(x - 1e-6 * e, logarithmic)) / 2e-6
+                for e in np.eye(x.size)
+            ]
+        ).T
+        assert derivative == pytest.approx(numeric, abs=1e-8)
+
+
+def test_derivatives_with_offsets():
+    unknowns = Unknowns.of(STRUCTURES["VII"], NOMINAL, SETTINGS, modes=3)
+    x = start(unknowns)
+    x[-2:] = 0.03, -0.05
+    assert unknowns.names[-2:] == ("stiffness_offset_2", "stiffness_offset_3")
+    assert unknowns.plant(x).stiffness_offsets == (0.03, -0.05)
+    derivative = unknowns.gradient_by_unknowns(x)
+    assert derivative[-2:, -2:] == pytest.approx(np.eye(2))
+    assert not derivative[-2:, :-2].any()
+    assert not derivative[:-2, -2:].any()
+
+
+def test_what_is_not_free_stays_as_it_is():
+    unknowns = Unknowns.of(STRUCTURES["III"], NOMINAL, ())
+    plant = unknowns.plant(start(unknowns))
+    assert plant.beam.density_kg_per_m == pytest.approx(NOMINAL.beam.density_kg_per_m)
+    assert plant.beam.bending_stiffness_n_m2 == NOMINAL.beam.bending_stiffness_n_m2
+    assert (plant.delay_s, plant.tool_inertia_kg_m2) == (1e-4, 1e-5)
+    assert (plant.damping.alpha, plant.damping.lambda_) == (1.0, 1.0)
+
+
+def test_an_order_alone_leaves_loss_and_stiffness_at_the_mode():
+    unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
+    x = start(unknowns)
+    first, second = undamped_frequencies_rad_s(NOMINAL.beam, 2)
+
+    def at_the_modes(at):
+        plant = unknowns.plant(at)
+        p, stiffness = plant.damping, plant.beam.bending_stiffness_n_m2
+        internal = p.zeta * (1j * second) ** p.alpha
+        ratio = plant.beam.density_over_stiffness
+        external = ratio * (1j * first) ** 2 + p.gamma * (1j * first) ** p.lambda_
+        return (
+            internal.imag,
+            stiffness * abs(1 + internal),
+            abs(external) / abs(1 + internal),
+            external.imag / ratio,
+        )
+
+    moved = x.copy()
+    moved[[1, 3]] = 0.3, 1.7
+    assert at_the_modes(moved) == pytest.approx(at_the_modes(x), rel=1e-12)
+    assert unknowns.plant(moved).parameters["zeta"] != pytest.approx(
+        unknowns.plant(x).parameters["zeta"]
+    )
+
+
+def test_starts_lie_within_the_bounds():
+    for structure in STRUCTURES.values():
+        unknowns = Unknowns.of(structure, NOMINAL, SETTINGS)
+        lower, upper = unknowns.bounds
+        x = start(unknowns)
+        assert ((lower <= x) & (x <= upper)).all()
+        assert unknowns.gradient_names[-4:] == (
+            "ln_density_over_stiffness",
+            "ln_stiffness",
+            "delay_s",
+            "tool_inertia_kg_m2",
+        )
