@@ -34,8 +34,12 @@ _FIRST_TOLERANCE: Final = 1e-3
 _TOLERANCE: Final = 1e-9
 """Of the sum of squares: less than a hundredth of a standard deviation."""
 
-_NOISE_ROUNDS: Final = (1e-4, _TOLERANCE)
-"""How far to descend each time that the noise is estimated anew; a third round moves nothing."""
+_BEFORE_LINES: Final = 1e-6
+_RESONANCE: Final = 3.0
+"""Half-widths of a resonance (damping ratio times frequency) within which no line is sought."""
+
+_RESONANCE_BINS: Final = 20
+"""The same for the sharpest of them, in bins."""
 
 _FILLINGS: Final = 8
 _SETTLED: Final = 1e-6
@@ -97,9 +101,10 @@ def fit_record(
     closest = min(starts, key=lambda start: start.minima[0].cost)
     noise = closest.lowest().noise()
     reference = closest.descent(noise)
-    for tolerance in _NOISE_ROUNDS:
-        noise = reference.noise()
-        reference = reference.settled(noise, tolerance)
+    reference = reference.settled(reference.noise(), _BEFORE_LINES)
+    # Lines are looked for once, in what a fit to every bin leaves.
+    noise = reference.noise(with_lines=True)
+    reference = reference.settled(noise, _TOLERANCE)
     descents = [
         reference if start is closest else start.descent(noise).settled(noise, _TOLERANCE)
         for start in starts
@@ -146,14 +151,26 @@ class _Descent:
                 break
         return here
 
-    def noise(self) -> Noise:
+    def noise(self, *, with_lines: bool = False) -> Noise:
         """Take for noise what remains here and is no free decay."""
         objective, comparison = self.objective, self.objective.comparison
+        at = objective.linearise(self.x)
+        near_mode = None
+        if with_lines:
+            hz = comparison.frequency_hz
+            near_mode = np.zeros(hz.size, dtype=bool)
+            for pole in at.poles:
+                width = max(
+                    _RESONANCE * abs(pole.at_rad_s.real) / (2 * np.pi),
+                    _RESONANCE_BINS * (hz[1] - hz[0]),
+                )
+                near_mode |= np.abs(hz - abs(pole.at_rad_s.imag) / (2 * np.pi)) < width
         return noise_of(
-            objective.project(objective.linearise(self.x), 1.0).residual,
+            objective.project(at, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
             comparison.measurement.torque_share,
+            near_mode,
         )
 
 

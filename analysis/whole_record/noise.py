@@ -63,6 +63,7 @@ def noise_of(
     frequency_hz: NDArray[np.float64],
     samples: int,
     share: float = 1.0,
+    near_mode: NDArray[np.bool_] | None = None,
 ) -> Noise:
     """Tell noise and hum from what a residual holds.
 
@@ -74,12 +75,17 @@ def noise_of(
     samples : int
     share : float
         Share of the samples at which the residual is known; it is nought at the others.
+    near_mode : ndarray of bool, shape (K,), optional
+        Bins that are compared whatever stands out there; without it no line is looked for. A
+        resonance that is left out is not fitted, and what is not fitted there stands out for ever.
     """
     power = smooth_power(residual) / share
     counts = np.ones(power.size, dtype=bool)
-    lines = []
+    lines: list[Line] = []
+    if near_mode is None:
+        return Noise(power, counts, ())
     for part in _standing_out(residual, power):
-        if not _steady(residual, part):
+        if near_mode[part].any() or not _steady(residual, part):
             continue
         counts[part] = False
         own = np.abs(residual[part]) ** 2

@@ -154,6 +154,15 @@ def test_a_hum_is_named_and_moves_nothing(sessions):
         assert difference < 0.7 * without.std[name]
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_no_hum_is_found_where_there_is_none(sessions, seed):
+    """What a rough start leaves at a sharp mode once passed for one, and stayed unfitted."""
+    session = sessions("IV", shaken=True).cut(5000)
+    analysis = fit_record(session.measured(noise_nm=1e-2, seed=seed), [STRUCTURES["IV"]])
+    assert analysis.lines == ()
+    assert analysis.compared.all()
+
+
 def test_what_a_wrong_structure_leaves_is_no_hum(sessions):
     analysis = fit_record(sessions("VI").measured(noise_nm=1e-2, seed=9), [STRUCTURES["II"]])
     assert analysis.lines == ()
