@@ -47,7 +47,7 @@ class ForegroundError(Exception):
 
 
 def run_in_foreground(
-    build: Callable[[float], Excitation],
+    build: Callable[[Profile], Excitation],
     crew: Crew,
     stop: StopRequest,
     *,
@@ -67,7 +67,7 @@ def run_in_foreground(
     Parameters
     ----------
     build
-        Makes the excitation for a rate in Hz.
+        Makes the excitation for a rig.
     crew
         The processes, started but not yet needed; ended when this returns.
     stop
@@ -106,7 +106,7 @@ def run_in_foreground(
             reserved.enter_context(
                 RigLock(profile.name, "rigd run", hardware=hardware, alone=alone)
             )
-            excitation = build(profile.rig.rate_hz)
+            excitation = build(profile)
             plan = plan_session(profile, excitation, force=force)
             _tell_plan(tell, profile, excitation, plan)
             make_room(folder, excitation, profile.limits)

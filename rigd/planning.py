@@ -1,15 +1,20 @@
 """What a session will do, before anything moves: stability of the loop, peaks, limits."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam import Beam
 from rigd.control import ClosedLoop, check_stability, close_loop
 from rigd.excitation import Excitation
+from rigd.excitation.named import Value, make_excitation
 from rigd.profile import Profile
 
 Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 
 class RefusedError(Exception):
@@ -38,6 +43,48 @@ class Plan:
     warnings: tuple[str, ...]
 
 
+class Foresight:
+    """What an excitation that is made for one rig may know of it.
+
+    Parameters
+    ----------
+    profile
+        Of the rig. Its loop is closed when it is first asked for.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        self._profile = profile
+
+    @property
+    def beam(self) -> Beam:
+        """The specimen as the profile has it."""
+        return self._profile.rig.beam
+
+    @cached_property
+    def _loop(self) -> ClosedLoop:
+        return close_loop(self._profile.loop_model())
+
+    def tracking(self, frequency_hz: Real) -> Complex:
+        """Angle over reference at some frequencies, of the shape given."""
+        return self._loop.response(frequency_hz)
+
+    def share_of_limits(self, reference_rad: Real) -> float:
+        """Largest share of a limit that a reference (n,) is predicted to take.
+
+        Raises
+        ------
+        ControlDesignError
+            If the loop is unstable and the response grows beyond all numbers.
+        """
+        firm, forcible = _limited(self._profile, _predict(self._loop, reference_rad))
+        return max(channel.value / channel.limit for channel in firm + forcible)
+
+
+def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value]) -> Excitation:
+    """Make an excitation for a rig: see `rigd.excitation.named.make_excitation`."""
+    return make_excitation(kind, parameters, profile.rig.rate_hz, Foresight(profile))
+
+
 def plan_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
     """Predict a session and compare it with the profile's limits.
 
@@ -61,7 +108,10 @@ def plan_session(profile: Profile, excitation: Excitation, *, force: bool = Fals
     loop = close_loop(profile.loop_model())
     unstable = check_stability(loop)
     prediction = predict(loop, excitation)
-    firm, forcible = _violations(profile, prediction)
+    firm, forcible = (
+        [finding for limited in channels if (finding := limited.violation())]
+        for channels in _limited(profile, prediction)
+    )
     if firm or (forcible and not force):
         refusals = [f"{finding}; lower the amplitude." for finding in firm]
         refusals += [
@@ -81,29 +131,54 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     ControlDesignError
         If the loop is unstable and the response grows beyond all numbers.
     """
-    response = loop.simulate(excitation.reference_rad)
+    return _predict(loop, excitation.reference_rad)
+
+
+def _predict(loop: ClosedLoop, reference_rad: Real) -> Prediction:
+    response = loop.simulate(reference_rad)
     return Prediction(
         peak_angle_rad=_peak(response.angle_rad),
         peak_velocity_rad_s=_peak(response.velocity_rad_s),
         peak_torque_nm=_peak(response.torque_nm),
-        peak_tracking_error_rad=_peak(excitation.reference_rad - response.angle_rad),
+        peak_tracking_error_rad=_peak(reference_rad - response.angle_rad),
         peak_coupling_torque_nm=_peak(response.coupling_torque_nm),
     )
 
 
-def _violations(profile: Profile, predicted: Prediction) -> tuple[list[str], list[str]]:
-    """Return what no session may do, and what clips a torque; a peak that is no number violates."""
+@dataclass(frozen=True, slots=True)
+class _Limited:
+    """A predicted peak and its limit; a peak that is no number violates it."""
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+    key: str
+
+    def violation(self) -> str | None:
+        if self.value <= self.limit:
+            return None
+        return (
+            f"The predicted peak {self.name} of {self.value:.4g} {self.unit} exceeds "
+            f"{self.limit:.4g} {self.unit} ({self.key})"
+        )
+
+
+def _limited(
+    profile: Profile, predicted: Prediction
+) -> tuple[tuple[_Limited, ...], tuple[_Limited, ...]]:
+    """Return what no session may exceed, and what clips a torque."""
     limits, motor = profile.limits, profile.rig.motor
     firm = (
-        ("angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"),
-        (
+        _Limited("angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"),
+        _Limited(
             "speed",
             predicted.peak_velocity_rad_s,
             limits.velocity_rad_s,
             "rad/s",
             "limits.velocity_rad_s",
         ),
-        (
+        _Limited(
             "tracking error",
             predicted.peak_tracking_error_rad,
             limits.tracking_error_rad,
@@ -112,24 +187,18 @@ def _violations(profile: Profile, predicted: Prediction) -> tuple[list[str], lis
         ),
     )
     forcible = (
-        (
+        _Limited(
             "coupling torque",
             predicted.peak_coupling_torque_nm,
             _sensor_limit_nm(profile),
             "N·m",
             "sensor.range",
         ),
-        ("torque", predicted.peak_torque_nm, motor.peak_torque_nm, "N·m", "motor.peak_torque_nm"),
+        _Limited(
+            "torque", predicted.peak_torque_nm, motor.peak_torque_nm, "N·m", "motor.peak_torque_nm"
+        ),
     )
-    found_firm, found_forcible = (
-        [
-            f"The predicted peak {channel} of {value:.4g} {unit} exceeds {limit:.4g} {unit} ({key})"
-            for channel, value, limit, unit, key in channels
-            if not value <= limit
-        ]
-        for channels in (firm, forcible)
-    )
-    return found_firm, found_forcible
+    return firm, forcible
 
 
 def _sensor_limit_nm(profile: Profile) -> float:

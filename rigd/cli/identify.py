@@ -108,14 +108,8 @@ def _run_sessions(
     from rigd.supervisor.crew import Crew
 
     def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
-        prepared: list[Profile] = []
-
-        def note_and_prepare(profile: "Profile") -> "Profile":
-            prepared.append(prepare(profile))
-            return prepared[0]
-
-        def build(_: float) -> "Excitation":
-            return session(prepared[0], torque_percent=torque_percent, stroke_rad=stroke_rad)
+        def build(profile: "Profile") -> "Excitation":
+            return session(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
 
         results = run_in_foreground(
             build,
@@ -130,7 +124,7 @@ def _run_sessions(
             live=False,
             force=False,
             quiet_stdout=quiet_stdout,
-            prepare=note_and_prepare,
+            prepare=prepare,
         )
         if stop.requested and not any(result.fault for result in results):
             raise typer.Exit(EXIT_INTERRUPTED)

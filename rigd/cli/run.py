@@ -109,12 +109,12 @@ def run_sessions(
     notes = session_notes(operator, specimen, note)
     stop, crew = start_crew(live=live)
     from rigd.engine.signals import ignore
-    from rigd.excitation.named import make_excitation
     from rigd.foreground import ForegroundError, run_in_foreground
+    from rigd.planning import excitation_for
 
     try:
         results = run_in_foreground(
-            partial(make_excitation, kind, parameters),
+            partial(excitation_for, kind=kind, parameters=parameters),
             crew,
             stop,
             profile_name=profile,
@@ -245,6 +245,45 @@ def file(
     Example: rigd run file reference.csv
     """
     return {"path": path, "rest_s": rest, "ring_down_s": ring_down}
+
+
+@excitation_command
+def modes(
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="JSON", readable=False, help="Modes as analyze --json writes them."),
+    ],
+    amplitude: Annotated[
+        float,
+        typer.Option("--amplitude", help="Amplitude in each band, lower where limits ask, rad."),
+    ] = 0.025,
+    stop_hz: Annotated[
+        float, typer.Option("--stop-hz", help="Modes above are left out, Hz.")
+    ] = 50.0,
+    widths: Annotated[
+        float, typer.Option("--widths", help="Half-power widths to either side of a mode.")
+    ] = 1.0,
+    duration: Duration = 120.0,
+    rest: Rest = 1.0,
+    ring_down: RingDown = 15.0,
+    taper: Annotated[
+        float, typer.Option("--taper", help="Fade in and out of every sweep over this time, s.")
+    ] = 1.0,
+) -> "dict[str, Value]":
+    """Sweep narrow bands round the modes that an analysis found, for smaller deviations.
+
+    Example: rigd run modes fits.json --repeat 5
+    """
+    return {
+        "path": path,
+        "amplitude_rad": amplitude,
+        "stop_hz": stop_hz,
+        "widths": widths,
+        "duration_s": duration,
+        "rest_s": rest,
+        "ring_down_s": ring_down,
+        "taper_s": taper,
+    }
 
 
 def _write_json(results: "list[SessionResult]") -> None:

@@ -1,10 +1,11 @@
-"""Reference trajectories of a session: chirp, hold, step, random-phase multisine, from a file.
+"""Reference trajectories of a session: chirp, hold, step, multisine, narrow sweeps, from a file.
 
 A reference is relative to the angle at which the session starts. Every excitation has the same
 three segments: rest (reference zero), sweep, ring-down (the sweep's last value held).
 """
 
 from rigd.excitation.csv_file import from_csv
+from rigd.excitation.narrow_sweeps import modes
 from rigd.excitation.options import ExcitationError
 from rigd.excitation.record import Excitation
 from rigd.excitation.signals import chirp, hold, multisine, step
@@ -15,6 +16,7 @@ __all__ = [
     "chirp",
     "from_csv",
     "hold",
+    "modes",
     "multisine",
     "step",
 ]

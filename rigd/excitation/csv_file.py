@@ -1,14 +1,13 @@
 """A reference from a CSV file."""
 
 import csv
-import os
-import stat
 from math import isfinite
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 import numpy as np
 
+from rigd.excitation.files import open_plain_file
 from rigd.excitation.options import ExcitationError, within_a_turn
 from rigd.excitation.record import Excitation, assemble, check_ticks, lay_out_segments
 
@@ -60,19 +59,9 @@ def from_csv(
     return assemble("file", parameters, rate_hz, segments, sweep)
 
 
-def _opened(path: Path) -> TextIO:
-    """Open a plain file; a pipe that nobody writes to is not waited for."""
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    status = os.fstat(fd)
-    if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
-        os.close(fd)
-        raise ExcitationError(f"{path}: is not a file of at most {MOST_BYTES / 1e6:g} MB.")
-    return open(fd, newline="", encoding="utf-8-sig")  # noqa: PTH123 - a descriptor has no path
-
-
 def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
     try:
-        with _opened(path) as file:
+        with open_plain_file(path, MOST_BYTES, newline="") as file:
             rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error

@@ -1,9 +1,12 @@
 """An excitation by its name and its parameters, as a request or a command line gives them."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from rigd.excitation.bands import Foresight
 from rigd.excitation.csv_file import from_csv
+from rigd.excitation.narrow_sweeps import modes
 from rigd.excitation.record import Excitation
 from rigd.excitation.signals import chirp, hold, multisine, step
 
@@ -15,11 +18,17 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
     "step": step,
     "multisine": multisine,
     "file": from_csv,
+    "modes": modes,
 }
 """By the names that the command line and session files have for them."""
 
+FROM_THE_RIG = frozenset({"rate_hz", "rig"})
+"""Arguments that are no options: the rig's own data."""
 
-def make_excitation(kind: str, parameters: Mapping[str, Value], rate_hz: float) -> Excitation:
+
+def make_excitation(
+    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: Foresight | None = None
+) -> Excitation:
     """Make one for a rig's rate.
 
     Parameters
@@ -30,10 +39,15 @@ def make_excitation(kind: str, parameters: Mapping[str, Value], rate_hz: float) 
         Keyword arguments of its function; what is left out has its default.
     rate_hz
         Ticks a second.
+    rig
+        For an excitation that is made for one rig.
 
     Raises
     ------
     ExcitationError
         If a value is absurd.
     """
-    return KINDS[kind](rate_hz=rate_hz, **parameters)
+    make = KINDS[kind]
+    if "rig" in inspect.signature(make).parameters:
+        return make(rate_hz=rate_hz, rig=rig, **parameters)
+    return make(rate_hz=rate_hz, **parameters)

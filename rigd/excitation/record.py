@@ -21,7 +21,7 @@ class Excitation:
     Attributes
     ----------
     kind
-        ``chirp``, ``hold``, ``step``, ``multisine`` or ``file``.
+        ``chirp``, ``hold``, ``step``, ``multisine``, ``file`` or ``modes``.
     parameters
         The options it was made from, and what follows from them, with units in the names.
     rate_hz

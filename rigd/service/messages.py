@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from rigd.excitation.named import KINDS, Value
+from rigd.excitation.named import FROM_THE_RIG, KINDS, Value
 
 LONGEST_LINE = 65_536
 """Bytes of a request, its newline included."""
@@ -170,7 +170,7 @@ def _checked(request: Start) -> Start:
     known = {
         name: parameter
         for name, parameter in inspect.signature(function).parameters.items()
-        if name != "rate_hz"
+        if name not in FROM_THE_RIG
     }
     values: dict[str, Value] = {}
     for name, given in request.parameters.items():

@@ -22,8 +22,7 @@ from rigd.devices.registry import Reality
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, ExcitationError
-from rigd.excitation.named import make_excitation
-from rigd.planning import Plan, RefusedError, plan_session
+from rigd.planning import Plan, RefusedError, excitation_for, plan_session
 from rigd.profile import Profile
 from rigd.service import messages
 from rigd.service.documents import (
@@ -437,9 +436,7 @@ class Service:
         """Make the excitation and see that it may be run; in the second thread."""
         profile = self._profile
         try:
-            excitation = make_excitation(
-                request.excitation, request.parameters, profile.rig.rate_hz
-            )
+            excitation = excitation_for(profile, request.excitation, request.parameters)
             plan = plan_session(profile, excitation, force=request.force)
             make_room(self._folder, excitation, profile.limits)
         except NoRoomError as error:

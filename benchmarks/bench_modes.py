@@ -1,0 +1,153 @@
+"""Narrow sweeps round the modes against the chirp: deviations for the same time of 136 s.
+
+The peer is the paper's chirp (0.025 rad, 0.05-50 Hz in 120 s, 1 s of rest before and 15 s of
+ring-down after). It is fitted first, as an operator would; its modes (those of the first session's
+fit) go into the JSON document that the narrow sweeps are made from. Of both, sessions with
+different noise are fitted by the whole-record estimator, all of rho/EI, EI, delay and tool inertia
+free. Printed are, parameter by parameter, the formal standard deviations (medians over the
+sessions), their ratio, and the ratio of the scatter over the sessions.
+
+Without ``--engine`` the sessions are made in the frequency domain: the reference through the loop
+1/(1 + s/80)^2, exact torque, encoder steps of 7e-5 rad, torque noise of 1e-2 N·m and steps of
+1.25e-4 N·m. With ``--engine`` they are runs of ``rigd run --fast`` on the profile ``sim``.
+``--amplitude`` is that of the narrow sweeps: more than the chirp's uses what the limits leave.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from bench_record_fit import LINK, PLANTS, RATE_HZ, Session
+from numpy.typing import NDArray
+
+from analysis.structures import STRUCTURES
+from analysis.whole_record import Measurement, Plant, RecordFit, fit_record
+from rigd.beam import transfer
+from rigd.excitation import chirp, modes
+from rigd.planning import Foresight
+from rigd.profile import Profile, load_profile
+
+POLE_RAD_S = 80.0
+
+
+def response(plant: Plant, reference_rad: NDArray[np.float64]) -> Session:
+    """Exact response to a reference, from rest."""
+    n = reference_rad.size
+    padded = 4 * n
+    decay = np.exp(-5.0 * np.arange(n) / n)
+    s = 5.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(padded, 1 / RATE_HZ)
+    angle = np.fft.rfft(reference_rad * decay, padded) / (1 + s / POLE_RAD_S) ** 2
+    torque = angle * (transfer(s, plant.beam, plant.damping) + plant.tool_inertia_kg_m2 * s**2)
+    torque *= np.exp(-s * plant.delay_s)
+    return Session(plant, *(np.fft.irfft(x, padded)[:n] / decay for x in (angle, torque)))
+
+
+def write_modes(fit: RecordFit, path: Path) -> None:
+    """Write what the narrow sweeps need of a fit, by the keys of `analyze --json`."""
+    found = [
+        {
+            "frequency_hz": mode.frequency_hz,
+            "frequency_std_hz": mode.frequency_std_hz,
+            "damping_ratio": mode.damping_ratio,
+        }
+        for mode in fit.modes
+    ]
+    path.write_text(json.dumps({"modes": found}), encoding="utf-8")
+
+
+def fitted(measurements: list[Measurement], name: str) -> list[RecordFit]:
+    """Fit one structure to each."""
+    return [fit_record(m, [STRUCTURES[name]]).fits[0] for m in measurements]
+
+
+def recorded(kind: list[str], profile: Path, count: int, folder: Path) -> list[Measurement]:
+    """Run sessions in the engine and read them."""
+    from analysis.record import load_record
+
+    measurements = []
+    for seed in range(count):
+        command = [sys.executable, "-m", "rigd", "run", *kind, "--profile", str(profile), "--fast"]
+        command += ["--seed", str(seed + 1), "--output", str(folder), "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        path = Path(json.loads(done.stdout)["sessions"][0]["path"])
+        measurements.append(Measurement.of_record(load_record(path)))
+        path.unlink()
+    return measurements
+
+
+def compare(name: str, truth: Plant, peer: list[RecordFit], narrow: list[RecordFit]) -> None:
+    """Print the deviations of both and their ratios."""
+    count = len(peer)
+    print(f"\nType {name}, {count} sessions of each kind")
+    print("parameter                    truth  std chirp  std modes  ratio  ratio of scatter  bias")
+    ratios = []
+    for parameter, value in truth.parameters.items():
+        stds = [
+            np.array([fit.std[parameter] or math.nan for fit in fits]) for fits in (peer, narrow)
+        ]
+        if any(np.isnan(std).all() for std in stds):
+            continue
+        of_peer, of_narrow = (float(np.nanmedian(std)) for std in stds)
+        found = [np.array([fit.parameters[parameter] for fit in fits]) for fits in (peer, narrow)]
+        scatter = found[0].std(ddof=1) / found[1].std(ddof=1)
+        bias = (found[1].mean() - value) / of_narrow
+        print(
+            f"{parameter:24} {value:9.3g} {of_peer:10.2e} {of_narrow:10.2e} "
+            f"{of_peer / of_narrow:6.2f} {scatter:17.2f} {bias:5.2f}"
+        )
+        if parameter in ("zeta", "alpha", "gamma", "lambda"):
+            ratios.append((of_peer / of_narrow, scatter))
+    formal, empirical = np.exp(np.mean(np.log(ratios), axis=0))
+    print(f"Damping, geometric mean: {formal:.2f} formal, {empirical:.2f} by scatter", flush=True)
+
+
+def profile_of(name: str) -> Profile:
+    """Take the simulated rig with the damping of a plant."""
+    profile = load_profile("sim")
+    return replace(profile, rig=replace(profile.rig, damping=PLANTS[name]))
+
+
+def main() -> None:
+    """Compare for the plants and amplitudes asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sessions", type=int, default=20, help="of each kind")
+    parser.add_argument("--plant", choices=PLANTS, action="append", help="only this one")
+    parser.add_argument("--amplitude", type=float, action="append", help="of the narrow sweeps")
+    parser.add_argument("--widths", type=float, default=1.0, help="to either side of a mode")
+    parser.add_argument("--engine", action="store_true", help="rigd run --fast, type VI only")
+    given = parser.parse_args()
+    plants = ["VI"] if given.engine else given.plant or ["VI", "III"]
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        document = folder / "fits.json"
+        for name in plants:
+            truth = Plant(LINK, PLANTS[name])
+            if given.engine:
+                peer = fitted(recorded(["chirp"], Path("sim"), given.sessions, folder), name)
+            else:
+                session = response(truth, chirp(rate_hz=RATE_HZ).reference_rad)
+                peer = fitted([session.measured(seed) for seed in range(given.sessions)], name)
+            write_modes(peer[0], document)
+            for amplitude_rad in given.amplitude or [0.025, 0.1]:
+                options = {"amplitude_rad": amplitude_rad, "widths": given.widths}
+                rig = Foresight(profile_of(name))
+                excitation = modes(rate_hz=RATE_HZ, path=document, rig=rig, **options)
+                print(f"\nUp to {amplitude_rad:g} rad: {excitation.parameters['bands']}")
+                if given.engine:
+                    command = ["modes", str(document), "--amplitude", str(amplitude_rad)]
+                    command += ["--widths", str(given.widths)]
+                    sessions = recorded(command, Path("sim"), given.sessions, folder)
+                else:
+                    session = response(truth, excitation.reference_rad)
+                    sessions = [session.measured(100 + seed) for seed in range(given.sessions)]
+                compare(name, truth, peer, fitted(sessions, name))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,235 @@
+"""Narrow sweeps: joints, bands, duration, limits, and what the split of the time is worth."""
+
+import inspect
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rigd import excitation
+from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
+from rigd.cli import run
+from rigd.excitation import ExcitationError
+from rigd.excitation.bands import Band, damping_of, shares_of_time
+from rigd.excitation.mode_table import FoundMode
+from rigd.excitation.named import FROM_THE_RIG, KINDS, make_excitation
+from rigd.planning import Foresight, excitation_for, plan_session
+
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+
+
+def bands_of(made):
+    """(start_hz, stop_hz, amplitude_rad, duration_s) of each sweep, from the file's metadata."""
+    rows = []
+    for text in made.parameters["bands"].split("; "):
+        band, amplitude, duration = text.split(", ")
+        start, stop = band.removesuffix(" Hz").split("-")
+        rows.append([float(start), float(stop), float(amplitude[:-4]), float(duration[:-2])])
+    return rows
+
+
+def test_it_takes_the_time_asked_for_to_the_tick(document, rig):
+    made = excitation.modes(
+        rate_hz=1000.0, path=document(), duration_s=61.234, rest_s=2.0, ring_down_s=7.5, rig=rig
+    )
+    assert made.segments == {
+        "rest": (0, 2000),
+        "sweep": (2000, 63_234),
+        "ring_down": (63_234, 70_734),
+    }
+    assert made.reference_rad.shape == (70_734,)
+    assert sum(row[3] for row in bands_of(made)) == pytest.approx(61.234, abs=1e-3)
+    assert not made.reference_rad[:2001].any()
+    assert abs(made.reference_rad[-1]) < 1e-6
+
+
+def test_angle_and_speed_are_zero_at_the_joints_and_jump_nowhere(document, rig):
+    made = excitation.modes(rate_hz=1000.0, path=document(), duration_s=60.0, rig=rig)
+    rows = bands_of(made)
+    joints = 1000 + np.round(1000 * np.cumsum([0.0, *(row[3] for row in rows)])).astype(int)
+    speed = np.diff(made.reference_rad) * 1000
+    fastest = np.abs(speed).max()
+    for joint in joints:
+        assert np.abs(made.reference_rad[joint - 3 : joint + 4]).max() < 1e-5
+        assert np.abs(speed[joint - 3 : joint + 3]).max() < 1e-3 * fastest
+    # A sine of the highest frequency changes its speed by omega dt of its peak from tick to tick.
+    highest_hz = max(row[1] for row in rows)
+    assert np.abs(np.diff(speed)).max() < 1.05 * 2 * np.pi * highest_hz / 1000 * fastest
+
+
+def test_each_sweep_covers_its_band_and_little_else(document):
+    made = excitation.modes(rate_hz=1000.0, path=document(), duration_s=90.0, widths=3.0)
+    frequency_hz = np.fft.rfftfreq(30_000, 1e-3)
+    first = 1000
+    for start_hz, stop_hz, amplitude_rad, duration_s in bands_of(made):
+        ticks = round(1000 * duration_s)
+        assert ticks == 30_000
+        energy = np.abs(np.fft.rfft(made.reference_rad[first : first + ticks])) ** 2
+        spread_hz = 1.0  # of the fades
+        inside = (frequency_hz > start_hz - spread_hz) & (frequency_hz < stop_hz + spread_hz)
+        assert energy[inside].sum() > 0.999 * energy.sum()
+        middle = np.abs(frequency_hz - 0.5 * (start_hz + stop_hz)) < 0.3 * (stop_hz - start_hz)
+        assert energy[middle].min() > 0.05 * energy.max()
+        assert np.abs(made.reference_rad[first : first + ticks]).max() == pytest.approx(
+            amplitude_rad, rel=2e-3
+        )
+        first += ticks
+
+
+def test_a_band_is_half_power_widths_and_the_uncertainty_to_either_side():
+    band = Band.of_mode(FoundMode(16.0, 0.005, 0.1), widths=2.0)
+    assert (band.start_hz, band.stop_hz) == pytest.approx((16 - 0.42, 16 + 0.42))
+    assert band.decay_s == pytest.approx(1 / (2 * np.pi * 16 * 0.005))
+    heavy = Band.of_mode(FoundMode(2.0, 0.6, 0.0), widths=2.0)
+    assert 0 < heavy.start_hz < heavy.stop_hz
+
+
+def test_what_rings_longest_comes_first_and_modes_above_are_left_out(document, rig):
+    made = excitation.modes(rate_hz=1000.0, path=document(), stop_hz=20.0, rig=rig)
+    assert [row[0] < mode < row[1] for row, mode in zip(bands_of(made), (2.57, 16.01), strict=True)]
+    assert len(bands_of(made)) == 2
+    with pytest.raises(ExcitationError, match=r"fits\.json.*2\.57 Hz.*stop_hz = 2 Hz"):
+        excitation.modes(rate_hz=1000.0, path=document(), stop_hz=2.0)
+
+
+@pytest.mark.parametrize("amplitude_rad", [0.025, 0.3])
+def test_the_planning_lets_the_amplitudes_through(document, profile, amplitude_rad):
+    options = {"path": document(), "amplitude_rad": amplitude_rad, "duration_s": 60.0}
+    plan = plan_session(profile, excitation_for(profile, "modes", options))
+    assert plan.warnings == ()
+    peak = plan.prediction.peak_torque_nm / profile.rig.motor.peak_torque_nm
+    assert peak < 0.95
+    if amplitude_rad == 0.3:
+        assert peak > 0.8
+
+
+def test_a_tighter_limit_lowers_the_amplitude_of_the_band_that_reaches_it(document, profile):
+    # Behind the motor loop the angle is small at the third mode, and the error the whole amplitude.
+    limits = replace(profile.limits, tracking_error_rad=0.02)
+    tight = replace(profile, limits=limits)
+    options = {"path": document(), "duration_s": 60.0}
+    free, held = (bands_of(excitation_for(p, "modes", options)) for p in (profile, tight))
+    assert [row[2] for row in free] == pytest.approx([0.025] * 3, rel=0.05)
+    assert held[2][2] < 0.018
+    assert held[0][2] == pytest.approx(free[0][2], rel=0.03)
+    plan_session(tight, excitation_for(tight, "modes", options))
+
+
+def test_the_split_is_the_best_there_is(rig):
+    """Against all splits of a grid, by the information computed in another way."""
+    modes = [
+        FoundMode(2.57, 0.0091, 0.0),
+        FoundMode(16.01, 0.0042, 0.0),
+        FoundMode(44.8, 0.0099, 0.0),
+    ]
+    bands = [Band.of_mode(mode, 1.0) for mode in modes]
+    shares = shares_of_time(bands, [0.025] * 3, rig)
+    assert shares.sum() == pytest.approx(1.0)
+    damping = damping_of(modes, LINK)
+    rates = []
+    for band in bands:
+        f = np.linspace(band.start_hz, band.stop_hz, 301)
+        tuned = min(
+            (Beam(0.98, 4.7e-3 * x, 0.090275) for x in np.linspace(0.97, 1.03, 2001)),
+            key=lambda beam, hz=band.mode.frequency_hz: min(
+                abs(z**2 / (0.98**2 * beam.density_over_stiffness**0.5) / (2 * np.pi) - hz)
+                for z in (1.8751040687, 4.6940911330, 7.8547574382)
+            ),
+        )
+        g, gradient = transfer_and_gradient(2j * np.pi * f, tuned, damping, PARAMETERS)
+        rows = np.stack([*gradient, f * g * 2j * np.pi, (2 * np.pi * f) ** 2 + 0j])
+        rows *= rig.tracking(f)
+        rates.append((rows.conj() @ rows.T).real / f.size)
+    rates = np.array(rates)
+    scale = np.sqrt(rates.sum(axis=0).diagonal())
+    rates /= np.outer(scale, scale)
+
+    def spread(split):
+        return np.log(np.diag(np.linalg.inv(np.tensordot(split, rates, axes=1)))[:4]).sum()
+
+    grid = [
+        (a, b, 1 - a - b) for a in np.arange(0.02, 1, 0.02) for b in np.arange(0.02, 0.99 - a, 0.02)
+    ]
+    best = min(map(spread, grid))
+    assert spread(shares) < best + 0.02
+    assert spread(shares) < spread([1 / 3] * 3) - 0.3
+
+
+def test_damping_that_gives_the_modes_their_ratios():
+    omega = 2 * np.pi * np.array([2.57, 16.01, 44.8])
+    for zeta, gamma in ((5.4e-5, 0.02), (5.4e-5, 0.0), (0.0, 0.03)):
+        ratio = 0.5 * (zeta * omega + gamma / (LINK.density_over_stiffness * omega))
+        modes = [FoundMode(w / (2 * np.pi), r, 0.0) for w, r in zip(omega, ratio, strict=True)]
+        found = damping_of(modes, LINK)
+        assert (found.zeta, found.gamma) == pytest.approx((zeta, gamma), rel=1e-9, abs=1e-12)
+    rising = [FoundMode(2.57, 1e-4, 0.0), FoundMode(16.01, 5e-3, 0.0)]
+    assert damping_of(rising, LINK).gamma == 0.0
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_modes_get_a_session_too(document, rig, count):
+    modes = [{"frequency_hz": f, "damping_ratio": 0.005} for f in (2.6, 16.0)][:count]
+    rows = bands_of(
+        excitation.modes(rate_hz=1000.0, path=document(modes), duration_s=40.0, rig=rig)
+    )
+    assert len(rows) == count
+    assert sum(row[3] for row in rows) == pytest.approx(40.0)
+    assert min(row[3] for row in rows) >= 0.5 * 40.0 / count - 1e-3
+
+
+def test_equal_documents_give_equal_references(document, profile):
+    options = {"path": document(), "duration_s": 30.0}
+    first, second = (excitation_for(profile, "modes", options) for _ in range(2))
+    assert (first.reference_rad == second.reference_rad).all()
+    assert first.parameters == second.parameters
+
+
+def test_metadata_have_units_and_plain_values(document, rig):
+    made = excitation.modes(rate_hz=1000.0, path=document(), duration_s=30.0, rig=rig)
+    assert made.kind == "modes"
+    assert made.parameters["file"] == "fits.json"
+    assert json.loads(json.dumps(dict(made.parameters))) == made.parameters
+    numbers = {name for name, value in made.parameters.items() if isinstance(value, float)}
+    assert all(name == "widths" or name.endswith(("_rad", "_hz", "_s")) for name in numbers)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"duration_s": 10.0}, ("duration_s = 10 s", "taper_s = 1 s", "3 sweeps", "12 s")),
+        ({"amplitude_rad": 0.0}, ("amplitude_rad = 0 rad",)),
+        ({"widths": 0.0}, ("widths = 0",)),
+        ({"taper_s": 0.0}, ("taper_s = 0 s",)),
+        ({"widths": 1e3}, ("widths", "Hz")),
+        ({"stop_hz": float("nan")}, ("stop_hz",)),
+    ],
+)
+def test_absurd_options_are_refused(document, options, words):
+    with pytest.raises(ExcitationError) as refused:
+        excitation.modes(rate_hz=1000.0, path=document(), **options)
+    assert all(word in str(refused.value) for word in words), str(refused.value)
+
+
+def test_the_command_has_the_excitations_defaults():
+    own = {
+        {"amplitude_rad": "amplitude"}.get(name, name.removesuffix("_s")): parameter
+        for name, parameter in inspect.signature(excitation.modes).parameters.items()
+        if name not in FROM_THE_RIG
+    }
+    options = inspect.signature(run.modes).parameters
+    assert {n: p.default for n, p in options.items()} == {n: p.default for n, p in own.items()}
+
+
+def test_without_a_rig_the_bands_get_equal_times_and_the_full_amplitude(document):
+    made = make_excitation("modes", {"path": document(), "amplitude_rad": 0.04}, 1000.0)
+    assert {(row[2], row[3]) for row in bands_of(made)} == {(0.04, 40.0)}
+    assert KINDS["modes"] is excitation.modes
+
+
+def test_foresight_agrees_with_the_plan(document, profile):
+    made = excitation_for(profile, "modes", {"path": document(), "duration_s": 30.0})
+    predicted = plan_session(profile, made).prediction
+    assert Foresight(profile).share_of_limits(made.reference_rad) == pytest.approx(
+        predicted.peak_torque_nm / profile.rig.motor.peak_torque_nm
+    )
