@@ -71,7 +71,7 @@ def test_every_how_to_runs_as_written(write_profile, tmp_path, runtime_folder):
             with start(*command) as process:
                 assert_went_well(process)
         assert_went_well(beside)
-    assert len(list((tmp_path / "sessions").glob("*.mcap"))) == 5
+    assert len(list((tmp_path / "sessions").glob("*.mcap"))) == 6
     for report in ("one_look", "another_look"):
         assert (tmp_path / report / "frf.png").stat().st_size > 50_000
 
