@@ -1,1 +1,20 @@
-"""Offline analyser of session files: frequency response and fractional damping models."""
+"""Offline analyser of session files: frequency response and fractional damping models.
+
+For scripts and notebooks, `load`, `frf`, `fit` and `select` of `analysis.api` are here too.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analysis.api import fit, frf, load, select
+
+__all__ = ["fit", "frf", "load", "select"]
+
+
+def __getattr__(name: str) -> object:
+    # Late, so that a command that needs none of it starts at once.
+    if name in __all__:
+        from analysis import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,12 +15,14 @@ import rigd
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from analysis.report.html import Subject
     from analysis.welch_route import FittedModel, WelchAnalysis
 
 
 def document(
     analyses: Sequence[WelchAnalysis],
     errors: Mapping[str, str] | None = None,
+    subjects: Sequence[Subject] = (),
 ) -> dict[str, Any]:
     """Collect the results of all files.
 
@@ -29,13 +31,17 @@ def document(
     analyses : sequence of WelchAnalysis
     errors : mapping of str to str, optional
         Message for each file that could not be analysed.
+    subjects : sequence of Subject, optional
+        Whole-record results, whose entries follow those of the paper's route.
 
     Returns
     -------
     dict
         ``versions``, ``files`` (what was read and how it was estimated), ``fits``, ``modes``,
-        ``peaks``, ``errors``: lists of flat objects that name their file. Finite numbers only.
+        ``peaks``, ``records``, ``errors``:
+        lists of flat objects that name their file. Finite numbers only.
     """
+    of_records = [_record_entries(subject) for subject in subjects]
     content: dict[str, Any] = _finite(
         {
             "versions": {
@@ -44,13 +50,20 @@ def document(
                 "numpy": np.__version__,
             },
             "files": [_file(analysis) for analysis in analyses],
-            "fits": [_fit(analysis, model) for analysis in analyses for model in analysis.models],
-            "modes": [
-                mode
-                for analysis in analyses
-                for model in analysis.models
-                for mode in _modes(analysis, model)
+            "fits": [
+                *(_fit(analysis, model) for analysis in analyses for model in analysis.models),
+                *(fit for entries in of_records for fit in entries["fits"]),
             ],
+            "modes": [
+                *(
+                    mode
+                    for analysis in analyses
+                    for model in analysis.models
+                    for mode in _modes(analysis, model)
+                ),
+                *(mode for entries in of_records for mode in entries["modes"]),
+            ],
+            "records": [record for entries in of_records for record in entries["records"]],
             "peaks": [
                 {
                     "file": str(analysis.record.path),
@@ -72,6 +85,12 @@ def document(
 def document_text(content: Mapping[str, Any]) -> str:
     """Write a document as JSON, with a newline at its end."""
     return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _record_entries(subject: Subject) -> dict[str, Any]:
+    from analysis.report.html.record_entries import record_entries
+
+    return record_entries(subject)
 
 
 def _file(analysis: WelchAnalysis) -> dict[str, Any]:

@@ -11,9 +11,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from analysis.report.html import Subject
     from analysis.welch_route import WelchAnalysis
 
 FIGURES: Final = ("signals", "frf", "torque")
+FIGURES_BESIDE_RECORD: Final = ("frf",)
+"""Of the paper's route, where the whole-record fit has signals and torque of its own."""
+
 TEXT_WIDTH: Final = 120
 
 
@@ -21,8 +25,9 @@ def write_report(
     analysis: WelchAnalysis,
     folder: Path,
     on_step: Callable[[str], None] = lambda _done: None,
+    subject: Subject | None = None,
 ) -> None:
-    """Write ``signals.png``, ``frf.png``, ``torque.png``, ``tables.txt`` and ``analysis.json``.
+    """Write figures, ``tables.txt``, ``analysis.json`` and, of a whole record, all in HTML.
 
     Parameters
     ----------
@@ -31,6 +36,9 @@ def write_report(
         An existing folder without these files.
     on_step : callable, optional
         Called with a few words after each figure.
+    subject : Subject, optional
+        The whole-record fits: with them, what `write_html_report` writes, in the place of
+        ``signals.png`` and ``torque.png``.
 
     Raises
     ------
@@ -42,9 +50,10 @@ def write_report(
     from analysis.report.signals_figure import signals_figure
     from analysis.report.torque_figure import torque_figure
 
-    for name, draw in zip(FIGURES, (signals_figure, frf_figure, torque_figure), strict=True):
+    drawn = {"signals": signals_figure, "frf": frf_figure, "torque": torque_figure}
+    for name in FIGURES if subject is None else FIGURES_BESIDE_RECORD:
         with style.styled():
-            figure = draw(analysis)
+            figure = drawn[name](analysis)
             try:
                 style.save(figure, folder / f"{name}.png")
             except OSError as error:
@@ -53,7 +62,12 @@ def write_report(
                 ) from error
         on_step(f"figure {name}")
     write_new(folder / "tables.txt", tables_text(analysis))
-    write_new(folder / "analysis.json", document_text(document([analysis])))
+    if subject is not None:
+        from analysis.report.html.write import write_html_report
+
+        write_html_report(subject, folder, on_step)
+    subjects = () if subject is None else (subject,)
+    write_new(folder / "analysis.json", document_text(document([analysis], subjects=subjects)))
 
 
 def tables_text(analysis: WelchAnalysis) -> str:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _NORMAL_95: Final = 1.959963984540054
 _WORST_CONDITION: Final = 1e13
+_LARGEST_LN_OMEGA: Final = 50.0
 
 
 def covariance_of_unknowns(
@@ -97,6 +98,8 @@ def damping_size(
     j = list(names).index(order)
     # ln size = ln coefficient + order ln omega has no covariance with the order at:
     ln_omega = -covariance[i, j] / covariance[j, j]
+    if abs(ln_omega) > _LARGEST_LN_OMEGA:
+        return None  # an order all but unknown is uncorrelated nowhere
     variance = max(covariance[i, i] - covariance[i, j] ** 2 / covariance[j, j], 0.0)
     size = values[coefficient] * math.exp(values[order] * ln_omega)
     return DampingSize(math.exp(ln_omega), size, size * math.sqrt(variance))

@@ -1,0 +1,247 @@
+"""The analyser for scripts and notebooks: `load`, `frf`, `fit`, `select` and `campaign`.
+
+What the command `analyze` does, step by step, with results as arrays and plain objects. Messages of
+errors are those of the command; nothing is printed, drawn or written.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, overload
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from analysis.campaigns import Campaign
+    from analysis.record import Record
+    from analysis.selection import Selection
+    from analysis.settings import WelchSettings
+    from analysis.welch_route import WelchAnalysis
+    from analysis.whole_record import RecordAnalysis, Setting
+    from rigd.spectral import FrequencyResponse
+
+__all__ = ["campaign", "fit", "frf", "load", "select"]
+
+
+def load(path: Path | str) -> Record:
+    """Read a session file.
+
+    Parameters
+    ----------
+    path : Path or str
+        A ``.mcap`` file in the format of ``docs/session_format.md``.
+
+    Returns
+    -------
+    Record
+        Time in s, angles in rad, torque in N·m on a uniform grid; specimen, delays, metadata.
+
+    Raises
+    ------
+    SessionError
+        The file cannot be read.
+    RecordError
+        It can, but not be analysed.
+    """
+    from analysis.record import load_record
+
+    return load_record(Path(path))
+
+
+def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyResponse:
+    """Estimate the frequency response from motor angle to coupling torque.
+
+    Parameters
+    ----------
+    record : Record
+    settings : WelchSettings, optional
+        Estimator, segments and band; by default the paper's.
+
+    Returns
+    -------
+    FrequencyResponse
+        In N·m/rad, without the channels' delays that the file states; with its coherence.
+
+    Raises
+    ------
+    EstimateError
+        The settings do not suit the record, or its angle does not move.
+    """
+    from analysis.estimate import estimate
+    from analysis.settings import WelchSettings
+
+    return estimate(record, settings or WelchSettings())[0]
+
+
+@overload
+def fit(
+    record: Record,
+    types: Sequence[str] | None = None,
+    *,
+    method: Literal["record"] = "record",
+    fixed: Iterable[Setting] = (),
+    band_hz: tuple[float, float] | None = None,
+) -> RecordAnalysis: ...
+
+
+@overload
+def fit(
+    record: Record,
+    types: Sequence[str] | None = None,
+    *,
+    method: Literal["welch"],
+    weightings: Sequence[str] | None = None,
+    band_hz: tuple[float, float] | None = None,
+) -> WelchAnalysis: ...
+
+
+def fit(
+    record: Record,
+    types: Sequence[str] | None = None,
+    *,
+    method: Literal["record", "welch"] = "record",
+    fixed: Iterable[Setting] = (),
+    weightings: Sequence[str] | None = None,
+    band_hz: tuple[float, float] | None = None,
+) -> RecordAnalysis | WelchAnalysis:
+    """Fit model types to a record.
+
+    Parameters
+    ----------
+    record : Record
+    types : sequence of str, optional
+        Of "I" to "VII"; by default all seven, with "welch" the paper's six.
+    method : {"record", "welch"}
+        Output error on the whole record, or the paper's fit to Welch's estimate.
+    fixed : iterable of str
+        With "record": settings of beam and rig that stay at the file's values, of
+        `analysis.whole_record.SETTINGS`.
+    weightings : sequence of str, optional
+        With "welch": "const", "omega", "omega^K"; by default the first two.
+    band_hz : tuple of float, optional
+        First and last frequency; by default 0 to 50 Hz, with "welch" the paper's band.
+
+    Returns
+    -------
+    RecordAnalysis or WelchAnalysis
+        By method.
+
+    Raises
+    ------
+    ValueError
+        No such type, method or setting; among its kinds those of the methods:
+        `MeasurementError` and `EstimateError`, if the record cannot be used.
+    """
+    from analysis.structures import STRUCTURES
+
+    unknown = [name for name in types or () if name not in STRUCTURES]
+    if unknown:
+        raise ValueError(
+            f"There is no model type {', '.join(map(repr, unknown))}; choose from "
+            f"{', '.join(STRUCTURES)}."
+        )
+    if method == "record":
+        from analysis.whole_record import BAND_HZ, Measurement, fit_record
+
+        return fit_record(
+            Measurement.of_record(record),
+            [STRUCTURES[name] for name in types or STRUCTURES],
+            fixed=fixed,
+            band_hz=band_hz or BAND_HZ,
+        )
+    if method == "welch":
+        from analysis.settings import PAPER_BAND_HZ, PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
+        from analysis.welch_route import analyse
+
+        settings = WelchSettings(
+            band_hz=band_hz or PAPER_BAND_HZ,
+            types=tuple(types or PAPER_TYPES),
+            weightings=tuple(weightings or PAPER_WEIGHTINGS),
+        )
+        return analyse(record, settings)
+    raise ValueError(f"There is no method {method!r}; choose 'record' or 'welch'.")
+
+
+def select(
+    record: Record,
+    *,
+    fixed: Iterable[Setting] = (),
+    band_hz: tuple[float, float] | None = None,
+) -> Selection:
+    """Fit every structure to a record, and say which one its data support.
+
+    Parameters
+    ----------
+    record : Record
+    fixed : iterable of str
+        Settings that stay at the file's values.
+    band_hz : tuple of float, optional
+        By default 0 to 50 Hz.
+
+    Returns
+    -------
+    Selection
+        The fit to be believed, the verdict in words, and all candidates.
+
+    Raises
+    ------
+    MeasurementError
+        The record cannot be used.
+    """
+    from analysis.selection import select as select_structure
+    from analysis.whole_record import BAND_HZ, Measurement
+
+    return select_structure(Measurement.of_record(record), fixed=fixed, band_hz=band_hz or BAND_HZ)
+
+
+def campaign(
+    paths: Iterable[Path | str],
+    settings: WelchSettings | None = None,
+    *,
+    types: Sequence[str] | None = None,
+    fixed: Sequence[Setting] = (),
+    jobs: int | None = None,
+    dask: str | None = None,
+) -> Campaign:
+    """Analyse the sessions of one specimen together, in parallel.
+
+    Parameters
+    ----------
+    paths : iterable of Path or str
+        Session files.
+    settings : WelchSettings, optional
+        Of the paper's route; by default the paper's.
+    types : sequence of str, optional
+        Fitted to the whole records; by default all seven.
+    fixed : sequence of str
+        Settings that stay at the file's values in those fits.
+    jobs : int, optional
+        Worker processes, by default one a core.
+    dask : str, optional
+        Address of a Dask scheduler to use instead.
+
+    Returns
+    -------
+    Campaign
+        Every session's results, statistics, nominal models, pooled estimate, validation.
+
+    Raises
+    ------
+    CampaignError
+        No session could be analysed, or the workers could not be had.
+
+    Notes
+    -----
+    A script has to call this under ``if __name__ == "__main__":``; a notebook need not.
+    """
+    from analysis.campaigns import campaign as run
+    from analysis.structures import STRUCTURES
+
+    return run(
+        [Path(path) for path in paths],
+        settings,
+        structures=tuple(types or STRUCTURES),
+        fixed=fixed,
+        jobs=jobs,
+        dask=dask,
+    )

@@ -1,0 +1,30 @@
+"""Many sessions together: statistics, nominal models, pooled estimate, validation."""
+
+from analysis.campaigns.campaign import Campaign, campaign
+from analysis.campaigns.errors import CampaignError
+from analysis.campaigns.nominal import MeanPeakDeviation, NominalModel
+from analysis.campaigns.parameter_statistics import ParameterStatistics
+from analysis.campaigns.pooled import PooledEstimate, PooledParameter
+from analysis.campaigns.session import (
+    RecordEstimate,
+    SessionFailure,
+    SessionResult,
+    WelchFit,
+)
+from analysis.campaigns.validation import LeftOutError
+
+__all__ = [
+    "Campaign",
+    "CampaignError",
+    "LeftOutError",
+    "MeanPeakDeviation",
+    "NominalModel",
+    "ParameterStatistics",
+    "PooledEstimate",
+    "PooledParameter",
+    "RecordEstimate",
+    "SessionFailure",
+    "SessionResult",
+    "WelchFit",
+    "campaign",
+]

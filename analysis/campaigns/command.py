@@ -1,0 +1,135 @@
+"""A campaign from the command line: progress with the time left, the folder, the tables."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from analysis.campaigns.campaign import Campaign
+    from analysis.settings import WelchSettings
+
+_NAME: Final = "campaign"
+_TEXT_WIDTH: Final = 120
+_FIGURES: Final = 6
+"""At most; each takes about as long as half a session."""
+
+
+def campaign_command(
+    files: Sequence[Path],
+    settings: WelchSettings,
+    *,
+    structures: Sequence[str],
+    report: Path | None = None,
+    json: Path | None = None,
+    jobs: int | None = None,
+    dask: str | None = None,
+    with_paper: bool = False,
+) -> int:
+    """Analyse a campaign, write its folder and its JSON, and print its tables.
+
+    Parameters
+    ----------
+    files : sequence of Path
+    settings : WelchSettings
+        Of the paper's route.
+    structures : sequence of str
+        Types fitted to the whole records.
+    report : Path, optional
+        Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
+        exists ``campaign.report-2`` and so on.
+    json : Path, optional
+        New file for all results; ``-`` for standard output, which then holds nothing else.
+    jobs : int, optional
+        Worker processes, by default one a core.
+    dask : str, optional
+        Address of a Dask scheduler to use instead.
+    with_paper : bool
+        Whether the paper's numbers stand beside these.
+
+    Returns
+    -------
+    int
+        Exit code: 1 if a file could not be used, 0 otherwise.
+
+    Raises
+    ------
+    CampaignError
+        None of the files could be used, or the workers could not be had.
+    OutputExistsError, OutputError
+        Something cannot be written.
+    """
+    from rich.console import Console
+
+    from analysis.campaigns.rows import campaign_document
+    from analysis.campaigns.tables import campaign_tables
+    from analysis.report.document import document_text
+    from analysis.report.folder import report_folders, write_new
+
+    first = files[0] if report is not None else files[0].with_name(_NAME)
+    (folder,) = report_folders([first], report)
+    found = _analysed(files, settings, structures, folder, jobs, dask, with_paper=with_paper)
+    to_stdout = json is not None and str(json) == "-"
+    console = Console(stderr=to_stdout, highlight=False)
+    if not console.is_terminal:
+        console = Console(stderr=to_stdout, highlight=False, width=_TEXT_WIDTH)
+    console.print(campaign_tables(found, with_paper=with_paper))
+    lines = [f"Report of the campaign: {folder}"]
+    if json is not None:
+        text = document_text(campaign_document(found, with_paper=with_paper))
+        if to_stdout:
+            print(text, end="")  # noqa: T201 - what was asked for
+        else:
+            write_new(json, text)
+            lines.append(f"All results as JSON: {json}")
+    console.print("\n".join(lines), markup=False, soft_wrap=True)
+    return 1 if found.failures else 0
+
+
+def _analysed(
+    files: Sequence[Path],
+    settings: WelchSettings,
+    structures: Sequence[str],
+    folder: Path,
+    jobs: int | None,
+    dask: str | None,
+    *,
+    with_paper: bool,
+) -> Campaign:
+    """Analyse and write, with progress on a terminal; tell what failed."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from analysis.campaigns.campaign import campaign
+    from analysis.campaigns.write import write_campaign
+    from analysis.report.folder import new_folder
+
+    terminal = Console(stderr=True, highlight=False)
+    with Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeRemainingColumn(),
+        console=terminal,
+        transient=True,
+        disable=not terminal.is_terminal,
+    ) as progress:
+        bar = progress.add_task("starting", total=2 * len(files) + _FIGURES)
+
+        def on_progress(done: int, total: int, name: str) -> None:
+            progress.update(bar, completed=done, total=total + _FIGURES, description=name)
+
+        with new_folder(folder) as part:
+            found = campaign(
+                files, settings, structures=structures, jobs=jobs, dask=dask,
+                on_progress=on_progress,
+            )  # fmt: skip
+            write_campaign(
+                found, part, with_paper=with_paper,
+                on_step=lambda done: progress.update(bar, advance=1, description=done),
+            )  # fmt: skip
+    for failure in found.failures:
+        terminal.print(f"Error: {failure.message}", markup=False, highlight=False, soft_wrap=True)
+    return found

@@ -1,0 +1,92 @@
+"""Whole-record estimates session by session, with what they say together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns.pooled import best_estimate
+from analysis.report import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from analysis.campaigns.campaign import Campaign
+    from analysis.campaigns.pooled import PooledParameter
+
+NAMES: Final = {
+    "zeta": ("ζ", 1e5, "10⁻⁵ s^α"),
+    "alpha": ("α", 1.0, ""),
+    "gamma": ("γ", 1e2, "10⁻² s^λ/m⁴"),
+    "lambda": ("λ", 1.0, ""),
+    "density_over_stiffness": ("ρ/EI", 1e3, "10⁻³ s²/m⁴"),
+    "bending_stiffness_n_m2": ("EI", 1e3, "10⁻³ N·m²"),
+    "delay_s": ("delay of the torque", 1e6, "µs"),
+    "tool_inertia_kg_m2": ("tool's inertia", 1e6, "10⁻⁶ kg·m²"),
+}
+"""Symbol, factor and unit of each parameter."""
+_COLUMNS: Final = 4
+
+
+def pooled_figure(campaign: Campaign) -> Figure:
+    """Draw each session's estimate with its 95 % interval over the pooled one, best structure."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    estimate = best_estimate(campaign.pooled)
+    rows = -(-len(estimate.parameters) // _COLUMNS)
+    width_in, height_in = 13.0, 2.6 * rows + 1.35
+    figure = style.new_figure(
+        width_in, height_in,
+        f"{estimate.sessions} sessions — pooled whole-record estimate, type {estimate.structure}",
+        f"type of the lowest BIC; its residual is {estimate.misfit:.3g} times the noise  ·  "
+        "p: probability of so much scatter if sessions differed by their own uncertainty alone",
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        rows, _COLUMNS, left=0.06, right=0.99, top=1 - 1.2 / height_in, bottom=0.5 / height_in,
+        wspace=0.3, hspace=0.4,
+    )  # fmt: skip
+    for number, parameter in enumerate(estimate.parameters):
+        axes = figure.add_subplot(grid[number // _COLUMNS, number % _COLUMNS])
+        _panel(campaign, estimate.structure, parameter, axes)
+        if number + _COLUMNS >= len(estimate.parameters):
+            axes.set_xlabel("Session", labelpad=1)
+    figure.legend(
+        handles=[
+            Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
+                   label="session, ± 1.96 of its standard deviation"),
+            Line2D([], [], color=style.BLUE, label="pooled"),
+            Patch(facecolor=style.BLUE, alpha=0.25, label="its 95 % interval"),
+            Patch(facecolor=style.SHADE, label="true value in one more session, 95 %"),
+        ],
+        loc="upper left", ncols=4, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
+    )  # fmt: skip
+    return figure
+
+
+def _panel(campaign: Campaign, structure: str, parameter: PooledParameter, axes: Axes) -> None:
+    symbol, factor, unit = NAMES[parameter.name]
+    places, values, spreads = [], [], []
+    for number, session in enumerate(campaign.sessions, start=1):
+        for each in session.record_estimates:
+            std = each.std[parameter.name]
+            if each.structure == structure and std is not None:
+                places.append(number)
+                values.append(factor * each.parameters[parameter.name])
+                spreads.append(1.96 * factor * std)
+    axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
+    axes.axhspan(
+        *(factor * end for end in parameter.interval), color=style.BLUE, alpha=0.25, linewidth=0
+    )
+    axes.axhline(factor * parameter.value, color=style.BLUE)
+    axes.errorbar(
+        places, values, yerr=spreads, fmt="o", markersize=2.6, color=style.INK, linewidth=0.8
+    )
+    axes.set_title(f"{symbol}   p = {parameter.chance:.2g}")
+    axes.set_ylabel(f"{symbol} ({unit})" if unit else symbol)
+    axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
+    axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
+    axes.ticklabel_format(axis="y", useOffset=False)

@@ -1,0 +1,204 @@
+"""Tables of a campaign as rows of plain values, for CSV files and JSON; in SI units, exact."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import platform
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import rigd
+from analysis.campaigns import paper
+from analysis.campaigns.nominal import best_models
+from analysis.structures import STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from analysis.campaigns.campaign import Campaign
+
+Row = dict[str, Any]
+
+_STATISTICS = ("mean", "median", "std", "min", "max")
+
+
+def table3_rows(campaign: Campaign, *, with_paper: bool = False) -> list[Row]:
+    """Statistics of the parameters."""
+    rows = []
+    for each in campaign.statistics:
+        row: Row = {
+            "type": each.structure,
+            "weighting": each.weighting,
+            "parameter": each.parameter,
+            **{name: getattr(each, name) for name in _STATISTICS},
+            "at_bounds": each.at_bounds,
+        }
+        if with_paper:
+            told = paper.table3().get((each.structure, each.weighting, each.parameter))
+            row |= {f"paper_{name}": told and getattr(told, name) for name in _STATISTICS}
+        rows.append(row)
+    return rows
+
+
+def table4_rows(campaign: Campaign, *, with_paper: bool = False) -> list[Row]:
+    """Mean deviation of the resonant peaks; types in columns, as in the paper."""
+    found: dict[tuple[str, int, str], Row] = {}
+    for quantity in ("frequency_rad_s", "magnitude_db"):
+        for model in campaign.nominal:
+            for deviation in model.deviations:
+                key = (quantity, deviation.mode, model.weighting)
+                row = found.setdefault(
+                    key, dict(zip(("quantity", "mode", "weighting"), key, strict=True))
+                )
+                row[model.structure] = getattr(deviation, quantity)
+    for (quantity, mode, weighting), row in found.items():
+        if with_paper:
+            for structure in [name for name in row if name in STRUCTURES]:
+                told = paper.table4().get((structure, weighting, quantity, mode))
+                row[f"paper_{structure}"] = told
+    order = list(dict.fromkeys(model.weighting for model in campaign.nominal))
+    return [found[key] for key in sorted(found, key=lambda k: (k[0], k[1], order.index(k[2])))]
+
+
+def table5_rows(campaign: Campaign, *, with_paper: bool = False) -> list[Row]:
+    """Parameters and performance of the two best nominal models."""
+    rows = []
+    for model in best_models(campaign.nominal):
+        row: Row = {"type": model.structure, "weighting": model.weighting}
+        row |= dict(model.parameters.items())
+        row["wmse"] = model.mean_wmse
+        for deviation in model.deviations:
+            row[f"mdr_omega{deviation.mode}_rad_s"] = deviation.frequency_rad_s
+            row[f"mdr_magnitude{deviation.mode}_db"] = deviation.magnitude_db
+        if with_paper:
+            row["paper_wmse"] = paper.table5_wmse().get((model.structure, model.weighting))
+        rows.append(row)
+    return rows
+
+
+def session_rows(campaign: Campaign) -> list[Row]:
+    """Every session's fits by the paper's route, and the nominal models' distance from it."""
+    return [
+        {
+            "file": str(session.path),
+            "type": fit.structure,
+            "weighting": fit.weighting,
+            **fit.parameters,
+            "cost": fit.cost,
+            "at_bounds": " ".join(fit.at_bounds),
+            **{f"nominal_{name}": value for name, value in asdict(model.indices[number]).items()},
+        }
+        for number, session in enumerate(campaign.sessions)
+        for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
+    ]
+
+
+def record_rows(campaign: Campaign) -> list[Row]:
+    """Every session's whole-record fits."""
+    return [
+        {
+            "file": str(session.path),
+            "type": each.structure,
+            **each.parameters,
+            **{f"{name}_std": value for name, value in each.std.items()},
+            "cost": each.cost,
+            "degrees_of_freedom": each.degrees_of_freedom,
+            "at_bounds": " ".join(each.at_bounds),
+        }
+        for session in campaign.sessions
+        for each in session.record_estimates
+    ]
+
+
+def pooled_rows(campaign: Campaign) -> list[Row]:
+    """Pooled whole-record estimates."""
+    return [
+        {
+            "type": estimate.structure,
+            "sessions": estimate.sessions,
+            "misfit": estimate.misfit,
+            "parameter": each.name,
+            "value": each.value,
+            "std": each.std,
+            "low_95": each.interval[0],
+            "high_95": each.interval[1],
+            "within_std": each.within_std,
+            "between_std": each.between_std,
+            "chance": each.chance,
+            "next_low_95": each.next_interval[0],
+            "next_high_95": each.next_interval[1],
+        }
+        for estimate in campaign.pooled
+        for each in estimate.parameters
+    ]
+
+
+def validation_rows(campaign: Campaign) -> list[Row]:
+    """Errors of each session predicted from the others."""
+    return [
+        {
+            "file": str(each.path),
+            "method": each.method,
+            "type": each.structure,
+            "weighting": each.weighting,
+            "error": each.error,
+            "own_error": each.own_error,
+        }
+        for each in campaign.validation
+    ]
+
+
+def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, list[Row]]:
+    """Every table by name, without those that are empty."""
+    with_numbers: Mapping[str, Callable[..., list[Row]]] = {
+        "table3": table3_rows,
+        "table4": table4_rows,
+        "table5": table5_rows,
+    }
+    found = {name: make(campaign, with_paper=with_paper) for name, make in with_numbers.items()}
+    found |= {
+        "sessions_welch": session_rows(campaign),
+        "sessions_record": record_rows(campaign),
+        "pooled": pooled_rows(campaign),
+        "validation": validation_rows(campaign),
+    }
+    return {name: [_known_row(row) for row in rows] for name, rows in found.items() if rows}
+
+
+def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Any]:
+    """Collect the campaign as one JSON document, without NaN: what is not known is null."""
+    return {
+        "versions": {
+            "rigd": rigd.__version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+        },
+        "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
+        "files": [
+            {"file": str(each.path), "warnings": list(each.warnings)} for each in campaign.sessions
+        ],
+        "errors": [{"file": str(each.path), "message": each.message} for each in campaign.failures],
+        **all_tables(campaign, with_paper=with_paper),
+    }
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """Rows as CSV with a heading; what is not known is an empty field."""
+    stream = io.StringIO()
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(stream, list(names), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def _known_row(row: Row) -> Row:
+    """Put None for numbers that are not finite."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in row.items()
+    }

@@ -1,0 +1,122 @@
+"""Each session predicted from the others: what a model is worth for data it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.campaigns.errors import task_errors
+from analysis.campaigns.nominal import mean_damping
+from analysis.campaigns.pooled import pooled_estimates
+from analysis.whole_record import Measurement, Plant
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from analysis.campaigns.session import SessionResult
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOutError:
+    """Error of one model in one session, of which it has seen nothing.
+
+    Attributes
+    ----------
+    path : Path
+        Of the session.
+    method : {"record", "welch"}
+        Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
+        of the others by the paper's route.
+    structure : str
+    weighting : str or None
+        None with "record".
+    error : float
+        Root mean square of predicted minus measured torque over that of the measured torque, in
+        the band, without means.
+    own_error : float or None
+        The same with the session's own whole-record fit of that structure, None with "welch". What
+        noise there is, it holds too: an error no larger shows that the sessions agree.
+    """
+
+    path: Path
+    method: str
+    structure: str
+    weighting: str | None
+    error: float
+    own_error: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What others say of a session: a model's name and its plant, the session's own beside it."""
+
+    method: str
+    structure: str
+    weighting: str | None
+    plant: Plant
+    own: Plant | None
+
+
+def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecast, ...]:
+    """Models of all sessions but one, to be tried on that one."""
+    session = sessions[left_out]
+    others = [*sessions[:left_out], *sessions[left_out + 1 :]]
+    own = {each.structure: each.plant for each in session.record_estimates}
+    found = [
+        Forecast("record", each.structure, None, each.plant, own[each.structure])
+        for each in pooled_estimates(others)
+        if each.structure in own
+    ]
+    for number, fit in enumerate(session.welch_fits):
+        damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
+        plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
+        found.append(Forecast("welch", fit.structure, fit.weighting, plant, None))
+    return tuple(found)
+
+
+def left_out_errors(
+    path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float]
+) -> tuple[LeftOutError, ...]:
+    """Read a session and compare its torque with what each model predicts from its angle.
+
+    Returns nothing for a session that the whole-record estimator cannot use.
+    """
+    from analysis.record import load_record
+    from analysis.whole_record.comparison import Comparison
+
+    try:
+        comparison = Comparison.of(Measurement.of_record(load_record(path)), band_hz)
+    except task_errors():
+        return ()
+    measured = comparison.torque_nm[comparison.kept]
+    size = np.linalg.norm(comparison.spectrum(measured))
+
+    def error(plant: Plant) -> float:
+        predicted, _ = comparison.prediction.torque(plant)
+        return float(np.linalg.norm(comparison.spectrum(predicted - measured)) / size)
+
+    return tuple(
+        LeftOutError(
+            path=path,
+            method=each.method,
+            structure=each.structure,
+            weighting=each.weighting,
+            error=error(each.plant),
+            own_error=None if each.own is None else error(each.own),
+        )
+        for each in tried
+    )
+
+
+def by_model(
+    errors: Sequence[LeftOutError],
+) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
+    """Group errors by method, structure and weighting, the smallest mean error first."""
+    found: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
+    for each in errors:
+        found.setdefault((each.method, each.structure, each.weighting), []).append(each)
+    groups = [(*key, tuple(group)) for key, group in found.items()]
+    return sorted(groups, key=lambda group: float(np.mean([each.error for each in group[3]])))

@@ -1,0 +1,151 @@
+"""How a report came about: file, record, what the file states, settings, versions."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from typing import TYPE_CHECKING
+
+import matplotlib as mpl
+import numpy as np
+
+import rigd
+from analysis.report.html.markup import Markup, element
+
+if TYPE_CHECKING:
+    from datetime import datetime
+    from pathlib import Path
+
+    from analysis.record import Record
+    from analysis.report.html.subject import Subject
+    from analysis.welch_route import WelchAnalysis
+
+_SHOWN_ALREADY = frozenset(
+    (
+        "rate_hz", "beam_length_m", "beam_density_kg_per_m", "beam_bending_stiffness_n_m2",
+        "tool_inertia_kg_m2", "angle_delay_s", "torque_delay_s",
+    )
+)  # fmt: skip
+
+
+def how_sections(subject: Subject, made_at: datetime) -> tuple[Markup, ...]:
+    """Make a table of facts for each of file, record, session, settings and versions."""
+    record = subject.record
+    parts = [
+        ("File", _file_facts(record.path)),
+        ("Record", _record_facts(record)),
+        (
+            "Session, as the file states it",
+            [(key, value) for key, value in record.metadata.items() if key not in _SHOWN_ALREADY],
+        ),
+        ("Whole-record fits", _record_fit_facts(subject)),
+    ]
+    if subject.welch is not None:
+        parts.append(("The paper's route", _welch_facts(subject.welch)))
+    parts.append(
+        (
+            "Versions",
+            [
+                ("report made", made_at.isoformat(timespec="seconds")),
+                ("rigd", rigd.__version__),
+                ("Python", platform.python_version()),
+                ("numpy", np.__version__),
+                ("matplotlib", mpl.__version__),
+            ],
+        )
+    )
+    return tuple(_facts(title, facts) for title, facts in parts if facts)
+
+
+def sha256(path: Path) -> str | None:
+    """Checksum of a file, None if it is not there any more."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError:
+        return None
+
+
+def _facts(title: str, facts: list[tuple[str, str]]) -> Markup:
+    rows = [
+        element("tr", element("th", name, scope="row"), element("td", value))
+        for name, value in facts
+    ]
+    made = element("table", element("caption", title), element("tbody", *rows))
+    return element("div", made, class_="table")
+
+
+def _file_facts(path: Path) -> list[tuple[str, str]]:
+    checksum = sha256(path)
+    facts = [("path", str(path))]
+    if checksum is not None:
+        facts += [("size", f"{path.stat().st_size} bytes"), ("SHA-256", checksum)]
+    return facts
+
+
+def _record_facts(record: Record) -> list[tuple[str, str]]:
+    beam, gaps = record.beam, record.gaps
+    samples = len(record.time_s)
+    flags = ", ".join(f"{count} × {meaning}" for meaning, count in record.flags.items())
+    return [
+        ("outcome", record.outcome),
+        ("samples", f"{samples} at {record.rate_hz:g} Hz, {samples / record.rate_hz:.6g} s"),
+        ("sweep", f"samples {record.sweep.start} to {record.sweep.stop - 1}"),
+        ("beam length", f"{beam.length_m:g} m"),
+        ("beam density", f"{beam.density_kg_per_m:g} kg/m"),
+        ("bending stiffness", f"{beam.bending_stiffness_n_m2:g} N·m²"),
+        ("inertia of the clamp", f"{record.tool_inertia_kg_m2:g} kg·m²"),
+        ("age of the angle", f"{1e3 * record.angle_delay_s:g} ms"),
+        ("age of the torque", f"{1e3 * record.torque_delay_s:g} ms"),
+        ("missing ticks", f"{gaps.missing_ticks}, {gaps.sweep_missing_ticks} of them in the sweep"),
+        (
+            "stale values in the sweep",
+            f"{gaps.sweep_stale_angles} of the angle, {gaps.sweep_stale_torques} of the torque",
+        ),
+        ("flags in the sweep", flags or "none"),
+    ]
+
+
+def _record_fit_facts(subject: Subject) -> list[tuple[str, str]]:
+    first_hz, last_hz = subject.band_hz
+    lines = [
+        f"{line.frequency_hz:.5g} Hz, {1e3 * line.amplitude_nm:.3g} mN·m"
+        for line in subject.analysis.lines
+    ]
+    return [
+        (
+            "estimator",
+            "output error on the whole record: the torque that the exact model (Eq. 25) makes of "
+            "the measured angle against the measured one, whitened with the noise found; maximum "
+            "likelihood for noise in the torque",
+        ),
+        ("band", f"{first_hz:g} to {last_hz:g} Hz, {subject.analysis.frequency_hz.size} bins"),
+        ("types", ", ".join(subject.fits)),
+        ("fixed at the file's values", ", ".join(subject.fixed) or "none"),
+        ("hum left out", "; ".join(lines) or "none found"),
+        (
+            "intervals and bands",
+            "95 %, from the covariance of the parameters at the minimum; curves by linearisation",
+        ),
+    ]
+
+
+def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
+    settings, used, response = analysis.settings, analysis.segmentation, analysis.response
+    first_hz, last_hz = settings.band_hz
+    estimator = {"h1": "Welch, H1", "h2": "Welch, H2", "hv": "Welch, Hv"}.get(settings.estimator)
+    facts = [
+        ("estimator", estimator or "ratio of the transforms of the whole record"),
+        ("band", f"{first_hz:g} to {last_hz:g} Hz, {len(response.frequency_hz)} bins"),
+        ("types", ", ".join(settings.types)),
+        ("weights", ", ".join(settings.weightings)),
+    ]
+    if estimator:
+        facts.append(
+            (
+                "segments",
+                f"{response.segments} of {used.segment_length} samples (Hamming), overlap "
+                f"{used.overlap}, nfft {used.nfft}",
+            )
+        )
+    return facts

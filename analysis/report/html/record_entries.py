@@ -1,0 +1,124 @@
+"""Whole-record results for the JSON document: entries beside those of the paper's route."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.report.record_figure_bands import loss_factors, response_band
+
+if TYPE_CHECKING:
+    from analysis.report.html.subject import Subject
+    from analysis.report.record_figure_bands import LossFactor
+    from analysis.whole_record import DampingSize
+
+_CURVE_POINTS = 200
+
+
+def record_entries(subject: Subject) -> dict[str, Any]:
+    """Collect the whole-record results of one record.
+
+    Returns
+    -------
+    dict
+        ``fits`` and ``modes``: lists of objects as the document has them of the paper's route,
+        with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
+        selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
+        not finite, as `analysis.report.document` takes them.
+    """
+    names = [
+        (
+            {
+                "file": str(subject.record.path),
+                "estimator": "record",
+                "type": fit.structure.name,
+                "weighting": None,
+                "candidate": name,
+            },
+            fit,
+        )
+        for name, fit in subject.fits.items()
+    ]
+    return {
+        "fits": [
+            {
+                **name,
+                "free": [*fit.interval],
+                "parameters": dict(fit.parameters),
+                "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
+                "interval_95": {
+                    key: None if ends is None else list(ends) for key, ends in fit.interval.items()
+                },
+                "cost": fit.cost,
+                "degrees_of_freedom": fit.degrees_of_freedom,
+                "at_bounds": list(fit.at_bounds),
+                "determined": list(fit.determined),
+                "covariance": fit.covariance.tolist(),
+                "internal_size": _size(fit.internal),
+                "external_size": _size(fit.external),
+                "ringing": {**asdict(fit.ringing), "significant": fit.ringing.significant},
+                "indices": {"mse": None, "wmse": None, "md": None},
+            }
+            for name, fit in names
+        ],
+        "modes": [
+            {
+                **name,
+                "mode": mode.number,
+                "frequency_hz": mode.frequency_hz,
+                "frequency_std_hz": mode.frequency_std_hz,
+                "damping_ratio": mode.damping_ratio,
+                "damping_ratio_std": mode.damping_ratio_std,
+            }
+            # Of the fit that is believed: they are what narrow sweeps are planned by.
+            for name, fit in names
+            if name["candidate"] == subject.verdict.selected
+            for mode in fit.modes
+        ],
+        "records": [
+            {
+                "file": str(subject.record.path),
+                "selected": subject.verdict.selected,
+                "verdict": list(subject.verdict.sentences),
+                "experiments": list(subject.verdict.experiments),
+                "withheld": sorted(subject.verdict.withheld),
+                "band_hz": list(subject.band_hz),
+                "fixed": list(subject.fixed),
+                "hum": [asdict(line) for line in subject.analysis.lines],
+                "curves": _curves(subject),
+            }
+        ],
+    }
+
+
+def _size(size: DampingSize | None) -> dict[str, Any] | None:
+    return None if size is None else asdict(size)
+
+
+def _curves(subject: Subject) -> dict[str, Any]:
+    """Tabulate the selected fit's response and loss factors over the band."""
+    first_hz, last_hz = subject.band_hz
+    frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
+    band = response_band(subject.fit, frequency_hz)
+    low, high = band.magnitude_limits()
+    factors = loss_factors(subject.fit, frequency_hz)
+    return {
+        "frequency_hz": frequency_hz.tolist(),
+        "magnitude_nm_per_rad": np.abs(band.response).tolist(),
+        "magnitude_low_nm_per_rad": low.tolist(),
+        "magnitude_high_nm_per_rad": high.tolist(),
+        "phase_rad": np.angle(band.response).tolist(),
+        "phase_std_rad": band.phase_std_rad.tolist(),
+        "loss_factor": _factor(factors.total),
+        "internal_loss_factor": _factor(factors.internal),
+        "external_loss_factor": _factor(factors.external),
+    }
+
+
+def _factor(factor: LossFactor | None) -> dict[str, list[float]] | None:
+    if factor is None:
+        return None
+    low, high = factor.limits()
+    return {"value": factor.value.tolist(), "low": low.tolist(), "high": high.tolist()}

@@ -1,0 +1,115 @@
+"""What a report is about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.record import Record
+    from analysis.selection import Selection
+    from analysis.welch_route import WelchAnalysis
+    from analysis.whole_record import RecordAnalysis, RecordFit, Setting
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the selection of a structure came to, as a report shows it.
+
+    Attributes
+    ----------
+    selected : str
+        Name of the fit to be believed, among `Subject.fits`.
+    sentences : tuple of str
+        What can be told from the data and what cannot, in the operator's words.
+    experiments : tuple of str
+        What would tell more.
+    withheld : frozenset of str
+        Orders of the selected fit that the data do not support: they are not reported.
+    delta_bic : dict of str to float
+        BIC above the lowest by the name of the fit; may be empty.
+    """
+
+    selected: str
+    sentences: tuple[str, ...]
+    experiments: tuple[str, ...] = ()
+    withheld: frozenset[str] = frozenset()
+    delta_bic: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, selection: Selection) -> Verdict:
+        """Take over what `analysis.selection` says."""
+        said, best = selection.verdict, selection.candidates[0]
+        return cls(
+            selected=best.name,
+            sentences=said.sentences,
+            experiments=said.experiments,
+            withheld=frozenset(best.fit.parameters.keys() - said.parameters.keys()),
+            delta_bic={each.name: each.bic - best.bic for each in selection.candidates},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """One record with everything that was found in it.
+
+    Attributes
+    ----------
+    record : Record
+    analysis : RecordAnalysis
+        Its noise, lines and bins are those of all `fits`.
+    fits : dict of str to RecordFit
+        Whole-record fits by the name that tables call them, in the order of the tables.
+    verdict : Verdict
+    band_hz : tuple of float
+        Of the whole-record fits.
+    fixed : tuple of str
+        Settings that stayed at the file's values in them.
+    welch : WelchAnalysis or None
+        The paper's route on the same record; None if it was not gone.
+    """
+
+    record: Record
+    analysis: RecordAnalysis
+    fits: Mapping[str, RecordFit]
+    verdict: Verdict
+    band_hz: tuple[float, float]
+    fixed: tuple[Setting, ...] = ()
+    welch: WelchAnalysis | None = None
+
+    @classmethod
+    def of(
+        cls,
+        record: Record,
+        selection: Selection,
+        band_hz: tuple[float, float],
+        fixed: tuple[Setting, ...] = (),
+        welch: WelchAnalysis | None = None,
+    ) -> Subject:
+        """Take what was selected for a record."""
+        return cls(
+            record=record,
+            analysis=selection.analysis,
+            fits={candidate.name: candidate.fit for candidate in selection.candidates},
+            verdict=Verdict.of(selection),
+            band_hz=band_hz,
+            fixed=fixed,
+            welch=welch,
+        )
+
+    @property
+    def fit(self) -> RecordFit:
+        """The selected fit."""
+        return self.fits[self.verdict.selected]
+
+    @property
+    def name(self) -> str:
+        """What titles call the record."""
+        return self.record.path.name
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What an analyst should read beside the results."""
+        return self.record.warnings if self.welch is None else self.welch.warnings

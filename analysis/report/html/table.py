@@ -1,0 +1,110 @@
+"""A table once, for HTML and for CSV: each number in full, and as it is shown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ABSENT: Final = "–"
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A number of a table.
+
+    Attributes
+    ----------
+    value : float or None
+        In SI units and in full; None if it is not known.
+    text : str
+        As it is shown, in the unit that the table states.
+    strong : bool
+        Whether the eye should stop at it.
+    """
+
+    value: float | None
+    text: str
+    strong: bool = False
+
+
+Cell = Number | str
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column: heading as people read it, and as programs do (name with unit)."""
+
+    heading: str
+    key: str
+    numeric: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of a report.
+
+    Attributes
+    ----------
+    name : str
+        Of its CSV file, without the ending.
+    caption : str
+    columns : tuple of Column
+        The first one names the rows.
+    rows : tuple of tuple of Cell
+    notes : tuple of str
+        Sentences under it.
+    selected : int or None
+        Row that is marked.
+    """
+
+    name: str
+    caption: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    notes: tuple[str, ...] = ()
+    selected: int | None = None
+
+
+def csv_text(table: Table) -> str:
+    """Write a table as CSV: keys as header, numbers in SI units and full precision."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([column.key for column in table.columns])
+    for row in table.rows:
+        writer.writerow([_plain(cell) for cell in row])
+    return buffer.getvalue()
+
+
+def number(value: float | None, form: str = ".4g", factor: float = 1.0) -> Number:
+    """Show `value` times `factor` in a format; a dash if it is not known or not finite."""
+    if value is None or not math.isfinite(value):
+        return Number(None, ABSENT)
+    return Number(float(value), f"{factor * value:{form}}".replace("-", "−"))
+
+
+def count(value: int) -> Number:
+    """Show a whole number."""
+    return Number(value, str(value))
+
+
+def estimate(
+    values: Sequence[float | None], std: float | None, factor: float = 1.0
+) -> tuple[Number, ...]:
+    """Show numbers that are uncertain by `std`, all to its second digit."""
+    if std is None or not math.isfinite(std) or std <= 0:
+        return tuple(number(value, ".5g", factor) for value in values)
+    decimals = max(1 - math.floor(math.log10(factor * std)), 0)
+    form = f".{decimals}f" if decimals <= 7 else ".4g"
+    return tuple(number(value, form, factor) for value in values)
+
+
+def _plain(cell: Cell) -> str:
+    if isinstance(cell, str):
+        return cell
+    return "" if cell.value is None else repr(cell.value)

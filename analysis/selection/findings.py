@@ -1,0 +1,145 @@
+"""What is in the record beside the beam of Eq. 25, each by its name and size."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from analysis.selection.finding import Finding
+from analysis.selection.stated_otherwise import of_beam, of_instruments, of_start
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from analysis.selection.candidates import Field
+    from analysis.selection.harmonics import Harmonic
+    from analysis.selection.nonlinear_search import NonlinearForce
+    from analysis.selection.whiteness import InputRelation, Whiteness
+
+_NORMAL_95: Final = 1.959963984540054
+_MAINS_WANDER: Final = 0.005
+
+
+def findings(
+    field: Field, forces: tuple[NonlinearForce, ...], multiples: tuple[Harmonic, ...]
+) -> tuple[Finding, ...]:
+    """Name what is there.
+
+    Parameters
+    ----------
+    field : Field
+    forces : tuple of NonlinearForce
+        Those the record calls for.
+    multiples : tuple of Harmonic
+        What the residual holds at multiples of the sweep's frequency.
+    """
+    return (
+        *_hum(field),
+        *map(_force, forces),
+        *_harmonics(multiples),
+        *of_instruments(field),
+        *of_beam(field),
+        *of_start(field),
+    )
+
+
+def mains(frequency_hz: float) -> str:
+    """Name the mains if that may be the source, else nothing."""
+    for base in (50, 60):
+        for n in range(1, 9):
+            if abs(frequency_hz - n * base) < _MAINS_WANDER * n * base:
+                return "the mains" if n == 1 else f"{n} times the mains frequency"
+    return ""
+
+
+def _hum(field: Field) -> Iterator[Finding]:
+    for line in field.noise.lines:
+        near = mains(line.frequency_hz)
+        source = f", {near}" if near else ""
+        yield Finding(
+            kind="hum",
+            sentence=(
+                f"The torque hums at {line.frequency_hz:.2f} Hz{source}, with "
+                f"{1e3 * line.amplitude_nm:.3g} mN·m all through the record. The motor did not "
+                "cause it; these frequencies were left out."
+            ),
+            value=line.amplitude_nm,
+            interval=None,
+            unit="N·m",
+            remedy="Check shield and earth of the torque sensor's cable.",
+        )
+
+
+def _force(force: NonlinearForce) -> Finding:
+    size, std, mode = force.size, force.std, force.term.mode
+    percent = f"{100 * abs(size):.2g} % (± {100 * _NORMAL_95 * std:.1g} %)"
+    if force.term.kind == "quadratic drag":
+        sentence = (
+            f"The damping of mode {mode} depends on its speed, as drag in air does: its damping "
+            f"ratio is {abs(size):.2g} (± {_NORMAL_95 * std:.1g}) "
+            f"{'higher' if size > 0 else 'lower'} at the highest speed than at rest."
+        )
+    elif force.term.kind == "cubic stiffness":
+        sentence = (
+            f"The beam is not linear: the stiffness of mode {mode} "
+            f"{'rises' if size > 0 else 'falls'} by {percent} up to its largest deflection (a "
+            "cubic force). It is neither a mode nor an order of the damping, and was fitted beside "
+            "the beam."
+        )
+    else:
+        sentence = (
+            f"The beam is not linear: the stiffness of mode {mode} differs from one side to the "
+            f"other, by {percent} at its largest deflection (a quadratic force)."
+        )
+    return Finding(
+        kind="nonlinear damping" if force.term.kind == "quadratic drag" else "nonlinear stiffness",
+        sentence=sentence,
+        value=size,
+        interval=(size - _NORMAL_95 * std, size + _NORMAL_95 * std),
+        unit="1",
+        remedy="Repeat the sweep at half the amplitude: what is not linear all but vanishes.",
+    )
+
+
+def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
+    for harmonic in multiples:
+        if harmonic.present:
+            parity = "odd" if harmonic.multiple % 2 else "even"
+            yield Finding(
+                kind="harmonics",
+                sentence=(
+                    f"What remains follows the sweep at {harmonic.multiple} times its frequency, "
+                    f"most with the drive at {harmonic.drive_hz:.1f} Hz: an {parity} harmonic, "
+                    "which nothing linear makes."
+                ),
+                value=harmonic.deviate,
+                interval=None,
+                unit="standard deviations",
+                remedy="Repeat the sweep at half the amplitude; look for play in the clamp.",
+            )
+
+
+def unexplained(white: Whiteness, related: InputRelation) -> Finding:
+    """Describe what remains and has no name."""
+    low, high = white.loudest_hz
+    near = mains((low + high) / 2)
+    if related.related:
+        what = (
+            "Part of what remains still follows the motor: linear dynamics that no structure has, "
+            f"most at {related.at_hz:.2f} Hz."
+        )
+        remedy = "Look for a second resonance: motor mount, clamp, cable."
+    else:
+        what = (
+            "What remains is louder than the noise, most from "
+            f"{low:.2f} to {high:.2f} Hz ({white.loudest_ratio:.1f} times), and does not follow "
+            f"the motor: a disturbance{', as of the mains that come and go' if near else ''}."
+        )
+        remedy = "Record with the motor at rest, to see whether it is always there."
+    return Finding(
+        kind="unexplained",
+        sentence=f"{what} Until it is known, take intervals and orders with care.",
+        value=white.loudest_ratio,
+        interval=None,
+        unit="1",
+        remedy=remedy,
+    )

@@ -1,0 +1,60 @@
+"""Hum next to the band, which leaks into it: the mains lie at the very end of a band to 50 Hz.
+
+Within the band the estimator finds lines itself (`RecordAnalysis.lines`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.whole_record.noise import Noise, noise_of, smooth_power
+
+if TYPE_CHECKING:
+    from analysis.whole_record import RecordFit
+    from analysis.whole_record.comparison import Comparison
+
+_NEAR_HZ: Final = 5.0
+_SAME_HZ: Final = 0.1
+_LEAKS: Final = 0.3
+"""Leaked power over that of the noise that does no harm."""
+
+
+def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noise:
+    """Leave out the bins into which a line beyond the band leaks, and name the line.
+
+    Parameters
+    ----------
+    noise : Noise
+        As the estimator found it.
+    comparison : Comparison
+    fit : RecordFit
+        What explains the record best under that noise: its torque is taken off.
+    """
+    rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
+    end_hz = float(comparison.frequency_hz[-1])
+    torque, _ = comparison.prediction.torque(fit.plant)
+    residual = np.fft.rfft(comparison.torque_nm[comparison.kept] - torque)
+    all_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
+    near = np.abs(all_hz - end_hz) < min(_NEAR_HZ, rate_hz / 2 - end_hz)
+    share = comparison.measurement.torque_share
+    anywhere = np.zeros(np.count_nonzero(near), dtype=bool)
+    found = noise_of(residual[near], all_hz[near], samples, share, near_mode=anywhere)
+    counts, lines = noise.counts.copy(), list(noise.lines)
+    for line in found.lines:
+        # A line leaks as peak / (pi distance in bins).
+        peak = line.amplitude_nm * samples / 2
+        harmless = math.sqrt(_LEAKS * float(noise.power[-1]))
+        reach_hz = peak / (math.pi * harmless) * rate_hz / samples
+        counts &= np.abs(comparison.frequency_hz - line.frequency_hz) > reach_hz
+        others = [k for k in lines if abs(line.frequency_hz - k.frequency_hz) > _SAME_HZ]
+        lines = [*others, line]
+    if not found.lines:
+        return noise
+    # What leaked has raised the estimated noise of whole blocks of bins.
+    clean = (fit.residual * np.sqrt(noise.power / 2))[counts]
+    bins = np.arange(counts.size)
+    power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / share)))
+    return Noise(power, counts, tuple(lines))

@@ -1,0 +1,173 @@
+"""Which restoring forces that are not linear the record calls for, and how large they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.selection.candidates import FREE_STIFFNESS
+from analysis.selection.chance import SURE
+from analysis.selection.nonlinear import KINDS, ModalForces, Term
+from analysis.selection.orders import STRONG
+from analysis.selection.refit import Refit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.selection.candidates import Candidate, Field
+
+_MOST_TERMS: Final = 2
+_ROUNDS: Final = 6
+_SETTLED: Final = 0.005
+_GAIN: Final = SURE**2 + 2 * math.log(30)
+"""Deviance that a term must save: three forces on three modes and three rounds are tried."""
+
+_HOPELESS: Final = 2000.0
+"""Deviance behind the best, to first order, from which no substitution leads back."""
+
+_EXPLAINED: Final = 0.5
+"""Share of what exceeds chance that the terms must explain; else something else is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class NonlinearForce:
+    """A restoring force that is not linear.
+
+    Attributes
+    ----------
+    term : Term
+    size : float
+        Share of the stiffness at the largest deflection, or damping ratio at the largest speed.
+    std : float
+    """
+
+    term: Term
+    size: float
+    std: float
+
+
+def nonlinear_forces(
+    field: Field, modes: tuple[int, ...]
+) -> tuple[Field, tuple[NonlinearForce, ...]]:
+    """Add forces one by one while each saves far more than chance would; fit all anew with them.
+
+    A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
+    order. Where the best candidate has these, the search also starts from those without.
+
+    Parameters
+    ----------
+    field : Field
+        Without such forces.
+    modes : tuple of int
+        Modes that the record shows.
+
+    Returns
+    -------
+    field : Field
+        The one given, if there is nothing.
+    forces : tuple of NonlinearForce
+    """
+    for lead in _leads(field):
+        found, forces = _added(field, lead, modes)
+        if forces and found.bic < field.bic - STRONG and _explain(field, found):
+            return found, forces
+    return field, ()
+
+
+def _leads(field: Field) -> tuple[Candidate, ...]:
+    """Candidates to start from: the best, and before it those that are simpler."""
+    best = field.best
+    if best.uniform and "alpha" not in best.structure.free:
+        return (best,)
+    simple = (c for c in field.candidates if c.uniform and c.structure in FREE_STIFFNESS)
+    return (*simple, best)
+
+
+def _added(
+    field: Field, lead: Candidate, modes: tuple[int, ...]
+) -> tuple[Field, tuple[NonlinearForce, ...]]:
+    """Add forces to one candidate, then to all."""
+    terms: list[Term] = []
+    sizes = std = np.zeros(0)
+    best = field.best
+    here = field.refit(lead.structure, lead.uniform, lead.fit.plant)
+    while len(terms) < _MOST_TERMS:
+        term, cost = _most_wanted(field, here, modes, terms)
+        behind = best.values * math.log(cost / best.fit.cost)
+        gain = best.values * math.log(here.cost / cost)
+        if term is None or gain < _GAIN or behind > _HOPELESS:
+            break
+        tried, more, more_std = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
+        if best.values * math.log(here.cost / tried.cost) < _GAIN:
+            break
+        terms.append(term)
+        here, sizes, std = tried, more, more_std
+    if not terms:
+        return field, ()
+    every = field.with_columns(here.columns, here.noise_here())
+    forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
+    return every, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
+
+
+def _most_wanted(
+    field: Field, refit: Refit, modes: tuple[int, ...], taken: list[Term]
+) -> tuple[Term | None, float]:
+    """Find the term that to first order saves most, and the cost with it."""
+    projected = refit.objective.project(refit.objective.linearise(refit.x), field.noise.weight)
+    forces = ModalForces(field.comparison, refit.plant)
+    terms = [Term(kind, mode) for kind in KINDS for mode in modes]
+    terms = [term for term in terms if term not in taken]
+    if not terms:
+        return None, projected.cost
+    at = refit.objective.linearise(refit.x)
+    known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
+    every = np.array([forces.column(term) for term in terms], dtype=np.complex128)
+    columns = every * field.noise.weight
+    columns = columns - _projection(columns, known)
+    squares = np.sum(np.abs(columns) ** 2, axis=1)
+    along = (columns.conj() @ projected.residual).real
+    saved = along**2 / np.maximum(squares, np.finfo(float).tiny)
+    most = int(np.argmax(saved))
+    return terms[most], max(projected.cost - float(saved[most]), 1e-3 * projected.cost)
+
+
+def _projection(
+    columns: NDArray[np.complex128], known: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Part of the columns that what is free already could explain."""
+    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
+    basis = known[scale > 0] / scale[scale > 0, None]
+    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
+    part: NDArray[np.complex128] = np.linalg.solve(gram, (basis.conj() @ columns.T).real).T @ basis
+    return part
+
+
+def _with_terms(
+    field: Field, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
+) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]]:
+    """Fit with the columns of these terms, at the sizes that they turn out to have."""
+    std = np.zeros(sizes.size)
+    for _ in range(_ROUNDS):
+        forces = ModalForces(field.comparison, refit.plant)
+        columns = np.array(
+            [forces.column(term, size) for term, size in zip(terms, sizes.tolist(), strict=True)]
+        )
+        refit = Refit.descend(
+            field.comparison, refit.objective.unknowns, refit.x, field.noise, columns
+        )
+        before, (sizes, std) = sizes, refit.amplitudes()
+        if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SETTLED * np.abs(sizes))):
+            break
+    return refit, sizes, std
+
+
+def _explain(without: Field, within: Field) -> bool:
+    """Whether the forces explain what the linear beam left, or at least half of it."""
+    power = np.abs(without.best.fit.residual) ** 2
+    before = without.best.fit.cost - without.best.fit.degrees_of_freedom
+    chance = SURE * math.sqrt(2 * power.size * 2)
+    after = within.best.fit.cost - within.best.fit.degrees_of_freedom
+    return after < max(_EXPLAINED * before, chance)

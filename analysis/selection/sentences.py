@@ -1,0 +1,129 @@
+"""The verdict in the operator's words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from analysis.selection.candidates import Candidate, Field
+    from analysis.selection.finding import Finding
+    from analysis.selection.orders import OrderVerdict
+
+_DAMPING: Final = {
+    "I": "damping of the material only, proportional to the rate of strain",
+    "II": "viscous damping by the surroundings only",
+    "III": "viscous damping by material and surroundings, both of order 1",
+    "IV": "damping of the material only, of fractional order",
+    "V": "damping by the surroundings only, of fractional order",
+    "VI": "damping by material and surroundings, both of fractional order",
+    "VII": "damping of the material of order 1, and by the surroundings of fractional order",
+}
+_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+
+
+def selected(
+    field: Field,
+    close: tuple[Candidate, ...],
+    orders: tuple[OrderVerdict, ...],
+    *,
+    adequate: bool,
+) -> list[str]:
+    """Say what was selected, and what it cannot be told from."""
+    best = field.best
+    beam = "" if best.uniform else ", on a beam whose modes each have a stiffness of their own"
+    said = [f"Type {best.structure.name}: {_DAMPING[best.structure.name]}{beam}."]
+    loose = [o.order for o in orders if o.value is None and o.order in best.structure.free]
+    if loose:
+        said.append(
+            f"It describes the record best, but its {' and '.join(loose)} must not be taken for a "
+            "property of the beam."
+        )
+    if close:
+        margin = min(c.bic for c in close) - best.bic
+        said.append(
+            f"The data cannot tell type {best.name} from "
+            f"{' or '.join(f'type {c.name}' for c in close)} (BIC differs by {margin:.1f}; "
+            "10 would be clear)."
+        )
+    else:
+        others = [c for c in field.candidates[1:] if c.structure is not best.structure]
+        if others:
+            next_best = others[0]
+            said.append(
+                f"The next, type {next_best.name}, is worse by {next_best.bic - best.bic:.3g} in "
+                "BIC."
+            )
+    if adequate:
+        said.append("What it leaves is noise: nothing in the record asks for more.")
+    return said
+
+
+def order(verdict: OrderVerdict, visible: tuple[int, ...]) -> str:
+    """Say what is known of one order."""
+    profile = verdict.profile
+    low, high = profile.interval
+    ends = f"95 %: {low:.3f} to {high:.3f}"
+    name, of = verdict.order, _OF[verdict.order]
+    if verdict.status == "absent":
+        return f"No {of} shows, so its order {name} means nothing here."
+    if verdict.status == "not identifiable":
+        span = (
+            "any value between 0 and 2 fits"
+            if profile.open_below and profile.open_above
+            else f"anything below {high:.2f} fits"
+            if profile.open_below
+            else f"anything above {low:.2f} fits"
+            if profile.open_above
+            else f"anything from {low:.2f} to {high:.2f} fits"
+        )
+        if len(visible) < 2 and name == "alpha":
+            span = "one mode alone shows how much damping there is, not of which order" + (
+                "" if profile.identifiable else f"; {span}"
+            )
+        return f"The order {name} of the {of} is not identifiable: {span}."
+    if verdict.status == "integer":
+        chance = "" if profile.admits_one else ", which differs from 1 by no more than chance may"
+        return (
+            f"The order {name} of the {of} is 1 as far as the data tell "
+            f"({ends} if it is left free{chance})."
+        )
+    if verdict.status == "fractional":
+        return f"The order {name} of the {of} is {profile.estimate:.3f} ({ends}); 1 is excluded."
+    return (
+        f"The order {name} of the {of} stays open: {profile.estimate:.3f} would fit ({ends}), but "
+        "so would an explanation of order 1, or part of the record is unexplained. It is not "
+        "reported."
+    )
+
+
+def experiments(
+    field: Field,
+    orders: tuple[OrderVerdict, ...],
+    visible: tuple[int, ...],
+    found: tuple[Finding, ...],
+    close: tuple[Candidate, ...],
+) -> list[str]:
+    """Say what would tell more, each piece of advice once."""
+    advice = []
+    modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
+    unknown = [o for o in orders if o.status == "not identifiable"]
+    if unknown:
+        names = " and ".join(o.order for o in unknown)
+        if len(visible) < 2:
+            second = modes.get(2, 6.3 * modes.get(1, 0.0))
+            advice.append(
+                f"To find {names}, excite the second mode as well: sweep up to at least "
+                f"{1.3 * second:.0f} Hz."
+            )
+        else:
+            advice.append(
+                f"To find {names}, measure longer where it counts: narrow, slow sweeps round "
+                "the modes, or a wider sweep that reaches one more mode."
+            )
+    unexplained = any(finding.kind == "unexplained" for finding in found)
+    if close or (not unexplained and any(o.status == "not supported" for o in orders)):
+        advice.append(
+            "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
+        )
+    advice += [finding.remedy for finding in found if finding.remedy]
+    return list(dict.fromkeys(advice))

@@ -1,0 +1,184 @@
+"""Is what remains only noise? Its cumulative periodogram, where it is too loud, and its input."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.selection.chance import SURE, kolmogorov, largest_of, of_chi_square
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BAND_95: Final = 1.3581
+"""95 % point of the Kolmogorov statistic times the root of the number of bins."""
+
+_LEVEL: Final = 1e-6
+"""Of probability: what `SURE` means for the other tests."""
+
+_WINDOWS: Final = (8, 32)
+_LOUD: Final = 1.4
+"""Power over that of the noise, which is itself known to 10-20 % only."""
+
+_COHERENT_BINS: Final = 9
+_LOUDEST: Final = 4.0
+"""Where the whitened residual is limited: chance exceeds it once in 3000 bins."""
+
+_LONGEST_LAG_S: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Whiteness:
+    """Tests of the whitened residual's power (Bartlett's cumulative periodogram).
+
+    Attributes
+    ----------
+    distance : float
+        Largest distance of the cumulative periodogram from the straight line.
+    band : float
+        Within which it stays in 95 % of the records that hold nothing but noise.
+    probability : float
+        Of such a distance by chance.
+    loudest_hz : tuple of float
+        Edges of the window that is loudest for its width.
+    loudest_ratio : float
+        Its power over that of the noise.
+    loud : bool
+        Whether chance is ruled out there.
+    """
+
+    distance: float
+    band: float
+    probability: float
+    loudest_hz: tuple[float, float]
+    loudest_ratio: float
+    loud: bool
+
+    @property
+    def white(self) -> bool:
+        """Whether nothing speaks against noise alone."""
+        return self.probability > _LEVEL and not self.loud
+
+
+@dataclass(frozen=True, slots=True)
+class InputRelation:
+    """Tests whether the residual still follows the angle: linear dynamics that the model lacks.
+
+    Attributes
+    ----------
+    coherence : float
+        Largest squared coherence of residual and angle over nine neighbouring bins.
+    at_hz : float
+        Where.
+    deviate : float
+        Of the coherence over the whole band, in standard deviations beyond chance.
+    correlation : float
+        Largest correlation of residual and angle, both whitened, in standard deviations.
+    lag_s : float
+        Where; negative: the residual comes before the angle.
+    related : bool
+        Whether chance is ruled out by any of the three.
+    """
+
+    coherence: float
+    at_hz: float
+    deviate: float
+    correlation: float
+    lag_s: float
+    related: bool
+
+
+def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Share of the power up to each bin, shape (K,), of a whitened residual."""
+    power = np.cumsum(residual.real**2 + residual.imag**2)
+    share: NDArray[np.float64] = power / power[-1]
+    return share
+
+
+def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64]) -> Whiteness:
+    """Test a residual.
+
+    Parameters
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Whitened; only bins that are compared.
+    frequency_hz : ndarray, shape (K,)
+    """
+    count = residual.size
+    line = np.arange(1, count + 1) / count
+    distance = float(np.abs(cumulative_periodogram(residual) - line).max())
+    power = residual.real**2 + residual.imag**2
+    sums = np.concatenate([[0.0], np.cumsum(power)])
+    loudest, edges, ratio, loud = -math.inf, (0.0, 0.0), 1.0, False
+    for width in _WINDOWS:
+        if width >= count:
+            continue
+        total = sums[width:] - sums[:-width]
+        i = int(np.argmax(total))
+        deviate = of_chi_square(float(total[i]), 2 * width)
+        if deviate > loudest:
+            loudest = deviate
+            edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
+            ratio = float(total[i]) / (2 * width)
+        loud |= deviate > SURE + 0.5 and float(total[i]) / (2 * width) > _LOUD
+    return Whiteness(
+        distance=distance,
+        band=BAND_95 / math.sqrt(count),
+        probability=kolmogorov(distance * math.sqrt(count)),
+        loudest_hz=edges,
+        loudest_ratio=ratio,
+        loud=loud,
+    )
+
+
+def input_relation(
+    residual: NDArray[np.complex128],
+    angle: NDArray[np.complex128],
+    frequency_hz: NDArray[np.float64],
+) -> InputRelation:
+    """Compare a residual with the angle.
+
+    Parameters
+    ----------
+    residual, angle : ndarray of complex, shape (K,)
+        Whitened residual and transform of the angle.
+    frequency_hz : ndarray, shape (K,)
+        Equally spaced.
+    """
+    turn = angle / np.maximum(np.abs(angle), np.finfo(float).tiny)
+    # A hum is no linear dynamics, however loud.
+    cross = residual * turn.conj() / np.maximum(np.abs(residual) / _LOUDEST, 1.0)
+    blocks = residual.size // _COHERENT_BINS
+    grouped = cross[: blocks * _COHERENT_BINS].reshape(blocks, _COHERENT_BINS)
+    # With the input of one size throughout, under chance (1 - coherence)^(m - 1) is uniform.
+    power = np.sum(np.abs(grouped) ** 2, axis=1)
+    together = np.abs(np.sum(grouped, axis=1)) ** 2
+    coherence = together / np.maximum(_COHERENT_BINS * power, np.finfo(float).tiny)
+    surprise = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
+    worst = int(np.argmax(surprise))
+    deviate = of_chi_square(2 * float(surprise.sum()), 2 * blocks)
+
+    spacing_hz = float(frequency_hz[1] - frequency_hz[0])
+    length = 4 * residual.size
+    lags = np.fft.ifft(cross, length)
+    at_s = np.fft.fftfreq(length, spacing_hz)  # bins are spaced as the lags' inverse
+    carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
+    correlation = np.abs((lags * carrier).real) * length / math.sqrt(residual.size)
+    correlation[np.abs(at_s) > _LONGEST_LAG_S] = 0.0
+    at = int(np.argmax(correlation))
+    tried = int(np.count_nonzero(correlation))
+    return InputRelation(
+        coherence=float(coherence[worst]),
+        at_hz=float(frequency_hz[worst * _COHERENT_BINS + _COHERENT_BINS // 2]),
+        deviate=deviate,
+        correlation=float(correlation[at]),
+        lag_s=float(at_s[at]),
+        related=bool(
+            deviate > SURE
+            or surprise[worst] > largest_of(blocks)
+            or correlation[at] ** 2 / 2 > largest_of(tried)
+        ),
+    )

@@ -1,0 +1,146 @@
+"""Time and memory of a campaign of 20 sessions on 2 cores, and what its Welch fits cost.
+
+Usage: python benchmarks/bench_campaign.py [FOLDER]
+
+FOLDER holds the sessions, or takes them: without one they go to a temporary folder. They come from
+the simulated rig under its virtual clock, one seed each; making them takes a minute.
+
+Peers: the same Welch fits one after the other in this process, and for the minima that they find
+Nelder-Mead from random starts on all points of the same cost (scipy). All fits are cold: the global
+search is made for every session anew.
+"""
+
+import math
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from timing import least_s
+
+from analysis.campaigns import campaign
+from analysis.campaigns.session import SessionTask, analyse_session
+from analysis.campaigns.workers import process_pool, run_all
+from analysis.campaigns.write import write_campaign
+from analysis.model import FrequencyResponseModel
+from analysis.settings import WelchSettings
+from analysis.structures import STRUCTURES
+from analysis.unknowns import Unknowns
+from analysis.weights import weights
+from analysis.whole_record import BAND_HZ
+
+SESSIONS = 20
+JOBS = 2
+STARTS = 4
+
+
+def recorded(folder: Path) -> list[Path]:
+    """Sessions of a folder, made if it has none."""
+    if not any(folder.glob("*.mcap")):
+        rigd = Path(sys.executable).with_name("rigd")
+        command = [rigd, "run", "chirp", "--fast", "--seed", "1", "--repeat", str(SESSIONS)]
+        subprocess.run([*command, "--output", folder], check=True, stdout=subprocess.DEVNULL)
+    return sorted(folder.glob("*.mcap"))
+
+
+def cpu_s() -> float:
+    """CPU time of this process and of the workers that have ended."""
+    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in both)
+
+
+def welch_only(paths: list[Path]) -> int:
+    """Fit by the paper's route alone, on two workers, these started included."""
+    task = SessionTask(WelchSettings(), (), (), BAND_HZ)
+    with process_pool(JOBS) as pool:
+        results = run_all(pool, analyse_session, [(path, task) for path in paths])
+    return sum(len(result.welch_fits) for result in results)
+
+
+def _cost(
+    measured: NDArray[np.complex128],
+    model: FrequencyResponseModel,
+    unknowns: Unknowns,
+    weight: NDArray[np.float64],
+    x: NDArray[np.float64],
+) -> float:
+    """Eq. (26)."""
+    return float(weight @ np.abs(model.evaluate(unknowns.damping(x)) - measured) ** 2)
+
+
+def searched(path: Path) -> dict[tuple[str, str], float]:
+    """Lowest cost of each fit of a session by random starts and Nelder-Mead on all points."""
+    from scipy.optimize import minimize
+
+    result = analyse_session(path, SessionTask(WelchSettings(), (), (), BAND_HZ))
+    model = FrequencyResponseModel(result.frequency_hz, result.beam, result.tool_inertia_kg_m2)
+    rng = np.random.default_rng(0)
+    found = {}
+    for fit in result.welch_fits:
+        unknowns = Unknowns.of(STRUCTURES[fit.structure], result.beam)
+        low, high = unknowns.bounds
+        low = np.maximum(low, math.log(1e-5))
+        weight = weights(2 * np.pi * result.frequency_hz, fit.weighting)
+        cost = partial(_cost, result.response, model, unknowns, weight)
+        ends = [
+            minimize(
+                cost, rng.uniform(low, np.minimum(high, 2.0)), method="Nelder-Mead",
+                bounds=list(zip(low, high, strict=True)),
+                options={"maxfev": 600, "xatol": 1e-5, "fatol": 1e-9},
+            ).fun
+            for _ in range(STARTS)
+        ]  # fmt: skip
+        found[fit.structure, fit.weighting] = fit.cost / min(ends) - 1
+    return found
+
+
+class Watch:
+    """Wall and CPU time since it was made."""
+
+    def __init__(self) -> None:
+        self.wall, self.cpu = time.perf_counter(), cpu_s()
+
+    def __str__(self) -> str:
+        """Both; half of the CPU time is what two free cores would take."""
+        wall, cpu = time.perf_counter() - self.wall, cpu_s() - self.cpu
+        return f"{wall:.1f} s, {cpu:.1f} s of CPU time"
+
+
+def main() -> None:
+    """Print the times and their ratios to the peers."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(name) / "sessions"
+        paths = recorded(folder)
+        watch = Watch()
+        fits = welch_only(paths)
+        print(
+            f"{len(paths)} sessions, {fits} Welch fits on {JOBS} workers, reading and all: {watch}"
+        )
+        task = SessionTask(WelchSettings(), (), (), BAND_HZ)
+        alone_s = least_s(lambda: analyse_session(paths[0], task), 3)
+        print(f"  in this process {alone_s:.2f} s a session, {len(paths) * alone_s:.1f} s in all")
+        report = Path(name) / "report"
+        report.mkdir()
+        watch = Watch()
+        found = campaign(paths, jobs=JOBS)
+        print(f"Campaign with whole-record fits of seven types and validation: {watch}")
+        watch = Watch()
+        write_campaign(found, report)
+        print(f"Figures and tables: {watch}")
+        for who, what in (
+            ("this process", resource.RUSAGE_SELF),
+            ("a worker", resource.RUSAGE_CHILDREN),
+        ):
+            print(f"  most memory of {who}: {resource.getrusage(what).ru_maxrss / 1024:.0f} MB")
+        print("Cost over that of random starts with Nelder-Mead - 1 (0: the same minimum)")
+        for (structure, weighting), excess in searched(paths[0]).items():
+            print(f"  {structure:4} {weighting:6} {excess:+.1e}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""A small campaign from files to figures, with two files that do not belong to it."""
+
+import csv
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from analysis.campaigns import CampaignError, campaign
+from analysis.campaigns.session import SessionTask, analyse_session
+from analysis.campaigns.tables import campaign_tables, pooled_meaning, tables_text
+from analysis.campaigns.validation import forecasts, left_out_errors
+from analysis.campaigns.write import write_campaign
+from analysis.whole_record import BAND_HZ, Plant
+
+
+@pytest.fixture(scope="module")
+def done(short_sessions, other_beam, settings, tmp_path_factory):
+    """The campaign, and its progress."""
+    torn = tmp_path_factory.mktemp("torn") / "torn.mcap"
+    torn.write_bytes(short_sessions[0].read_bytes()[:5000])
+    paths = [short_sessions[0], torn, *short_sessions[1:], other_beam]
+    progress = []
+    found = campaign(
+        paths, settings, structures=("I", "III"), jobs=2,
+        on_progress=lambda *step: progress.append(step),
+    )  # fmt: skip
+    return found, progress
+
+
+def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, other_beam):
+    found, progress = done
+    assert [each.path for each in found.sessions] == short_sessions
+    torn, other = found.failures
+    assert "torn.mcap" in torn.message
+    assert other.path == other_beam
+    assert "beam_length_m is 1 m, but 0.98 m in" in other.message
+    assert [step[0] for step in progress] == list(range(1, 11))
+    assert progress[-1][:2] == (10, 10)
+    assert {step[2] for step in progress} >= {path.name for path in short_sessions}
+
+
+def test_workers_find_what_this_process_finds(done, short_sessions, settings):
+    found, _ = done
+    task = SessionTask(settings, ("I", "III"), (), BAND_HZ)
+    here = analyse_session(short_sessions[2], task)
+    there = found.sessions[2]
+    assert np.array_equal(here.response, there.response)
+    for one, two in zip(here.welch_fits, there.welch_fits, strict=True):
+        assert one.parameters == pytest.approx(two.parameters, rel=1e-9)
+    for one, two in zip(here.record_estimates, there.record_estimates, strict=True):
+        assert one.parameters == pytest.approx(two.parameters, rel=1e-6, abs=1e-12)
+
+
+def test_the_pooled_estimate_is_the_truth_within_its_interval(done, truth):
+    found, _ = done
+    _, damping = truth
+    estimates = {each.structure: each for each in found.pooled}
+    three = estimates["III"]
+    values = {each.name: each for each in three.parameters}
+    assert abs(values["zeta"].value - damping.zeta) < 4 * values["zeta"].std
+    assert abs(values["gamma"].value - damping.gamma) < 4 * values["gamma"].std
+    assert three.misfit == pytest.approx(1.0, abs=0.1)
+    assert estimates["I"].misfit > 2
+    assert values["zeta"].chance > 1e-3
+
+
+def test_left_out_sessions_are_predicted_to_within_noise(done):
+    found, _ = done
+    right = [e for e in found.validation if (e.method, e.structure) == ("record", "III")]
+    assert len(right) == len(found.sessions)
+    for each in right:
+        assert each.error < 1.05 * each.own_error
+    wrong = [e.error for e in found.validation if (e.method, e.structure) == ("record", "I")]
+    assert min(wrong) > 1.5 * max(e.error for e in right)
+
+
+def test_a_left_out_session_has_no_say_in_its_own_forecast(done):
+    """With another last session, what is said of it stays the same."""
+    found, _ = done
+    sessions = list(found.sessions)
+    strange = replace(
+        sessions[-1],
+        welch_fits=tuple(
+            replace(fit, parameters={k: 9 * v for k, v in fit.parameters.items()})
+            for fit in sessions[-1].welch_fits
+        ),
+        record_estimates=tuple(
+            replace(each, covariance=9 * each.covariance) for each in sessions[-1].record_estimates
+        ),
+    )
+    before = forecasts(sessions, len(sessions) - 1)
+    after = forecasts([*sessions[:-1], strange], len(sessions) - 1)
+    assert [each.plant for each in before] == [each.plant for each in after]
+
+
+def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
+    """The true plant leaves the noise, a plant without torque leaves everything."""
+    found, _ = done
+    (forecast, *_) = forecasts(found.sessions, 0)
+    link, damping = truth
+    true = replace(forecast, plant=Plant(link, damping), own=None)
+    light = replace(link, density_kg_per_m=1e-12, bending_stiffness_n_m2=1e-12)
+    none = replace(true, plant=Plant(light, damping))
+    exact, nothing = left_out_errors(short_sessions[0], [true, none], BAND_HZ)
+    best = min(e.own_error for e in found.validation if e.own_error is not None)
+    assert exact.error == pytest.approx(best, rel=0.1)
+    assert nothing.error == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_folder_holds_every_figure_and_table(done, tmp_path):
+    found, _ = done
+    steps = []
+    write_campaign(found, tmp_path, with_paper=True, on_step=steps.append)
+    names = {path.name for path in tmp_path.iterdir()}
+    for figure in (
+        "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",
+        "validation",
+    ):  # fmt: skip
+        assert np.asarray(Image.open(tmp_path / f"{figure}.png").convert("L")).std() > 5
+        assert ET.parse(tmp_path / f"{figure}.svg").getroot().tag.endswith("svg")
+        assert f"figure {figure}" in steps
+    with (tmp_path / "table3.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["mean"]) for row in rows] == [each.mean for each in found.statistics]
+    assert rows[0]["paper_mean"] == "0.000133"
+    with (tmp_path / "table4.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 3 * 2
+    first = {(row["quantity"], row["mode"], row["weighting"]): row for row in rows}
+    deviation = found.nominal[2].deviations[0]
+    row = first["magnitude_db", "1", "const"]
+    assert float(row["III"]) == deviation.magnitude_db
+    assert row["paper_III"] == "3.635"
+    content = json.loads((tmp_path / "campaign.json").read_text())
+    assert content["pooled"][0].keys() >= {"type", "parameter", "value", "between_std"}
+    assert len(content["errors"]) == 2
+    assert len(content["sessions_welch"]) == len(found.sessions) * 4
+    text = (tmp_path / "tables.txt").read_text()
+    for words in ("Table 3", "Table 4", "Table 5", "Pooled", "predicted from the others", "torn"):
+        assert words in text
+    assert {f"{name}.csv" for name in ("table5", "pooled", "validation")} <= names
+
+
+def test_words_about_scatter(done):
+    found, _ = done
+    assert "they repeat" in pooled_meaning(found)
+    (best,) = (each for each in found.pooled if each.structure == "III")
+    shaken = replace(
+        best, parameters=tuple(replace(each, chance=1e-4) for each in best.parameters[:1])
+    )
+    told = pooled_meaning(replace(found, pooled=(shaken,)))
+    assert "differ by more than their own uncertainties in ζ" in told
+    assert "no structure tried" in pooled_meaning(
+        replace(found, pooled=(replace(best, misfit=9.0),))
+    )
+
+
+def test_the_paper_s_numbers_stand_beside_only_on_request(done):
+    found, _ = done
+    assert campaign_tables(found)
+    assert "the paper's" not in tables_text(found)
+    assert "(1.33)" in tables_text(found, with_paper=True)
+
+
+def test_a_cluster_finds_the_same(done, short_sessions, settings, monkeypatch):
+    """From another folder than the workers', by relative paths."""
+    distributed = pytest.importorskip("distributed", reason="the extra `dask` is not installed")
+    found, _ = done
+    monkeypatch.chdir(short_sessions[0].parent)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+    ) as cluster:
+        there = campaign(
+            [Path(path.name) for path in short_sessions], settings, structures=("III",),
+            dask=cluster.scheduler_address,
+        )  # fmt: skip
+    assert [each.path for each in there.sessions] == short_sessions
+    for one, two in zip(there.statistics, found.statistics, strict=True):
+        assert one.mean == pytest.approx(two.mean, rel=1e-9)
+
+
+def test_no_session_left(tmp_path, settings):
+    with pytest.raises(CampaignError, match=r"(?s)No session could be analysed.*none\.mcap"):
+        campaign([tmp_path / "none.mcap"], settings, jobs=1)
+    with pytest.raises(CampaignError, match="none was given"):
+        campaign([], settings)

@@ -1,0 +1,260 @@
+"""The report as a browser takes it: well-formed, complete, self-contained, harmless."""
+
+import csv
+import json
+import re
+from dataclasses import replace
+from datetime import UTC, datetime
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from analysis.report import style
+from analysis.report.document import _finite
+from analysis.report.folder import OutputError
+from analysis.report.html import Verdict
+from analysis.report.html.damping_sentences import damping_sentences
+from analysis.report.html.figures import illustrations
+from analysis.report.html.page import page
+from analysis.report.html.record_entries import record_entries
+from analysis.report.html.write import FIGURES, report_tables, write_html_report
+
+VOID = {"meta", "br", "img"}
+LIMIT_BYTES = 2_000_000
+
+
+class Reader(HTMLParser):
+    """Checks that elements nest and collects what the tests look at."""
+
+    def __init__(self):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.attributes, self.text = [], [], [], []
+        self.rows, self._row, self._cell = {}, None, None
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes.append((tag, dict(attrs)))
+        assert len(dict(attrs)) == len(attrs), f"{tag} has an attribute twice"
+        if tag not in VOID:
+            self.open.append((tag, dict(attrs)))
+        if tag == "tr":
+            self._row = []
+        if tag == "data":
+            self._row.append(float(dict(attrs)["value"]))
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes.append((tag, dict(attrs)))
+        assert any(name == "svg" for name, _ in self.open), f"{tag} closes itself outside SVG"
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        opened, _ = self.open.pop()
+        assert opened == tag, f"</{tag}> closes <{opened}>"
+        if tag == "tr":
+            tables = [attributes.get("id") for name, attributes in self.open if name == "table"]
+            self.rows.setdefault(tables[-1], []).append(self._row)
+
+    def handle_data(self, data):
+        if not any(name in ("style", "svg") for name, _ in self.open):
+            self.text.append(data)
+
+
+def read(text):
+    reader = Reader()
+    reader.feed(text)
+    reader.close()
+    assert reader.open == []
+    return reader
+
+
+@pytest.fixture(scope="session")
+def source(report):
+    return (report / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="session")
+def read_page(source):
+    return read(source)
+
+
+def test_it_is_one_well_formed_document(source, read_page):
+    assert source.startswith('<!DOCTYPE html>\n<html lang="en">')
+    assert read_page.tags.count("main") == 1
+    assert next(tag for tag in read_page.tags if re.fullmatch("h[1-6]", tag)) == "h1"
+    identifiers = [a["id"] for _, a in read_page.attributes if "id" in a]
+    assert len(identifiers) == len(set(identifiers))
+    targets = [a["href"] for _, a in read_page.attributes if "href" in a]
+    used = re.findall(r"url\(#([^)]+)\)", source) + [t.removeprefix("#") for t in targets]
+    assert len(used) > 20
+    assert set(used) <= set(identifiers)
+
+
+def test_nothing_comes_from_outside_and_nothing_runs(source, read_page):
+    assert "://" not in source
+    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(read_page.tags)
+    for _, attributes in read_page.attributes:
+        assert not [name for name in attributes if name.startswith("on")]
+        for name in ("src", "href", "xlink:href"):
+            assert attributes.get(name, "#").startswith(("#", "data:image/png;base64,"))
+    assert "@import" not in source
+    assert len(source.encode()) < LIMIT_BYTES
+
+
+def test_what_the_operator_wrote_stays_text(read_page, record_subject, hostile_note):
+    text = "".join(read_page.text)
+    assert f"Note: {hostile_note}" in text
+    assert text.count(hostile_note) == 2
+    assert "operator: <i>Rossi</i>" in text
+    assert "Less than noise <b> remains." in text
+    assert record_subject.record.path.name == "a <b> & $c$.mcap"
+    assert read_page.tags.count("b") == read_page.tags.count("i") == 0
+
+
+def test_it_is_readable_without_sight_and_on_paper(source, read_page):
+    figures = [a for tag, a in read_page.attributes if a.get("role") == "img"]
+    assert len(figures) == len(FIGURES)
+    assert all(len(figure["aria-label"]) > 60 for figure in figures)
+    assert read_page.tags.count("figcaption") == read_page.tags.count("figure")
+    assert read_page.tags.count("table") == read_page.tags.count("caption") > 10
+    assert all(a.get("scope") in ("row", "col") for tag, a in read_page.attributes if tag == "th")
+    assert "@media print" in source
+    assert "prefers-color-scheme: dark" in source
+
+
+def test_text_of_the_figures_is_text(source):
+    words = re.findall(r"<text[^>]*>([^<]+)</text>", source)
+    assert {"Coupling torque", "Frequency (Hz)", "total", "Mode 1"} <= {w.strip() for w in words}
+
+
+def test_the_verdict_comes_first_with_its_intervals(read_page, record_subject):
+    text = " ".join("".join(read_page.text).split())
+    first_mode = record_subject.fit.modes[0]
+    assert f"The antenna's damping ratio is {100 * first_mode.damping_ratio:.2f}"[:-1] in text
+    places = [text.index(word) for word in ("Both orders", "Sweep round mode 1 & 2", "Parameters,")]
+    assert places == sorted(places)
+    assert text.index("damping ratio is") < places[0]
+    assert "Only 3 Welch segment(s)" in text  # the warning
+    for fact in ("SHA-256", "2026-11-20T12:00:00+00:00", "output error", "numpy"):
+        assert fact in text
+
+
+def test_numbers_are_those_of_the_json_document(report, read_page, record_subject):
+    entries = json.loads(json.dumps(_finite(record_entries(record_subject)), allow_nan=False))
+    (fit,) = [fit for fit in entries["fits"] if fit["type"] == "VI"]
+    rows = read_page.rows["parameters"][1:]
+    assert len(rows) == len(fit["parameters"]) == 8
+    for row, (name, value) in zip(rows, fit["parameters"].items(), strict=True):
+        expected = [value, fit["std"][name], *(fit["interval_95"][name] or ())]
+        assert row == [number for number in expected if number is not None]
+    modes = [mode for mode in entries["modes"] if mode["type"] == "VI"]
+    keys = ("mode", "frequency_hz", "frequency_std_hz", "damping_ratio", "damping_ratio_std")
+    assert [row[:5] for row in read_page.rows["modes"][1:]] == [
+        [mode[key] for key in keys] for mode in modes
+    ]
+    assert [row[0] for row in read_page.rows["damping_sizes"][1:]] == [
+        fit["internal_size"]["omega_rad_s"],
+        fit["external_size"]["omega_rad_s"],
+    ]
+    covariance = np.array(fit["covariance"])
+    std = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(
+        read_page.rows["correlations"][1:], covariance / np.outer(std, std), rtol=1e-12
+    )
+    by_type = {row[0]: row for row in csv.reader(open_table(report, "structures"))}
+    for each in entries["fits"]:
+        assert float(by_type[each["type"]][10]) == each["cost"]
+
+
+def open_table(report, name):
+    return (report / "tables" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+
+
+def test_csv_and_page_hold_the_same_numbers(report, read_page, record_subject):
+    modes, tables, of_paper = report_tables(record_subject)
+    assert {path.stem for path in (report / "tables").iterdir()} == {
+        table.name for table in (modes, *tables, *of_paper)
+    }
+    for table in (modes, *tables, *of_paper):
+        header, *rows = csv.reader(open_table(report, table.name))
+        assert header == [column.key for column in table.columns]
+        numeric = [i for i, column in enumerate(table.columns) if column.numeric]
+        in_csv = [[float(row[i]) for i in numeric if row[i]] for row in rows]
+        assert in_csv == read_page.rows[table.name][1:]
+
+
+def test_what_is_shown_is_the_number_rounded(record_subject):
+    modes, tables, of_paper = report_tables(record_subject)
+    shown = {"modes": (1.0, 1.0, 1.0, 100.0, 100.0, 100.0, 100.0)}
+    for row in modes.rows:
+        for cell, factor in zip(row, shown["modes"], strict=True):
+            assert float(cell.text) == pytest.approx(factor * cell.value, rel=0.06)
+    (zeta, alpha, *_) = tables[0].rows
+    assert zeta[3].text == f"{1e5 * zeta[3].value:.2f}"
+    assert alpha[3].text == f"{alpha[3].value:.4f}"
+    assert len(alpha[4].text.lstrip("0.")) == 2  # significant digits of a standard deviation
+    welch = {(row[0], row[1]): row for row in of_paper[0].rows}
+    for model in record_subject.welch.models:
+        row = welch[model.fit.structure.name, model.fit.weighting]
+        assert row[2].value == model.fit.parameters["zeta"]
+        assert row[-3].value == model.indices.mse
+
+
+def test_orders_that_the_data_do_not_support_are_not_told(record_subject):
+    careful = replace(
+        record_subject, verdict=Verdict("VI", ("Nothing is sure.",), withheld=frozenset({"alpha"}))
+    )
+    modes, tables, _ = report_tables(careful)
+    text = page(careful, ["", ""], modes, tables, (), datetime(2026, 1, 1, tzinfo=UTC))
+    told = "".join(read(text).text)
+    assert "its order α is not known" in told
+    assert "not supported by the data" in told
+    (row,) = [row for row in tables[0].rows if row[0] == "α"]
+    assert [cell.value for cell in row[3:7]] == [None] * 4
+    assert 'href="#paper"' not in text
+
+
+def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_subject):
+    fit = record_subject.fits["VII"]
+    told = " ".join(damping_sentences(fit, frozenset({"alpha"})))
+    assert "internal damping" not in told
+    assert "The external damping is γ" in told
+    assert "of the fixed order α\u00a0=\u00a01." in " ".join(damping_sentences(fit, frozenset()))
+
+
+def test_a_band_that_begins_beyond_a_mode_is_drawn(record_subject):
+    with style.styled():
+        found = [each.name for each in illustrations(replace(record_subject, band_hz=(5.0, 50.0)))]
+    assert found == list(FIGURES)
+
+
+def test_figures_are_there_as_png_and_svg(report):
+    for name in FIGURES:
+        assert (report / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        svg = (report / "figures" / f"{name}.svg").read_text(encoding="utf-8")
+        assert svg.lstrip().startswith("<?xml")
+        assert "<text" in svg
+
+
+def test_a_taken_name_is_told_and_left_alone(report, record_subject):
+    before = (report / "report.html").stat().st_mtime_ns
+    with pytest.raises(OutputError, match=r"record_frf\.png cannot be written"):
+        write_html_report(record_subject, report)
+    assert (report / "report.html").stat().st_mtime_ns == before
+
+
+def test_entries_hold_bands_round_their_curves(record_subject):
+    (record,) = record_entries(record_subject)["records"]
+    curves = record["curves"]
+    assert record["selected"] == "VI"
+    low, value, high = (
+        np.array(curves[f"magnitude{end}_nm_per_rad"]) for end in ("_low", "", "_high")
+    )
+    assert np.all((low < value) & (value < high))
+    total = curves["loss_factor"]
+    assert np.all(np.array(total["low"]) < np.array(total["value"]))
+    np.testing.assert_allclose(
+        total["value"],
+        np.add(curves["internal_loss_factor"]["value"], curves["external_loss_factor"]["value"]),
+    )

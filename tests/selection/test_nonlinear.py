@@ -1,0 +1,60 @@
+"""Forces that are not linear: their columns against the equation of motion solved in time."""
+
+import numpy as np
+import pytest
+
+from analysis.selection.nonlinear import ModalForces, Term
+from analysis.whole_record import Measurement, Plant
+from analysis.whole_record.comparison import Comparison
+
+MODE_1 = Term("cubic stiffness", 1)
+
+
+@pytest.fixture(scope="module")
+def forces(sessions, plants, link):
+    comparison = Comparison.of(sessions("III").measured(), (0.0, 50.0))
+    return comparison, ModalForces(comparison, Plant(link, plants["III"]))
+
+
+def spectrum(comparison, torque_nm):
+    return comparison.spectrum(comparison.decimation.apply(torque_nm)[comparison.kept])
+
+
+def deviation(one, other):
+    return np.linalg.norm(one - other) / np.linalg.norm(other)
+
+
+def test_a_rise_of_two_percent_is_found_by_substitution(forces, stiffening):
+    comparison, modal = forces
+    truth = spectrum(comparison, stiffening("III", 0.02)) / 0.02
+    assert deviation(modal.column(MODE_1, 0.02), truth) < 0.03
+    assert deviation(modal.column(MODE_1), truth) > 0.1
+
+
+def test_a_delay_delays_the_column(forces, plants, link):
+    comparison, modal = forces
+    late = ModalForces(comparison, Plant(link, plants["III"], delay_s=2e-3)).column(MODE_1)
+    turn = np.exp(-2j * np.pi * comparison.frequency_hz * 2e-3)
+    assert deviation(late, modal.column(MODE_1) * turn) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("kind", "multiples"),
+    [("cubic stiffness", {1, 3}), ("quadratic stiffness", {2}), ("quadratic drag", {1, 3})],
+)
+def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
+    """Driven at 2 Hz: what remains once the start has rung down."""
+    t = np.arange(60_000) / 1000
+    rise = 1 - np.exp(-((t / 2) ** 2))
+    angle = 0.05 * np.sin(4 * np.pi * t) * rise
+    known = np.ones(t.size, dtype=bool)
+    measurement = Measurement("m", angle, np.zeros(t.size), 1000.0, link, known, known, 0.0)
+    comparison = Comparison.of(measurement, (0.0, 50.0))
+    column = ModalForces(comparison, Plant(link, plants["III"])).column(Term(kind, 1))
+    samples = np.zeros(comparison.samples // 2 + 1, dtype=complex)
+    samples[comparison.bins] = column
+    late = np.fft.irfft(samples, comparison.samples)[-5000:]  # 40 s: 80 periods
+    power = np.abs(np.fft.rfft(late * np.hanning(late.size))) ** 2
+    at = {m: power[m * 80 - 2 : m * 80 + 3].sum() for m in (1, 2, 3)}
+    made = {m for m, value in at.items() if value > 1e-4 * max(at.values())}
+    assert made == multiples

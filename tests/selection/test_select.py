@@ -1,0 +1,185 @@
+"""Verdicts on sessions of known plants: the structure, its orders, and whatever else is there."""
+
+import json
+
+import numpy as np
+import pytest
+
+from analysis.selection import select
+from analysis.selection.candidates import Field
+from analysis.selection.orders import EVEN
+from analysis.selection.profile import CHI_SQUARE_95, with_order
+from analysis.selection.refit import vector
+from analysis.structures import STRUCTURES
+from analysis.whole_record import SETTINGS
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.noise import Noise
+from rigd.beam import Beam
+
+OTHER = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)
+"""rho/EI off by 1 %, EI by 2 %."""
+
+NOISE_NM = 1e-2
+
+
+def kinds(verdict):
+    return {found.kind for found in verdict.findings}
+
+
+@pytest.fixture(scope="module")
+def type_iii(sessions):
+    return select(sessions("III").measured(noise_nm=NOISE_NM, seed=41))
+
+
+def test_the_verdict_on_a_plant_of_type_iii(type_iii):
+    verdict = type_iii.verdict
+    assert (verdict.structure, verdict.uniform, verdict.adequate) == ("III", True, True)
+    assert verdict.findings == ()
+    assert verdict.visible_modes == (1, 2, 3)
+    for order in (verdict.alpha, verdict.lambda_):
+        assert (order.status, order.value) == ("integer", 1.0)
+        assert order.interval[0] < 1 < order.interval[1]
+    assert verdict.parameters["zeta"] == pytest.approx(0.54e-4, rel=0.02)
+    assert type_iii.fit.structure is STRUCTURES["III"]
+
+
+def test_the_table_ranks_nine_candidates(type_iii):
+    verdict = type_iii.verdict
+    rows = [(row.structure, row.uniform) for row in verdict.table]
+    assert sorted(rows) == sorted(
+        [(name, True) for name in STRUCTURES] + [("III", False), ("VII", False)]
+    )
+    bic = [row.delta_bic for row in verdict.table]
+    assert bic[0] == 0
+    assert bic == sorted(bic)
+    assert min(row.delta_aic for row in verdict.table) == 0
+    at = {(row.structure, row.uniform): row for row in verdict.table}
+    freed = at["VII", True]
+    count = type_iii.candidates[0].values
+    gained = count * np.log(at["III", True].cost / freed.cost)
+    assert freed.delta_bic == pytest.approx(np.log(count) - gained)
+    assert at["II", True].delta_bic > 1000
+    assert [c.fit.cost for c in type_iii.candidates] == [row.cost for row in verdict.table]
+
+
+def test_the_verdict_is_json(type_iii):
+    verdict = type_iii.verdict
+    text = json.dumps(verdict.as_json(), allow_nan=False)
+    back = json.loads(text)
+    assert back["structure"] == "III"
+    assert back["lambda"]["status"] == "integer"
+    assert back["alpha"]["profile"]["values"] == list(verdict.alpha.profile.values)
+    assert back["sentences"] == list(verdict.sentences)
+
+
+@pytest.fixture(scope="module")
+def undeclared(sessions):
+    made = sessions("IV", beam=OTHER, delay_s=3e-4, tool_inertia_kg_m2=1e-5)
+    return select(made.measured(noise_nm=NOISE_NM, seed=43)).verdict
+
+
+def test_a_fractional_order_that_the_data_support(undeclared):
+    assert (undeclared.structure, undeclared.uniform, undeclared.rivals) == ("IV", True, ())
+    alpha, lambda_ = undeclared.alpha, undeclared.lambda_
+    assert alpha.status == "fractional"
+    low, high = alpha.interval
+    assert low < alpha.value < high < 1
+    assert abs(alpha.value - 0.8) < 4 * (high - low) / (2 * 1.96)  # 95 % miss one in twenty
+    assert (lambda_.status, lambda_.value) == ("absent", None)
+
+
+def test_delay_clamp_and_beam_data_are_named(undeclared):
+    assert kinds(undeclared) == {"delay", "tool inertia", "beam data"}
+    found = {finding.kind: finding for finding in undeclared.findings}
+    assert found["delay"].value == pytest.approx(3e-4, abs=2e-5)
+    low, high = found["delay"].interval
+    assert abs(found["delay"].value - 3e-4) < 4 * (high - low) / (2 * 1.96)
+    assert "Declare the delay" in found["delay"].remedy
+    assert found["tool inertia"].value == pytest.approx(1e-5, rel=0.1)
+    off = [f.value for f in undeclared.findings if f.kind == "beam data"]
+    assert off == pytest.approx([0.01, 0.02], abs=4e-3)
+
+
+@pytest.fixture(scope="module")
+def one_mode(sessions):
+    return select(sessions("III").measured(noise_nm=NOISE_NM, seed=44), band_hz=(0.0, 10.0)).verdict
+
+
+def test_one_mode_does_not_tell_alpha(one_mode):
+    assert one_mode.visible_modes == (1,)
+    assert one_mode.alpha.status == "not identifiable"
+    assert one_mode.alpha.value is None
+    assert one_mode.alpha.interval is None
+    assert "alpha" not in one_mode.parameters
+    assert any("alpha" in said and "not identifiable" in said for said in one_mode.sentences)
+    assert any("excite the second mode" in what for what in one_mode.experiments)
+    assert one_mode.findings == ()
+
+
+def test_what_cannot_be_told_apart_is_said(one_mode):
+    close = [row.structure for row in one_mode.table[1:] if row.delta_bic < EVEN]
+    assert close
+    assert list(one_mode.rivals) == close
+    assert any("cannot tell" in said for said in one_mode.sentences)
+
+
+def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, stiffening):
+    made = sessions("III")
+    t = np.arange(made.torque_nm.size) / 1000
+    hum = 0.03 * np.sin(2 * np.pi * 50.02 * t)  # beyond the band, and leaking into it
+    torque = made.torque_nm + stiffening("III", 0.02) + hum
+    spoilt = type(made)(made.angle_rad, torque)
+    verdict = select(spoilt.measured(noise_nm=NOISE_NM, seed=45)).verdict
+    assert (verdict.structure, verdict.uniform, verdict.adequate) == ("III", True, True)
+    assert kinds(verdict) == {"hum", "nonlinear stiffness"}
+    line, force = verdict.findings
+    assert line.value == pytest.approx(0.03, rel=0.1)
+    assert "the mains" in line.sentence
+    assert force.value == pytest.approx(0.02, rel=0.15)
+    assert "mode 1" in force.sentence
+    assert verdict.alpha.status == verdict.lambda_.status == "integer"
+
+
+@pytest.fixture(scope="module")
+def field(sessions):
+    made = sessions("III", offsets=(0.006, -0.013))
+    return Field.of(made.measured(noise_nm=NOISE_NM, seed=46), (), (0.0, 50.0))
+
+
+def test_a_beam_that_is_not_uniform_is_no_fractional_order(field):
+    assert field.best.name == "III, modes free"
+    fit = field.best.fit
+    assert fit.parameters["stiffness_offset_2"] == pytest.approx(0.006, abs=1e-3)
+    assert fit.parameters["stiffness_offset_3"] == pytest.approx(-0.013, abs=1e-3)
+
+
+def test_unknowns_of_a_plant_lead_back_to_it(field):
+    for candidate in field.candidates:
+        unknowns = field.unknowns(candidate.structure, candidate.uniform)
+        back = unknowns.plant(vector(unknowns, candidate.fit.plant)).parameters
+        for name, value in candidate.fit.parameters.items():
+            assert back[name] == pytest.approx(value, rel=1e-9, abs=1e-15), name
+
+
+def test_a_refit_at_the_minimum_stays_there(field):
+    best = field.best
+    refit = field.refit(best.structure, best.uniform, best.fit.plant)
+    assert refit.cost == pytest.approx(best.fit.cost, rel=1e-7)
+
+
+def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sessions):
+    profile, analysis = type_iii.verdict.alpha.profile, type_iii.analysis
+    comparison = Comparison.of(sessions("III").measured(noise_nm=NOISE_NM, seed=41), (0.0, 50.0))
+    scale = comparison.samples * comparison.decimation.rate_hz / 2
+    noise = Noise(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)
+    nothing = np.zeros((0, comparison.frequency_hz.size), dtype=complex)
+    field = Field(comparison, noise, SETTINGS, type_iii.candidates, nothing)
+    costs = []
+    for value in (profile.estimate, *profile.interval):
+        held = with_order(STRUCTURES["III"], "alpha", value)
+        costs.append(field.refit(held, True, field.best.fit.plant).cost)
+    deviance = field.best.values * np.log(np.array(costs) / costs[0])
+    assert deviance[1:] == pytest.approx(CHI_SQUARE_95, rel=0.05)
+    assert profile.identifiable
+    assert profile.share < 0.02
+    assert min(profile.deviance) == 0

@@ -1,0 +1,117 @@
+"""The tests of a residual, each on signals of which the answer is known."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from analysis.selection import cumulative_periodogram
+from analysis.selection.chance import kolmogorov, of_chi_square
+from analysis.selection.harmonics import harmonics, in_time
+from analysis.selection.whiteness import input_relation, whiteness
+
+BINS = 4000
+HZ = np.arange(1, BINS + 1) / 80
+"""Of a record of 80 s, to 50 Hz."""
+
+
+def noise(seed, count=BINS):
+    parts = np.random.default_rng(seed).normal(size=(2, count))
+    return parts[0] + 1j * parts[1]
+
+
+def test_deviates_and_probabilities_are_those_of_the_tables():
+    for value, freedom in ((20.0, 2), (150.0, 100), (80.0, 100), (9000.0, 8000)):
+        expected = stats.norm.isf(stats.chi2.sf(value, freedom))
+        assert of_chi_square(value, freedom) == pytest.approx(expected, abs=0.12)
+    for statistic in (0.2, 0.6, 1.3581, 2.0):
+        expected = stats.kstwobign.sf(statistic)
+        assert kolmogorov(statistic) == pytest.approx(expected, abs=1e-6)
+
+
+def test_noise_is_white_and_the_band_means_what_it_says():
+    found = [whiteness(noise(seed), HZ) for seed in range(300)]
+    outside = np.mean([test.distance > test.band for test in found])
+    assert 0.01 < outside < 0.10
+    assert np.mean([test.white for test in found]) > 0.98
+    assert not any(test.loud for test in found)
+
+
+def test_the_cumulative_periodogram_is_the_share_of_the_power():
+    residual = noise(1)
+    share = cumulative_periodogram(residual)
+    third = np.abs(residual[: BINS // 3]) ** 2
+    assert share[BINS // 3 - 1] == pytest.approx(third.sum() / np.sum(np.abs(residual) ** 2))
+    assert share[-1] == pytest.approx(1.0)
+
+
+def test_a_tilted_spectrum_is_not_white():
+    found = whiteness(noise(2) * np.linspace(1.3, 0.7, BINS), HZ)
+    assert not found.white
+    assert found.distance > 2 * found.band
+
+
+def test_what_is_loud_is_found_where_it_is():
+    residual = noise(3)
+    residual[1600:1616] *= 4
+    found = whiteness(residual, HZ)
+    assert found.loud
+    assert not found.white
+    low, high = found.loudest_hz
+    assert low < HZ[1616]
+    assert high > HZ[1600]
+    assert high - low < 0.5
+
+
+def sweep():
+    """Angle, its frequency and time: 0.05-50 Hz in 80 s at 125 Hz."""
+    t = np.arange(10_000) / 125
+    phase = 2 * np.pi * (0.05 * t + 49.95 * t**2 / 160)
+    return np.sin(phase), phase, t
+
+
+def test_linear_dynamics_that_remain_are_told_from_noise_and_hum():
+    angle = np.fft.rfft(sweep()[0])[1 : BINS + 1]
+    assert not any(input_relation(noise(seed), angle, HZ).related for seed in range(40))
+    resonance = 1 / (1 - (HZ / 20) ** 2 + 0.01j * HZ / 20)
+    left = 8 * angle / np.abs(angle).max() * resonance / np.abs(resonance).max()
+    found = input_relation(noise(5) + left, angle, HZ)
+    assert found.related
+    assert found.at_hz == pytest.approx(20.0, abs=0.4)
+    hum = noise(6)
+    hum[3200:3203] += 300
+    assert not input_relation(hum, angle, HZ).related
+
+
+def test_an_echo_is_found_with_its_lag():
+    angle = np.fft.rfft(sweep()[0])[1 : BINS + 1]
+    echo = 0.4 * angle / np.abs(angle) * np.exp(-2j * np.pi * HZ * 0.3)
+    found = input_relation(noise(7) + echo, angle, HZ)
+    assert found.related
+    assert found.lag_s == pytest.approx(0.3, abs=0.02)
+
+
+@pytest.mark.parametrize("multiple", [2, 3])
+def test_a_harmonic_of_the_sweep_is_found_and_its_like_alone(multiple):
+    angle, phase, t = sweep()
+    residual = in_time(noise(8), slice(1, BINS + 1), t.size)
+    assert residual.std() == pytest.approx(0.8**0.5, rel=0.03)  # of the band to 62.5 Hz
+    drive_hz = 0.05 + 49.95 * t / 80
+    extra = np.where((drive_hz > 6) & (drive_hz < 9), np.sin(multiple * phase + 0.4), 0.0)
+    found = {one.multiple: one for one in harmonics(angle, residual + extra, 125.0, (0.0, 50.0))}
+    assert found[multiple].present
+    assert 5.5 < found[multiple].drive_hz < 9.5
+    assert not found[5 - multiple].present
+
+
+def test_noise_ringing_and_the_drive_itself_are_no_harmonic():
+    angle, _, t = sweep()
+    for seed in range(20):
+        residual = in_time(noise(seed), slice(1, BINS + 1), t.size)
+        residual += np.where(t > 4, 5 * np.sin(16 * t) * np.exp(-(t - 4)), 0.0)
+        residual += 2 * angle
+        assert not any(one.present for one in harmonics(angle, residual, 125.0, (0.0, 50.0)))
+
+
+def test_without_a_sweep_there_is_no_harmonic_to_look_for():
+    angle = np.random.default_rng(9).normal(size=10_000)
+    assert harmonics(angle, angle, 125.0, (0.0, 50.0)) == ()
