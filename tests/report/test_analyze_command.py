@@ -239,7 +239,8 @@ def test_a_report_that_cannot_be_written_is_refused(session, tmp_path):
 
 def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
     process = subprocess.Popen(
-        [sys.executable, "-m", "analysis.cli", *([session.name] * 40), "--report", "out"],
+        [sys.executable, "-m", "analysis.cli", *([session.name] * 40),
+         "--each", "--method", "welch", "--report", "out"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     out = tmp_path / "out"
