@@ -353,8 +353,11 @@ def operate(profile, tmp_path, monkeypatch):
 
     yield make
     for operated in made:
-        if not operated.loop.is_closed():
-            operated.close()
+        if operated.loop.is_closed():
+            continue
+        if operated.state in (State.RUNNING, State.STOPPING):
+            operated.rig._crew.control.kill()  # of a test that has failed: nobody waits for it
+        operated.close()
 
 
 @pytest.fixture
