@@ -176,7 +176,7 @@ class ThreadChild:
         self.name = name
         self.main = main
         self.world = world
-        self.inbox, self.outbox = queue.SimpleQueue(), queue.SimpleQueue()
+        self.inbox, self.outbox = queue.Queue(), queue.Queue()
         self.killed = False
         self.thread = threading.Thread(target=self.work, daemon=True)
 

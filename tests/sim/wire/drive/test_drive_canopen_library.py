@@ -79,7 +79,7 @@ class DriveBus(can.BusABC):
         self.channel_info = "drive on the bench"
         self.bench = bench
         self.lock = threading.Lock()
-        self.frames = queue.SimpleQueue()
+        self.frames = queue.Queue()
         bench.node._send = lambda can_id, data: self.frames.put((can_id, data))
         self.syncing = self.beating = False
         self._stop = threading.Event()
