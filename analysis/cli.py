@@ -165,7 +165,8 @@ def analyze(
 
             code = campaign_command(
                 files, settings, structures=tuple(STRUCTURES) if routes.whole_record else (),
-                report=report, json=json, jobs=jobs, dask=dask, with_paper=paper,
+                fixed=routes.fixed, report=report, json=json, jobs=jobs, dask=dask,
+                with_paper=paper,
             )  # fmt: skip
     except OutputExistsError as error:
         _complain(str(error))

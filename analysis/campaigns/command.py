@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from analysis.campaigns.campaign import Campaign
     from analysis.settings import WelchSettings
+    from analysis.whole_record import Setting
 
 _NAME: Final = "campaign"
 _TEXT_WIDTH: Final = 120
@@ -22,6 +24,7 @@ def campaign_command(
     settings: WelchSettings,
     *,
     structures: Sequence[str],
+    fixed: Sequence[Setting] = (),
     report: Path | None = None,
     json: Path | None = None,
     jobs: int | None = None,
@@ -37,6 +40,8 @@ def campaign_command(
         Of the paper's route.
     structures : sequence of str
         Types fitted to the whole records.
+    fixed : sequence of str
+        Settings that those fits take from the files.
     report : Path, optional
         Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
         exists ``campaign.report-2`` and so on.
@@ -63,6 +68,7 @@ def campaign_command(
     """
     from rich.console import Console
 
+    from analysis.campaigns.campaign import campaign
     from analysis.campaigns.rows import campaign_document
     from analysis.campaigns.tables import campaign_tables
     from analysis.report.document import document_text
@@ -70,7 +76,10 @@ def campaign_command(
 
     first = files[0] if report is not None else files[0].with_name(_NAME)
     (folder,) = report_folders([first], report)
-    found = _analysed(files, settings, structures, folder, jobs, dask, with_paper=with_paper)
+    run = partial(
+        campaign, files, settings, structures=structures, fixed=fixed, jobs=jobs, dask=dask
+    )
+    found = _analysed(run, len(files), folder, with_paper=with_paper)
     to_stdout = json is not None and str(json) == "-"
     console = Console(stderr=to_stdout, highlight=False)
     if not console.is_terminal:
@@ -89,20 +98,12 @@ def campaign_command(
 
 
 def _analysed(
-    files: Sequence[Path],
-    settings: WelchSettings,
-    structures: Sequence[str],
-    folder: Path,
-    jobs: int | None,
-    dask: str | None,
-    *,
-    with_paper: bool,
+    run: Callable[..., Campaign], files: int, folder: Path, *, with_paper: bool
 ) -> Campaign:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from analysis.campaigns.campaign import campaign
     from analysis.campaigns.write import write_campaign
     from analysis.report.folder import new_folder
 
@@ -116,16 +117,13 @@ def _analysed(
         transient=True,
         disable=not terminal.is_terminal,
     ) as progress:
-        bar = progress.add_task("starting", total=2 * len(files) + _FIGURES)
+        bar = progress.add_task("starting", total=2 * files + _FIGURES)
 
         def on_progress(done: int, total: int, name: str) -> None:
             progress.update(bar, completed=done, total=total + _FIGURES, description=name)
 
         with new_folder(folder) as part:
-            found = campaign(
-                files, settings, structures=structures, jobs=jobs, dask=dask,
-                on_progress=on_progress,
-            )  # fmt: skip
+            found = run(on_progress=on_progress)
             write_campaign(
                 found, part, with_paper=with_paper,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),

@@ -17,7 +17,40 @@ _START_S: Final = 30.0
 _LOOK_S: Final = 0.05
 
 
-class Window:
+class _Playback:
+    """Rerun's program with a file, as long as this context is entered."""
+
+    _program: RerunProgram
+
+    @property
+    def program(self) -> RerunProgram:
+        """The program itself."""
+        return self._program
+
+    def wait(self) -> int:
+        """Wait until it ends: a window when it is closed, a server not by itself.
+
+        Returns
+        -------
+        int
+            Its exit code.
+        """
+        while (code := self._program.exit_code) is None:
+            time.sleep(_LOOK_S)
+        return code
+
+    def close(self) -> None:
+        """End it."""
+        self._program.kill()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Window(_Playback):
     """The viewer's window on a file.
 
     What the user has set in Rerun's own viewer is neither used nor changed.
@@ -49,29 +82,8 @@ class Window:
             {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
         )
 
-    @property
-    def program(self) -> RerunProgram:
-        """Rerun's program behind the window."""
-        return self._program
 
-    def wait(self) -> int:
-        """Wait until the window is closed; return the viewer's exit code."""
-        while (code := self._program.exit_code) is None:
-            time.sleep(_LOOK_S)
-        return code
-
-    def close(self) -> None:
-        """Close the window."""
-        self._program.kill()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class PageOfFile:
+class PageOfFile(_Playback):
     """The viewer's page on a file, on loopback.
 
     Parameters
@@ -113,27 +125,10 @@ class PageOfFile:
             path.stem, self._program.grpc_port, self._page.port, time.time_ns()
         )
 
-    @property
-    def program(self) -> RerunProgram:
-        """Rerun's program behind the page."""
-        return self._program
-
-    def wait(self) -> int:
-        """Wait until the server ends, which it does not by itself; return its exit code."""
-        while (code := self._program.exit_code) is None:
-            time.sleep(_LOOK_S)
-        return code
-
     def close(self) -> None:
         """Take the page away."""
         self._page.close()
-        self._program.kill()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        super().close()
 
     def _await_server(self) -> None:
         deadline = time.monotonic() + _START_S

@@ -274,3 +274,25 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
     )
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("files", [["a.mcap"], ["a.mcap", "b.mcap"]])
+def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, files):
+    fixed = []
+
+    def run(_files, routes, *_):
+        fixed.append(routes.fixed)
+        return 0
+
+    def campaign(*_, **options):
+        fixed.append(options["fixed"])
+        return 0
+
+    monkeypatch.setattr("analysis.cli._run", run)
+    monkeypatch.setattr("analysis.campaigns.command.campaign_command", campaign)
+    result = CliRunner().invoke(app, [*files, "--fix", "tool_inertia_kg_m2, delay_s"])
+    assert result.exit_code == 0, result.output
+    assert fixed == [("delay_s", "tool_inertia_kg_m2")]
+    result = CliRunner().invoke(app, [*files, "--fix", "inertia"])
+    assert result.exit_code == 2
+    assert "there is no inertia; choose from density_over_stiffness" in result.output
