@@ -159,12 +159,15 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def look(session):
-    """Open files in Rerun's viewer, without a screen; return what it shows after a while."""
+    """Open files in Rerun's viewer, without a screen; return what it shows after a while.
+
+    Until a layout has come it shows one view of everything: so many views are waited for.
+    """
     from rerun.experimental import ViewerClient
 
     from rigd.live.program import RerunProgram
 
-    def shown(*files: str) -> tuple[dict[str, np.ndarray], list]:
+    def shown(*files: str, at_least: int) -> tuple[dict[str, np.ndarray], list]:
         program = RerunProgram(
             (
                 *(str(session / file) for file in files),
@@ -187,7 +190,7 @@ def look(session):
                 except (OSError, RuntimeError, ValueError):
                     time.sleep(0.1)
                     continue
-                if state.views and not state.loading:
+                if len(state.views) >= at_least and not state.loading:
                     time.sleep(1.0)  # the plots need a frame or two
                     state = client.get_state()
                     return {
@@ -197,7 +200,7 @@ def look(session):
                         for view in state.views
                     }, [report for view in state.views for report in view.reports]
                 time.sleep(0.1)
-            pytest.fail("the viewer shows nothing")
+            pytest.fail(f"the viewer does not show {at_least} views")
         finally:
             program.kill()
 
@@ -244,7 +247,7 @@ def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
     assert done.returncode == 0, done.stderr
     words = show.split()
     assert words[:3] == ["rerun", "--bind", "127.0.0.1"]
-    assert_plotted(look(*words[3:]))
+    assert_plotted(look(*words[3:], at_least=len(COLORS)))
 
 
 def test_the_python_of_the_page_puts_session_and_layout_into_one_file(session):
@@ -266,7 +269,7 @@ def test_the_python_of_the_page_puts_session_and_layout_into_one_file(session):
 
 def test_a_session_file_opened_as_it_is_shows_the_events_only(look):
     """As the page says: should Rerun ever do better, the page is to say so."""
-    views, _ = look(EXAMPLE, "docs/layouts/rigd.rbl")
+    views, _ = look(EXAMPLE, "docs/layouts/rigd.rbl", at_least=1)
     assert len(views) == 1
     assert "Motor angle (rad)" not in views
 

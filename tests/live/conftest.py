@@ -260,8 +260,8 @@ class Saver:
         )
 
     def has_begun(self) -> bool:
-        """Whether something that counts has come."""
-        return self._path.exists() and self._path.stat().st_size > 100_000
+        """Whether something that counts has come: more than the frame of a picture, some 100 kB."""
+        return self._path.exists() and self._path.stat().st_size > 300_000
 
     def has_all(self) -> bool:
         """Whether nothing more comes: what is on its way when the server goes is lost."""
