@@ -12,7 +12,7 @@ demo: $(VENV)/ready
 	$(BIN)/analyze demo/*.mcap --report demo/report
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist loadgroup
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -28,6 +28,12 @@ _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """More workers than processors: every second test waits for processes and for real time."""
+    return (os.cpu_count() or 1) + 2
+
+
 RIGD = Path(sys.executable).parent / "rigd"
 HW_PROFILES = Path(__file__).parents[1] / "hw_profiles"
 

@@ -8,9 +8,6 @@ import pytest
 from rigd.bench import loops
 from rigd.profile import load_profile
 
-# Whole processes in real time: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
 SECONDS = 0.3
 
 

@@ -18,9 +18,6 @@ from rigd.session.format import pack_sample_into
 from rigd.supervisor.orders import Order
 from rigd.supervisor.rig import Rig
 
-# Sessions in real time share a core: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
 
 @pytest.fixture
 def channels():

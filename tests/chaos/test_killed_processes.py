@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-# Sessions in real time share a core: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
 STANDSTILL_S = 1.0
 """For which a virtual machine may stop, at the worst moment, and no test fails."""
 

@@ -34,8 +34,6 @@ from rigd.view.palette import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
 from rigd.view.recorded import nominal_damping, subject_of_session
 from rigd.view.response_charts import MAGNITUDE, ResponseCharts
 
-pytestmark = pytest.mark.xdist_group("replay")
-
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")

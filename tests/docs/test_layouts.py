@@ -17,8 +17,6 @@ import pytest
 from rigd.session.schema import EVENT_TOPIC, SAMPLE_TOPIC, message_class
 from rigd.view.palette import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
 
-pytestmark = pytest.mark.xdist_group("replay")
-
 DOCS = Path(__file__).parents[2] / "docs"
 LAYOUTS = DOCS / "layouts"
 PAGE = (DOCS / "opening_sessions.md").read_text("utf-8")

@@ -16,9 +16,6 @@ from rigd.supervisor.crew import Crew
 from rigd.supervisor.orders import Order
 from rigd.supervisor.rig import Rig
 
-# Sessions share a core: one at a time.
-pytestmark = pytest.mark.xdist_group("realtime")
-
 COARSE_KB = 4096
 
 

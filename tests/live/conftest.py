@@ -268,7 +268,7 @@ class Saver:
         if not self.has_begun():
             return False
         sizes = []
-        for _ in range(8):  # looked at often, as a sleep may be one of the machine
+        for _ in range(15):  # looked at often, as a sleep may be one of the machine
             sizes.append(self._path.stat().st_size)
             time.sleep(0.1)
         return len(set(sizes)) == 1

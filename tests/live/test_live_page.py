@@ -10,8 +10,6 @@ import pytest
 
 from rigd.live.page import PageServer, kept_here
 
-pytestmark = pytest.mark.xdist_group("realtime")
-
 
 def get(port: int, path: str, host: str | None = None):
     """Ask the publisher's page server, as a browser does."""

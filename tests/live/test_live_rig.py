@@ -18,8 +18,6 @@ from rigd.supervisor import live_view
 from rigd.supervisor.orders import Order
 from rigd.supervisor.rig import Rig
 
-pytestmark = pytest.mark.xdist_group("realtime")
-
 
 @pytest.fixture
 def rig(write_profile, runtime_folder):

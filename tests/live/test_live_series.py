@@ -5,10 +5,6 @@ import signal
 import time
 from pathlib import Path
 
-import pytest
-
-pytestmark = pytest.mark.xdist_group("realtime")
-
 
 def run_session(publisher, name: str, eventually) -> None:
     """Have the producer's next quarter of a second be a session of its own."""

@@ -8,8 +8,6 @@ import pytest
 
 from rigd.live.viewer import Viewer
 
-pytestmark = pytest.mark.xdist_group("realtime")
-
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 
 

@@ -22,8 +22,6 @@ from rigd.view.antenna import TITLE as ANTENNA
 from rigd.view.layout import TABS
 from rigd.view.palette import GREEN, GREY, ORANGE, SKY_BLUE
 
-pytestmark = pytest.mark.xdist_group("realtime")
-
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 
 PICTURES = os.environ.get("RIGD_PICTURES")

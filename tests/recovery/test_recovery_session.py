@@ -8,11 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
-
 from rigd.session import read_session, recover
-
-pytestmark = pytest.mark.xdist_group("realtime")
 
 RIGD = Path(sys.executable).parent / "rigd"
 

@@ -14,8 +14,6 @@ import pytest
 from rigd.service.address import answers, socket_path
 from rigd.session import read_session
 
-pytestmark = pytest.mark.xdist_group("realtime")
-
 RIGD = Path(sys.executable).parent / "rigd"
 SHORT = ("--duration", "1", "--rest", "0.2", "--ring-down", "0")
 LONG = ("--duration", "600", "--rest", "0.2")

@@ -15,8 +15,6 @@ from rigd.session import read_session
 from rigd.supervisor.orders import Order
 from rigd.supervisor.rig import Rig, RigError
 
-pytestmark = pytest.mark.xdist_group("realtime")
-
 
 @pytest.fixture
 def profile():

@@ -283,8 +283,6 @@ def test_after_enabling_the_ticks_go_on(drive, scripted):
 class TestByTheClock:
     """A real drive does not wait: the loop paces itself."""
 
-    pytestmark = pytest.mark.xdist_group("realtime")
-
     @pytest.fixture
     def drive(self, make_drive, rig, settings):
         return make_drive(
