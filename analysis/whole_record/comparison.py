@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.whole_record.decimation import Decimation, fast_length_below
+from analysis.whole_record.feedback import following
 from analysis.whole_record.free_decay import DecaySpectra
 from analysis.whole_record.measurement import MeasurementError
 from analysis.whole_record.prediction import Prediction
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from analysis.whole_record.plant import Plant
 
 _FEWEST_BINS: Final = 50
+_LARGEST_REST: Final = 0.3
+"""Share of the angle's power that may be apart from the reference. With more it was not this
+reference that the motor followed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,11 @@ class Comparison:
     frequency_hz : ndarray, shape (K,)
     visible_modes : int
         Modes of the nominal beam within the band, whose free decay is projected out.
+    decays : DecaySpectra
+    apart_nm : ndarray, shape (samples,)
+        Torque that was taken out because it followed no reference, at the samples kept.
+    apart_at_unknown_nm : ndarray, shape (u,)
+        The same at the ticks whose torque is unknown.
     """
 
     measurement: Measurement
@@ -51,6 +60,8 @@ class Comparison:
     frequency_hz: NDArray[np.float64]
     visible_modes: int
     decays: DecaySpectra
+    apart_nm: NDArray[np.float64] | float = 0.0
+    apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -117,6 +128,53 @@ class Comparison:
         """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
         return np.fft.rfft(values)[..., self.bins]
 
+    def followed_rad(self) -> NDArray[np.float64]:
+        """Part of the angle that follows the reference, shape (m,).
+
+        All of it without a reference, or with one that does not explain it.
+        """
+        reference_rad = self.measurement.reference_rad
+        if reference_rad is None:
+            return self.angle_rad
+        followed = following(
+            self.angle_rad,
+            self.decimation.apply(reference_rad - reference_rad[0]),
+            self.decimation.rate_hz,
+        )
+        apart = np.sum((self.angle_rad - followed) ** 2)
+        return followed if apart < _LARGEST_REST * np.sum(self.angle_rad**2) else self.angle_rad
+
+    def following_reference(self, plant: Plant) -> Comparison:
+        """Take for input only what follows the reference, and take out what the rest does.
+
+        Parameters
+        ----------
+        plant : Plant
+            As found so far. Its error adds to the noise and makes no bias.
+
+        Returns
+        -------
+        Comparison
+            `self` if all of the angle counts as such: see `followed_rad`.
+        """
+        followed = self.followed_rad()
+        if followed is self.angle_rad:
+            return self
+        rest = self.prediction.of_other(self.angle_rad - followed)
+        apart = rest.torque(plant)[0]
+        torque_nm = self.torque_nm.copy()
+        torque_nm[self.kept] -= apart
+        return replace(
+            self,
+            angle_rad=followed,
+            torque_nm=torque_nm,
+            prediction=self.prediction.of_other(followed),
+            apart_nm=apart,
+            apart_at_unknown_nm=rest.torque_between(
+                plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+            )[0],
+        )
+
     def filled(self, plant: Plant) -> Comparison:
         """Put what `plant` predicts where the torque is unknown, so that it does not count there.
 
@@ -127,10 +185,13 @@ class Comparison:
         if known.all():
             return self
         torque = self.measurement.torque_nm.copy()
-        torque[~known] = self.prediction.torque_between(
-            plant, self.decimation.factor, self._places(~known)
-        )[0]
-        return replace(self, torque_nm=self.decimation.apply(torque))
+        torque[~known] = (
+            self.apart_at_unknown_nm
+            + self.prediction.torque_between(plant, self.decimation.factor, self._places(~known))[0]
+        )
+        torque_nm = self.decimation.apply(torque)
+        torque_nm[self.kept] -= self.apart_nm
+        return replace(self, torque_nm=torque_nm)
 
     def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
         """Compute what unknown torques would have given to the gradient's spectra, (k, K)."""

@@ -8,20 +8,22 @@ geometric sums, in closed form.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.whole_record.response import FIRST_OFFSET, offset_name
-from rigd.beam import clamped_free_eigenvalues
+from analysis.whole_record.response import FIRST_OFFSET, eigenvalues, offset_name
 from rigd.beam.modes import poles_for_eigenvalues
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from analysis.whole_record.plant import Plant
+
+
+_HARDLY: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,7 @@ def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]
     wrt : sequence of str
         Names that `ResponseGrid` knows; some do not move a pole.
     """
-    z = clamped_free_eigenvalues(count)
+    z = eigenvalues(count).copy()
     for mode, offset in enumerate(plant.stiffness_offsets[: count - 1], start=FIRST_OFFSET):
         z[mode - 1] *= (1 + offset) ** 0.25
     found = []
@@ -121,33 +123,60 @@ class DecaySpectra:
 
     def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
         """Spectra of ``Re exp(p t)`` and, if it oscillates, ``Im exp(p t)``: shape (m, K)."""
-        rows = []
-        for pole in poles:
-            upper = self._sum(pole.at_rad_s)
-            if pole.oscillates:
-                lower = self._sum(pole.at_rad_s.conjugate())
-                rows += [(upper + lower) / 2, (upper - lower) / 2j]
-            else:
-                rows.append(upper)
-        return np.array(rows, dtype=np.complex128).reshape(len(rows), self._turn.size)
+        return self._spectra(poles, self._sum)
 
     def gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
         """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K)."""
-        total = np.zeros((poles[0].derivative.size, self._turn.size), dtype=np.complex128)
+        turned = []
         place = 0
         for pole in poles:
-            upper = self._sum_of_time(pole.at_rad_s)
             if pole.oscillates:
+                # t exp(p t) times the pole's motion, seen along the two amplitudes.
                 moved = complex(amplitudes[place], -amplitudes[place + 1]) * pole.derivative
-                lower = self._sum_of_time(pole.at_rad_s.conjugate())
-                total += (np.outer(moved, upper) + np.outer(moved.conj(), lower)) / 2
+                turned += [moved.real, -moved.imag]
                 place += 2
             else:
-                total += np.outer(amplitudes[place] * pole.derivative.real, upper)
+                turned.append(amplitudes[place] * pole.derivative.real)
                 place += 1
+        parts: NDArray[np.float64] = np.array(turned).T @ self.growing(poles).view(np.float64)
+        total: NDArray[np.complex128] = parts.view(np.complex128)
         return total
+
+    def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Spectra of the same times the time since the first sample: shape (m, K)."""
+        return self._spectra(poles, self._sum_of_time)
+
+    def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
+        """Spectra of oscillations all through the record, shape (4 n, K).
+
+        Of either phase, and growing from nought: together any amplitude and phase at the beginning
+        and any other at the end, and that is what leaks into distant bins.
+        """
+        none = np.zeros(0, dtype=np.complex128)
+        # All but steady: on a bin's own frequency the sums would be 0 / 0.
+        slow = _HARDLY / self._duration_s
+        poles = [Pole(0, complex(-slow, 2 * np.pi * hz), none) for hz in frequency_hz]
+        return np.concatenate([self.columns(poles), self.growing(poles)])
+
+    def _spectra(
+        self, poles: Sequence[Pole], upper: Callable[[complex], NDArray[np.complex128]]
+    ) -> NDArray[np.complex128]:
+        """Spectra of the real and, if it oscillates, the imaginary part of a complex decay."""
+        rows = np.empty((sum(1 + pole.oscillates for pole in poles), self._turn.size), complex)
+        place = 0
+        for pole in poles:
+            of_pole = upper(pole.at_rad_s)
+            if pole.oscillates:
+                of_conjugate = upper(pole.at_rad_s.conjugate())
+                np.multiply(of_pole + of_conjugate, 0.5, out=rows[place])
+                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[place + 1])
+                place += 2
+            else:
+                rows[place] = of_pole
+                place += 1
+        return rows
 
     def _sum(self, pole: complex) -> NDArray[np.complex128]:
         """Sum of ``exp(p t)`` over the samples, turned to each bin."""
@@ -159,8 +188,9 @@ class DecaySpectra:
         """Sum of ``t exp(p t)``: the derivative of `_sum` by the pole."""
         ratio = np.exp(pole * self._period_s) * self._turn
         over = np.exp(pole * self._duration_s)
-        rest = 1 - ratio
-        total: NDArray[np.complex128] = (
-            (1 - over) * self._period_s * ratio / rest - self._duration_s * over
-        ) / rest
+        reciprocal = np.reciprocal(1 - ratio)
+        total: NDArray[np.complex128] = ratio * reciprocal
+        total *= (1 - over) * self._period_s
+        total -= self._duration_s * over
+        total *= reciprocal
         return total

@@ -52,6 +52,9 @@ class Measurement:
         By how much the torque is older than the angle at one time stamp, as the file states it.
     tool_inertia_kg_m2 : float
         Inertia between torque sensor and beam, as the file states it.
+    reference_rad : ndarray, shape (n,), or None
+        Angle that a controller was asked for, if one held the motor: what of the angle does not
+        follow it is taken to be the noise's doing.
     """
 
     name: str
@@ -64,6 +67,7 @@ class Measurement:
     rest_angle_rad: float | None = None
     delay_s: float = 0.0
     tool_inertia_kg_m2: float = 0.0
+    reference_rad: NDArray[np.float64] | None = None
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -79,6 +83,7 @@ class Measurement:
             rest_angle_rad=record.rest_angle_rad,
             delay_s=record.torque_delay_s - record.angle_delay_s,
             tool_inertia_kg_m2=record.tool_inertia_kg_m2,
+            reference_rad=record.reference_rad,
         )
 
     def check(self, highest_hz: float) -> None:

@@ -66,11 +66,11 @@ class Projected:
 
     def normal_equations(self) -> NormalEquations:
         """As the descent wants them."""
-        conjugate = self.jacobian.conj()
+        jacobian = _parts(self.jacobian)
         return NormalEquations(
             cost=self.cost,
-            gradient=(conjugate @ self.residual).real,
-            hessian=(conjugate @ self.jacobian.T).real,
+            gradient=jacobian @ _parts(self.residual),
+            hessian=jacobian @ jacobian.T,
         )
 
 
@@ -113,7 +113,7 @@ class Objective:
         )
         return Linearisation(
             residual=comparison.spectrum(torque - comparison.torque_nm[comparison.kept]),
-            jacobian=chain.T @ comparison.spectrum(gradient),
+            jacobian=(chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128),
             poles=poles,
             columns=comparison.decays.columns(poles),
         )
@@ -133,18 +133,19 @@ class Objective:
         residual, jacobian = at.residual * weight, at.jacobian * weight
         if not at.poles:
             return Projected(residual, jacobian, np.zeros(0), np.zeros((0, 0)))
-        columns = at.columns * weight
-        scale = np.sqrt(np.sum(columns.real**2 + columns.imag**2, axis=1))
+        columns = _parts(at.columns * weight)
+        scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
         scale[scale == 0] = 1.0  # a decay that is over at once
         columns /= scale[:, None]
-        conjugate = columns.conj()
-        gram = (conjugate @ columns.T).real
+        gram = columns @ columns.T
         inverse = np.linalg.inv(gram + 1e-12 * np.eye(scale.size))
-        amplitudes = -inverse @ (conjugate @ residual).real
+        amplitudes = -inverse @ (columns @ _parts(residual))
         jacobian += weight * self.comparison.decays.gradient(at.poles, amplitudes / scale)
+        parts = _parts(jacobian)
+        parts -= ((parts @ columns.T) @ inverse) @ columns
         return Projected(
-            residual=residual + amplitudes @ columns,
-            jacobian=jacobian - ((jacobian.conj() @ columns.T).real @ inverse) @ columns,
+            residual=residual + (amplitudes @ columns).view(np.complex128),
+            jacobian=jacobian,
             amplitudes=amplitudes / scale,
             amplitude_gram=gram * np.outer(scale, scale),
         )
@@ -154,3 +155,12 @@ class Objective:
     ) -> NormalEquations:
         """Sum of squares at `x`, with what a Gauss-Newton step needs."""
         return self.project(self.linearise(x), weight).normal_equations()
+
+
+def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Real and imaginary parts side by side, shape (..., 2 K), of the same memory.
+
+    Products of these are the real parts of those of the complex values, at half the price.
+    """
+    parts: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
+    return parts

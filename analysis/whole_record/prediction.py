@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
 
     from analysis.whole_record.plant import Plant
 
-_PADDED: Final = 1.5
-_DECAY: Final = 9.0
-"""sigma times the padded duration: what wraps round shrinks by exp(-9), to 1e-4 of what a beam
-still does after a whole record; rounding and what the decimation left beyond the band grow by
-exp(9 / 1.5) = 400."""
+_PADDED: Final = 1.1
+_DECAY: Final = 6.6
+"""sigma times the padded duration. What wraps round shrinks by exp(-6.6), to 1e-3 of what a beam
+still does after a whole record, and is a free decay, of which no fit takes notice; rounding and
+what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
 class Prediction:
@@ -40,7 +41,16 @@ class Prediction:
         Samples of which the prediction is wanted.
     """
 
-    __slots__ = ("_growth", "_kept", "_length", "_response", "_sigma", "_spectrum", "rate_hz")
+    __slots__ = (
+        "_decay",
+        "_growth",
+        "_kept",
+        "_length",
+        "_response",
+        "_sigma",
+        "_spectrum",
+        "rate_hz",
+    )
 
     def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, kept: slice) -> None:
         self.rate_hz = rate_hz
@@ -50,8 +60,15 @@ class Prediction:
         time_s = np.arange(angle_rad.size) / rate_hz
         bins = np.arange(self._length // 2 + 1)
         self._response = ResponseGrid(sigma + 2j * np.pi * rate_hz / self._length * bins)
-        self._spectrum = np.fft.rfft(angle_rad * np.exp(-sigma * time_s), self._length)
+        self._decay = np.exp(-sigma * time_s)
+        self._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
         self._growth = np.exp(sigma * time_s[kept])
+
+    def of_other(self, angle_rad: NDArray[np.float64]) -> Prediction:
+        """Predict from another angle of the same length, shape (n,)."""
+        other = copy(self)
+        other._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
+        return other
 
     def torque(
         self, plant: Plant, wrt: Sequence[str] = ()

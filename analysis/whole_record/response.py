@@ -14,11 +14,12 @@ stiffness and d its offset::
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, participation
+from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,6 +35,17 @@ FIRST_OFFSET: Final = 2
 def offset_name(mode: int) -> str:
     """Name of a mode's offset among the parameters."""
     return f"stiffness_offset_{mode}"
+
+
+@lru_cache(maxsize=16)
+def eigenvalues(count: int) -> NDArray[np.float64]:
+    """First roots of ``1 + cos z cosh z = 0``, shape (count,), kept: every evaluation needs them.
+
+    Not to be written to.
+    """
+    z = clamped_free_eigenvalues(count)
+    z.flags.writeable = False
+    return z
 
 
 class ResponseGrid:
@@ -109,8 +121,8 @@ class ResponseGrid:
         p = ratio * self._s_squared + damping.gamma * s_lambda
         total, by_p, by_c = np.zeros((3, self._s.size), dtype=np.complex128)
         last = FIRST_OFFSET + len(plant.stiffness_offsets) - 1
-        shares = participation(plant.beam, last)[FIRST_OFFSET - 1 :] * stiffness
-        of_modes = (clamped_free_eigenvalues(last)[FIRST_OFFSET - 1 :] / plant.beam.length_m) ** 4
+        of_modes = (eigenvalues(last)[FIRST_OFFSET - 1 :] / plant.beam.length_m) ** 4
+        shares = 4 * stiffness / (plant.beam.length_m * of_modes)
         for i, (share, k, offset) in enumerate(
             zip(shares, of_modes, plant.stiffness_offsets, strict=True)
         ):

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.structures import Structure
+    from analysis.whole_record.comparison import Comparison
     from analysis.whole_record.noise import Line
     from analysis.whole_record.plant import Plant
 
@@ -56,7 +57,7 @@ class Ringing:
     amplitude_nm : tuple of float
         By mode, at the first sample compared.
     chi_square : float
-        Of all its amplitudes together.
+        Of all its amplitudes together, beside the hum if there is some.
     degrees_of_freedom : int
     """
 
@@ -92,10 +93,12 @@ class RecordFit:
     std : dict of str to (float or None)
         Standard deviations of the same: 0 for the fixed ones, None for those that rest on a bound
         or that the data do not determine. Of a tool's inertia that rests on 0: what it would be
-        without that bound.
+        without that bound. An estimate that cannot be negative of a value that is 0 lies 0 to one
+        side of it half of the time and a half-normal error to the other: on average it is
+        1/sqrt(2 pi) = 0.40 of this deviation too large, and it scatters by 0.58 of it.
     interval : dict of str to ((float, float) or None)
         95 % confidence intervals of the free ones, None as above. Of the positive parameters they
-        are symmetric in the logarithm; of a tool's inertia that rests on 0 it begins there.
+        are symmetric in the logarithm; that of a tool's inertia ends at 0 (`interval_from_zero`).
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
@@ -162,6 +165,8 @@ class RecordAnalysis:
         One-sided power spectral density of the torque's noise, without lines.
     lines : tuple of Line
         Hum found in the torque, which no structure was compared with.
+    comparison : Comparison
+        What they were compared with.
     """
 
     fits: tuple[RecordFit, ...]
@@ -169,3 +174,4 @@ class RecordAnalysis:
     compared: NDArray[np.bool_]
     noise_nm2_per_hz: NDArray[np.float64]
     lines: tuple[Line, ...]
+    comparison: Comparison

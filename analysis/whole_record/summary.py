@@ -11,8 +11,8 @@ from analysis.whole_record.result import RecordFit
 from analysis.whole_record.uncertainty import (
     covariance_of_unknowns,
     damping_size,
-    half_normal_interval,
     interval,
+    interval_from_zero,
     mode_table,
     ringing,
 )
@@ -69,10 +69,11 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
         place = names.index(tool)
         free = held & (np.arange(held.size) != place)
         every, _ = covariance_of_unknowns(jacobian, scatter, free)
-        step = -every[place] @ (jacobian.conj() @ projected.residual).real / scatter
-        unit = chain[place, place]
-        std[tool] = spread = float(unit * every[place, place] ** 0.5)
-        intervals[tool] = half_normal_interval(float(unit * step), spread)
+        std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
+    spread = std.get(tool)
+    if tool in names and spread:
+        intervals[tool] = interval_from_zero(values[tool], spread)
+    hum = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
     return RecordFit(
         structure=unknowns.structure,
         plant=plant,
@@ -85,7 +86,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
         internal=damping_size("zeta", "alpha", values, determined, covariance),
         external=damping_size("gamma", "lambda", values, determined, covariance),
         modes=mode_table(at.poles, of_unknowns),
-        ringing=ringing(at.poles, projected, scatter),
+        ringing=ringing(at.poles, projected, scatter, at.columns * noise.weight, hum),
         cost=projected.cost,
         degrees_of_freedom=freedom,
         residual=projected.residual,

@@ -66,9 +66,21 @@ def interval(name: str, value: float, std: float) -> tuple[float, float]:
     return value - half, value + half
 
 
-def half_normal_interval(unbounded: float, std: float) -> tuple[float, float]:
-    """95 % interval of what cannot be negative, where its estimate would be and is held at 0."""
-    return 0.0, max(unbounded + _NORMAL_95 * std, 0.0)
+def interval_from_zero(value: float, std: float) -> tuple[float, float]:
+    """95 % confidence interval of what cannot be negative: of the symmetric one, what is possible.
+
+    It begins at 0, one-sided, for an estimate within 1.96 standard deviations of it, also for one
+    that rests there. It covers a true value of 0 in 97.5 % of all records, others in 95 to 97.5 %.
+
+    Parameters
+    ----------
+    value : float
+        The estimate, 0 or more.
+    std : float
+        Standard deviation that it would have if it could be negative.
+    """
+    half = _NORMAL_95 * std
+    return max(value - half, 0.0), value + half
 
 
 def damping_size(
@@ -137,21 +149,61 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
     return tuple(table)
 
 
-def ringing(poles: Sequence[Pole], projected: Projected, scatter: float) -> Ringing:
-    """Amplitudes of the free decay by mode, and how far beyond chance they are."""
+def ringing(
+    poles: Sequence[Pole],
+    projected: Projected,
+    scatter: float,
+    columns: NDArray[np.complex128],
+    hum: NDArray[np.complex128],
+) -> Ringing:
+    """Amplitudes of the free decay by mode, and how far beyond chance they are.
+
+    A hum is left out bin by bin, but starts and ends with the record and so leaks into all other
+    bins, which free decay would explain in part: what counts is what it explains beside the hum.
+
+    Parameters
+    ----------
+    poles : sequence of Pole
+    projected : Projected
+    scatter : float
+        Variance of the whitened residual's parts.
+    columns : ndarray of complex, shape (m, K)
+        Whitened spectra of the free decays.
+    hum : ndarray of complex, shape (h, K)
+        Those of what was left out as lines.
+    """
+    decays = projected.amplitudes
+    explained = float(decays @ projected.amplitude_gram @ decays)
+    if len(hum) and decays.size:
+        without = projected.residual - decays @ columns
+        beside, left = _combination(without, np.concatenate([columns, hum]))
+        explained = _combination(without, hum)[1] - left
+        decays = beside[: decays.size]
     amplitudes: dict[int, float] = {}
     place = 0
     for pole in poles:
         width = 2 if pole.oscillates else 1
-        size = float(np.linalg.norm(projected.amplitudes[place : place + width]))
+        size = float(np.linalg.norm(decays[place : place + width]))
         amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), size)
         place += width
-    a = projected.amplitudes
     return Ringing(
         amplitude_nm=tuple(amplitudes.values()),
-        chi_square=float(a @ projected.amplitude_gram @ a) / scatter,
-        degrees_of_freedom=a.size,
+        chi_square=explained / scatter,
+        degrees_of_freedom=decays.size,
     )
+
+
+def _combination(
+    values: NDArray[np.complex128], columns: NDArray[np.complex128]
+) -> tuple[NDArray[np.float64], float]:
+    """Best real combination of columns, shape (m,), and the sum of squares that it leaves."""
+    parts = np.ascontiguousarray(columns).view(np.float64)
+    size = np.sqrt(np.einsum("ij,ij->i", parts, parts))
+    size[size == 0] = 1.0
+    scaled, right = (parts / size[:, None]).T, values.view(np.float64)
+    factors = np.linalg.lstsq(scaled, right)[0]
+    rest = right - scaled @ factors
+    return factors / size, float(rest @ rest)
 
 
 def _std(slope: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:

@@ -20,6 +20,8 @@ PLANTS = {
     "VI": Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
     "III": Damping(zeta=0.54e-4, alpha=1.0, gamma=0.02, lambda_=1.0),
     "IV": Damping(zeta=2.49e-4, alpha=0.8, gamma=0.0, lambda_=0.0),
+    "like springs": Damping(zeta=0.029, alpha=0.31, gamma=0.15, lambda_=0.41),
+    "like masses": Damping(zeta=1.3e-4, alpha=1.51, gamma=2.2e-3, lambda_=1.1),
 }
 
 
@@ -93,6 +95,22 @@ def response(reference, damping, beam, delay_s, tool_inertia_kg_m2, offsets):
     return Session(*(np.fft.irfft(x, padded)[:n] / decay for x in (angle, torque)))
 
 
+def sweep_rad(t):
+    phase = 2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 120)
+    return np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
+
+
+def multisine_rad(t):
+    """A period of 10 s, six times over."""
+    line_hz = np.arange(10, 401) / 10
+    phases = np.random.default_rng(3).uniform(0, 2 * np.pi, line_hz.size)
+    during = (t >= 0) & (t < 60)
+    period = np.cos(2 * np.pi * line_hz * t[during][:10_000, None] + phases).sum(axis=1)
+    reference = np.zeros(t.size)
+    reference[during] = np.tile(0.01 / np.abs(period).max() * period, 6)
+    return reference
+
+
 @cache
 def session(
     name: str,
@@ -101,12 +119,15 @@ def session(
     tool_inertia_kg_m2: float = 0.0,
     shaken: bool = False,
     offsets: tuple[float, ...] = (),
+    multisine: bool = False,
 ) -> Session:
-    """One second of rest, 0.05-50 Hz in 60 s, 10 s of ring-down; if shaken, 5 s of that before."""
+    """One second of rest, 0.05-50 Hz in 60 s, 10 s of ring-down; if shaken, 5 s of that before.
+
+    With `multisine`, 391 lines from 1 to 40 Hz in place of the sweep.
+    """
     before = 5.0 if shaken else 0.0
     t = np.arange(round((before + 71) * RATE_HZ)) / RATE_HZ - before - 1
-    phase = 2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 120)
-    reference = np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
+    reference = multisine_rad(t) if multisine else sweep_rad(t)
     reference[t < -2] += 0.01 * np.sin(2 * np.pi * 2.6 * (t[t < -2] + 1 + before))
     reference[t < -2] += 0.002 * np.sin(2 * np.pi * 16 * (t[t < -2] + 1 + before))
     return response(reference, PLANTS[name], beam, delay_s, tool_inertia_kg_m2, offsets)
@@ -116,6 +137,17 @@ def session(
 def sessions():
     """Make a session of one of the `PLANTS`: see `session`."""
     return session
+
+
+@pytest.fixture(scope="session")
+def references():
+    """Angle asked for in a session, at a number of ticks from its start."""
+
+    def reference(n: int, multisine: bool = False) -> NDArray[np.float64]:
+        t = np.arange(n) / RATE_HZ - 1
+        return multisine_rad(t) if multisine else sweep_rad(t)
+
+    return reference
 
 
 @pytest.fixture(scope="session")

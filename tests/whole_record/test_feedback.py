@@ -1,0 +1,125 @@
+"""Sessions under a controller that feeds the noise of the torque back into the motor."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from analysis.structures import STRUCTURES
+from analysis.whole_record import fit_record
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.feedback import following
+from rigd.beam import Beam, transfer
+
+RATE_HZ = 1000.0
+NOISE_NM = 1e-2
+CLAMP = 1e-5
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+
+
+def fit(measurement, name):
+    return fit_record(measurement, [STRUCTURES[name]]).fits[0]
+
+
+@cache
+def answers(n, damping):
+    """Of motor (2e-3 kg m², loop of 80 rad/s, one tick late) and beam to a torque, in Laplace."""
+    s = 5 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
+    turned = 500 * s * (s + 310) / (s + 80) ** 4 * np.exp(-s / RATE_HZ)
+    return turned, turned * (transfer(s, LINK, damping) + CLAMP * s**2)
+
+
+@pytest.fixture
+def controlled(sessions, plants, references):
+    """Let the sensor's noise move the motor, and the beam answer; the angle shows it all."""
+
+    def make(name, seed, *, multisine=False, **masks):
+        session = sessions(name, tool_inertia_kg_m2=CLAMP, multisine=multisine)
+        n = session.angle_rad.size
+        decay = np.exp(-5 * np.arange(n) / n)
+        noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=n)
+        spectrum = np.fft.rfft(noise * decay, 4 * n)
+        turned, answered = (
+            np.fft.irfft(spectrum * answer, 4 * n)[:n] / decay
+            for answer in answers(n, plants[name])
+        )
+        moved = replace(
+            session,
+            angle_rad=session.angle_rad + turned,
+            torque_nm=session.torque_nm + answered + noise,
+        )
+        return replace(moved.measured(**masks), reference_rad=references(n, multisine))
+
+    return make
+
+
+def deviates(found, name="tool_inertia_kg_m2", value=CLAMP):
+    return (found.parameters[name] - value) / found.std[name]
+
+
+def test_what_follows_is_found_through_a_lag_and_noise():
+    n, rng = 20_000, np.random.default_rng(1)
+    reference = rng.normal(size=n) * np.hanning(n)
+    lag = np.exp(-np.arange(200) / 10.0)
+    follows = np.convolve(reference, lag)[:n]
+    noise = rng.normal(size=n) * 0.3 * follows.std()
+    found = following(follows + noise, reference, 125.0)
+    assert np.std(found - follows) < 0.2 * noise.std()
+
+
+def test_an_angle_that_is_its_own_reference_follows_it_all():
+    angle = np.random.default_rng(2).normal(size=5000)
+    assert following(angle, angle, 125.0) == pytest.approx(angle, abs=1e-6)
+
+
+def test_nothing_follows_a_reference_that_stands_still():
+    assert not following(np.ones(500), np.zeros(500), 125.0).any()
+
+
+def test_noise_that_moves_the_motor_is_no_response(sessions, controlled):
+    """Against the same noise in the torque alone, which leaves nothing to chance."""
+    session = sessions("III", tool_inertia_kg_m2=CLAMP)
+    biased, unbiased = [], []
+    for seed in range(3):
+        noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=session.angle_rad.size)
+        alone = replace(session, torque_nm=session.torque_nm + noise).measured()
+        by_chance = deviates(fit(alone, "III"))
+        measured = controlled("III", seed)
+        biased.append(deviates(fit(replace(measured, reference_rad=None), "III")) - by_chance)
+        unbiased.append(deviates(fit(measured, "III")) - by_chance)
+    assert np.mean(biased) > 0.4
+    assert abs(np.mean(unbiased)) < 0.1
+
+
+def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
+    unknown = np.concatenate([np.arange(20_000, 20_050), np.arange(40_000, 60_000, 100)])
+    every = fit(controlled("III", 5), "III")
+    found = fit(controlled("III", 5, unknown_torque=unknown), "III")
+    for name, std in every.std.items():
+        if std:
+            assert abs(found.parameters[name] - every.parameters[name]) < 0.3 * std, name
+
+
+def test_a_reference_that_does_not_explain_the_angle_is_not_believed(sessions, references):
+    measured = sessions("III").measured()
+    other = np.random.default_rng(0).normal(size=measured.angle_rad.size)
+    comparison = Comparison.of(replace(measured, reference_rad=other), (0.0, 50.0))
+    plant = fit(measured, "III").plant
+    assert comparison.following_reference(plant) is comparison
+    explained = replace(measured, reference_rad=references(measured.angle_rad.size))
+    comparison = Comparison.of(explained, (0.0, 50.0))
+    assert comparison.following_reference(plant) is not comparison
+
+
+def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_parameters):
+    """It moves the motor there too: no response, no hum, and no other structure."""
+    measured = controlled("VI", 7, multisine=True)
+    found = fit_record(measured, [STRUCTURES[name] for name in ("III", "VI", "VII")])
+    third, sixth, seventh = found.fits
+    assert found.lines == ()
+    assert seventh.cost < third.cost - 100
+    assert abs(sixth.cost - seventh.cost) < 10  # its alpha is all but 1
+    for name, value in true_parameters("VI", tool_inertia_kg_m2=CLAMP).items():
+        if seventh.std[name]:
+            assert abs(deviates(seventh, name, value)) < 3.0, name
