@@ -1,6 +1,6 @@
 """Which structure a record supports, what it says of the orders, and what else is in it."""
 
-from analysis.selection.candidates import Candidate
+from analysis.selection.candidate import Candidate
 from analysis.selection.finding import Finding
 from analysis.selection.harmonics import Harmonic
 from analysis.selection.orders import OrderVerdict

@@ -1,4 +1,4 @@
-"""All structures fitted to one record under one noise, and what the information criteria say."""
+"""All structures fitted to one record under one noise, the lowest BIC first."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.selection.candidate import Candidate
 from analysis.selection.hum import without_leakage
-from analysis.selection.refit import Refit, adapted, vector
+from analysis.selection.refit import Refit
+from analysis.selection.restart import adapted, resonances_kept, vector
+from analysis.selection.visible import visible_modes
+from analysis.selection.whiteness import whiteness
 from analysis.structures import STRUCTURES
 from analysis.whole_record import SETTINGS, Plant, fit_record
 from analysis.whole_record.comparison import Comparison
@@ -26,8 +30,14 @@ if TYPE_CHECKING:
     from analysis.whole_record import Measurement, RecordAnalysis, RecordFit, Setting
 
 FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
-"""Structures also tried on a beam that is not uniform: those of a material of integer order. With
-a free order as well, the order would be read off what the stiffness leaves over."""
+"""Structures always tried on a beam that is not uniform: those of a material of integer order."""
+
+_FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
+"""Tried there as well if such a beam is the best. Then the modes' frequencies say nothing of the
+orders, only their damping does."""
+
+_DISMISSED: Final = 10.0
+"""Difference of BIC by which these must be better."""
 
 _CROSS_CHECKS: Final = 3
 _FEW: Final = 8
@@ -35,62 +45,11 @@ _FEW: Final = 8
 
 _MANY: Final = 40
 _NEARLY: Final = 1e-3
-_VISIBLE: Final = 20.0
-"""Power over that of the noise, at the peak of a mode that shows."""
+_MISSED: Final = 1e-5
+"""Share of a sum of squares, which is some 1e4; BIC counts a parameter as 9."""
 
-_NEAR: Final = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """One structure on one kind of beam, fitted.
-
-    Attributes
-    ----------
-    structure : Structure
-    uniform : bool
-        Whether all modes follow from one stiffness.
-    fit : RecordFit
-    columns : int
-        Parameters of what is not linear, beside those of the fit.
-    """
-
-    structure: Structure
-    uniform: bool
-    fit: RecordFit
-    columns: int = 0
-
-    @property
-    def parameters(self) -> int:
-        """Number of free parameters; the free decay's amplitudes, common to all, do not count."""
-        return len(self.fit.interval) + self.columns
-
-    @property
-    def values(self) -> int:
-        """Number of real values compared."""
-        fit = self.fit
-        decays = fit.ringing.degrees_of_freedom
-        return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns
-
-    @property
-    def deviance(self) -> float:
-        """``-2 ln`` likelihood but for a constant: noise of known shape and free level."""
-        return self.values * math.log(self.fit.cost / self.values)
-
-    @property
-    def bic(self) -> float:
-        """Schwarz, Annals of Statistics 6 (1978) 461-464."""
-        return self.deviance + self.parameters * math.log(self.values)
-
-    @property
-    def aic(self) -> float:
-        """Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723."""
-        return self.deviance + 2 * self.parameters
-
-    @property
-    def name(self) -> str:
-        """As tables call it."""
-        return self.structure.name if self.uniform else f"{self.structure.name}, modes free"
+_DOUBTFUL: Final = 0.01
+"""Probability of a residual's shape by chance, below which all modes are searched for anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,44 +90,32 @@ class Field:
             The record cannot be used.
         """
         uniform = fit_record(measurement, fixed=fixed, band_hz=band_hz)
-        comparison = Comparison.of(measurement, band_hz)
-        found = [(fit, True) for fit in uniform.fits]
-        analyses = [uniform]
-        likeliest = min(uniform.fits, key=lambda fit: fit.cost)
-        if len(visible_modes(comparison, _noise(uniform, comparison), likeliest)) > 1:
-            loose = fit_record(
-                measurement, FREE_STIFFNESS, fixed=fixed, band_hz=band_hz, uniform=False
-            )
-            found += [(fit, False) for fit in loose.fits]
-            analyses.append(loose)
-        reference = _closest(analyses)
-        estimated = _noise(reference, comparison)
-        closest = min(reference.fits, key=lambda fit: fit.cost)
-        noise = without_leakage(estimated, comparison, closest)
+        comparison = uniform.comparison
         field = cls(
             comparison=comparison,
-            noise=noise,
+            noise=_noise(uniform, comparison),
             free=tuple(name for name in SETTINGS if name not in fixed),
-            candidates=(),
+            candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
             columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
-        )
-        as_estimated = np.array_equal(noise.counts, estimated.counts)
-        own = {id(fit) for fit in reference.fits} if as_estimated else set()
-        field = replace(
-            field,
-            candidates=_ranked(
-                Candidate(fit.structure, is_uniform, fit)
-                if id(fit) in own
-                else field.candidate(fit.structure, is_uniform, fit.plant, _FEW)
-                for fit, is_uniform in found
-            ),
-        )
+        )._without_leakage()
+        likeliest = field.likeliest
+        if len(visible_modes(comparison, field.noise, likeliest)) > 1:
+            field = (
+                field._with_modes_free(likeliest)
+                if _all_but_white(field, likeliest)
+                else field._with_modes_searched(measurement, fixed, band_hz)
+            )
         return field.cross_checked()
 
     @property
     def best(self) -> Candidate:
         """The lowest BIC."""
         return self.candidates[0]
+
+    @property
+    def likeliest(self) -> RecordFit:
+        """The lowest sum of squares, however many parameters it took."""
+        return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
     def bic(self) -> float:
@@ -189,9 +136,19 @@ class Field:
     ) -> Refit:
         """Descend with one structure from a plant that has its damping."""
         unknowns = self.unknowns(structure, uniform)
-        at = vector(unknowns, start)
+        return self.descent(unknowns, vector(unknowns, start), max_evaluations)
+
+    def descent(
+        self, unknowns: Unknowns, start: NDArray[np.float64], max_evaluations: int
+    ) -> Refit:
+        """Descend from a vector of unknowns."""
         return Refit.descend(
-            self.comparison, unknowns, at, self.noise, self.columns, max_evaluations
+            self.comparison,
+            unknowns,
+            start,
+            self.noise,
+            self.columns,
+            max_evaluations=max_evaluations,
         )
 
     def candidate(
@@ -200,6 +157,46 @@ class Field:
         """Fit one structure from a plant."""
         refit = self.refit(structure, uniform, start, max_evaluations)
         return Candidate(structure, uniform, refit.fit(), len(self.columns))
+
+    def _without_leakage(self) -> Field:
+        """Leave out what hum beyond the band spoils."""
+        noise = without_leakage(self.noise, self.comparison, self.likeliest)
+        return self._under(noise) if noise is not self.noise else self
+
+    def _under(self, noise: Noise) -> Field:
+        """Fit again under a noise that differs a little."""
+        other = replace(self, noise=noise)
+        again = _ranked(
+            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW) for c in self.candidates
+        )
+        return replace(other, candidates=again)
+
+    def _with_modes_free(self, uniform: RecordFit) -> Field:
+        """Free the modes' stiffness from where a uniform beam explains the record."""
+        fits = {candidate.structure.name: candidate.fit for candidate in self.candidates}
+        found = []
+        for structure in FREE_STIFFNESS:
+            unknowns = self.unknowns(structure, uniform=False)
+            start = resonances_kept(unknowns, fits[structure.name], uniform.modes)
+            refit = self.descent(unknowns, start, _MANY)
+            found.append(Candidate(structure, False, refit.fit(), len(self.columns)))
+        return replace(self, candidates=_ranked((*self.candidates, *found)))
+
+    def _with_modes_searched(
+        self,
+        measurement: Measurement,
+        fixed: tuple[Setting, ...],
+        band_hz: tuple[float, float],
+    ) -> Field:
+        """Search for the modes wherever they are; the noise is that of the likelier beam."""
+        loose = fit_record(measurement, FREE_STIFFNESS, fixed=fixed, band_hz=band_hz, uniform=False)
+        found = tuple(Candidate(fit.structure, False, fit) for fit in loose.fits)
+        every = replace(self, candidates=(*self.candidates, *found))
+        noise, closest = _noise(loose, self.comparison), min(loose.fits, key=lambda f: f.cost)
+        common = noise.counts & self.noise.counts
+        if _deviance(noise, closest, common) > _deviance(self.noise, self.likeliest, common):
+            return every._under(self.noise)
+        return every._under(without_leakage(noise, self.comparison, closest))
 
     def cross_checked(self) -> Field:
         """Start each from where the best is: over a flat valley a search may miss what is there."""
@@ -223,14 +220,39 @@ class Field:
             return candidate
         unknowns = self.unknowns(structure, candidate.uniform)
         start = adapted(unknowns, other.fit.plant, other.structure)
-        given = (self.noise, self.columns)
-        first = Refit.descend(self.comparison, unknowns, start, *given, _FEW)
+        outlook = self.descent(unknowns, start, 1)
+        least = candidate.fit.cost * (1 - _MISSED)
+        if outlook.promised_cost > least:
+            return candidate
+        first = self.descent(unknowns, start, _FEW)
         if first.cost > candidate.fit.cost * (1 + _NEARLY):
             return candidate
-        found = Refit.descend(self.comparison, unknowns, first.x, *given, _MANY)
-        if found.cost > candidate.fit.cost * (1 - 1e-7):
+        found = self.descent(unknowns, first.x, _MANY)
+        if found.cost > least:
             return candidate
         return Candidate(structure, candidate.uniform, found.fit(), len(self.columns))
+
+    def with_orders_free(self) -> Field:
+        """Free the orders too on a beam that is not uniform, if that explains far more."""
+        best = self.best
+        needed = best.fit.cost * math.exp(-_DISMISSED / best.values)
+        refits = []
+        for structure in _FREE_ORDERS:
+            unknowns = self.unknowns(structure, uniform=False)
+            start = adapted(unknowns, best.fit.plant, best.structure)
+            first = self.descent(unknowns, start, _FEW)
+            if first.promised_cost < needed:
+                refits.append(self.descent(unknowns, first.x, _MANY))
+        if not refits:
+            return self
+        found = (
+            Candidate(refit.objective.unknowns.structure, False, refit.fit(), len(self.columns))
+            for refit in refits
+        )
+        freed = replace(self, candidates=_ranked((*self.candidates, *found)))
+        if freed.best.bic > best.bic - _DISMISSED:
+            return self
+        return freed._under(min(refits, key=lambda refit: refit.cost).noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
         """Fit all again, with what is not linear beside the beam."""
@@ -241,33 +263,20 @@ class Field:
         return replace(other, candidates=again).cross_checked()
 
 
-def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple[int, ...]:
-    """Modes at which the torque stands out of the noise."""
-    torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
-    over = np.abs(torque) ** 2 / noise.power
-    found = []
-    for mode in fit.modes:
-        near = np.abs(comparison.frequency_hz - mode.frequency_hz) < _NEAR * mode.frequency_hz
-        near &= noise.counts
-        if near.any() and float(np.median(over[near])) > _VISIBLE:
-            found.append(mode.number)
-    return tuple(found)
-
-
 def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
     return tuple(sorted(candidates, key=lambda candidate: candidate.bic))
 
 
-def _closest(analyses: list[RecordAnalysis]) -> RecordAnalysis:
-    """Find the analysis under whose noise the record is likeliest."""
-    common = np.logical_and.reduce([analysis.compared for analysis in analyses])
+def _deviance(noise: Noise, fit: RecordFit, bins: NDArray[np.bool_]) -> float:
+    """``-2 ln`` likelihood of a fit under its noise, in some of the bins."""
+    squares = float(np.sum(np.abs(fit.residual[bins]) ** 2))
+    return squares + 2 * float(np.sum(np.log(noise.power[bins])))
 
-    def deviance(analysis: RecordAnalysis) -> float:
-        best: RecordFit = min(analysis.fits, key=lambda fit: fit.cost)
-        squares = float(np.sum(np.abs(best.residual[common]) ** 2))
-        return squares + 2 * float(np.sum(np.log(analysis.noise_nm2_per_hz[common])))
 
-    return min(analyses, key=deviance)
+def _all_but_white(field: Field, fit: RecordFit) -> bool:
+    counts = field.noise.counts
+    found = whiteness(fit.residual[counts], field.comparison.frequency_hz[counts])
+    return found.probability > _DOUBTFUL and not found.loud
 
 
 def _noise(analysis: RecordAnalysis, comparison: Comparison) -> Noise:

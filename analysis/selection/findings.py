@@ -121,20 +121,30 @@ def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
 def unexplained(white: Whiteness, related: InputRelation) -> Finding:
     """Describe what remains and has no name."""
     low, high = white.loudest_hz
-    near = mains((low + high) / 2)
     if related.related:
+        where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
         what = (
-            "Part of what remains still follows the motor: linear dynamics that no structure has, "
-            f"most at {related.at_hz:.2f} Hz."
+            f"Part of the torque follows the motor, {where}, in a way that no uniform or nearly "
+            "uniform beam does: something else moves along."
         )
-        remedy = "Look for a second resonance: motor mount, clamp, cable."
+        remedy = (
+            "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "
+            "what stays belongs to the rig."
+        )
     else:
+        near = mains((low + high) / 2)
         what = (
-            "What remains is louder than the noise, most from "
-            f"{low:.2f} to {high:.2f} Hz ({white.loudest_ratio:.1f} times), and does not follow "
-            f"the motor: a disturbance{', as of the mains that come and go' if near else ''}."
+            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise from "
+            f"{low:.2f} to {high:.2f} Hz, and does not follow the motor: a disturbance"
+            f"{', as of the mains that come and go' if near else ''}."
+            if white.loud
+            else "What remains is not spread over the frequencies as the noise is (most from "
+            f"{low:.2f} to {high:.2f} Hz), and does not follow the motor."
         )
-        remedy = "Record with the motor at rest, to see whether it is always there."
+        remedy = (
+            "Record for as long with the motor held (rigd run hold): if it is there as well, look "
+            "for what else runs near by, and at the sensor's shield and earth."
+        )
     return Finding(
         kind="unexplained",
         sentence=f"{what} Until it is known, take intervals and orders with care.",

@@ -17,13 +17,18 @@ from analysis.selection.refit import Refit
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.selection.candidates import Candidate, Field
+    from analysis.selection.candidate import Candidate
+    from analysis.selection.candidates import Field
 
 _MOST_TERMS: Final = 2
 _ROUNDS: Final = 6
 _SETTLED: Final = 0.005
 _GAIN: Final = SURE**2 + 2 * math.log(30)
 """Deviance that a term must save: three forces on three modes and three rounds are tried."""
+
+_HINT: Final = 6.0
+"""Deviance that the most wanted term must promise before any is tried; chance promises as much in
+one record of ten."""
 
 _HOPELESS: Final = 2000.0
 """Deviance behind the best, to first order, from which no substitution leads back."""
@@ -55,7 +60,8 @@ def nonlinear_forces(
     """Add forces one by one while each saves far more than chance would; fit all anew with them.
 
     A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
-    order. Where the best candidate has these, the search also starts from those without.
+    order. Where the best candidate has these, the search also starts from those without. But even
+    then such a force leaves its trace, by which the best would gain; without one nothing is tried.
 
     Parameters
     ----------
@@ -70,6 +76,10 @@ def nonlinear_forces(
         The one given, if there is nothing.
     forces : tuple of NonlinearForce
     """
+    best = field.best
+    here = field.refit(best.structure, best.uniform, best.fit.plant)
+    if _gain(best, here.cost, _most_wanted(field, here, modes, [])[1]) < _HINT:
+        return field, ()
     for lead in _leads(field):
         found, forces = _added(field, lead, modes)
         if forces and found.bic < field.bic - STRONG and _explain(field, found):
@@ -96,12 +106,11 @@ def _added(
     here = field.refit(lead.structure, lead.uniform, lead.fit.plant)
     while len(terms) < _MOST_TERMS:
         term, cost = _most_wanted(field, here, modes, terms)
-        behind = best.values * math.log(cost / best.fit.cost)
-        gain = best.values * math.log(here.cost / cost)
-        if term is None or gain < _GAIN or behind > _HOPELESS:
+        behind = _gain(best, cost, best.fit.cost)
+        if term is None or _gain(best, here.cost, cost) < _GAIN or behind > _HOPELESS:
             break
         tried, more, more_std = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
-        if best.values * math.log(here.cost / tried.cost) < _GAIN:
+        if _gain(best, here.cost, tried.cost) < _GAIN:
             break
         terms.append(term)
         here, sizes, std = tried, more, more_std
@@ -110,6 +119,11 @@ def _added(
     every = field.with_columns(here.columns, here.noise_here())
     forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
     return every, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
+
+
+def _gain(candidate: Candidate, before: float, after: float) -> float:
+    """Deviance saved between two sums of squares."""
+    return candidate.values * math.log(before / after)
 
 
 def _most_wanted(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
-    from analysis.selection.candidates import Candidate, Field
+    from analysis.selection.candidate import Candidate
+    from analysis.selection.candidates import Field
     from analysis.selection.profile import Order, Profile
 
 Status = Literal["integer", "fractional", "not supported", "not identifiable", "absent"]
@@ -16,6 +18,9 @@ STRONG: Final = 10.0
 Statistical Association 90 (1995) 773-795); below `EVEN` the data do not tell the two apart."""
 
 EVEN: Final = 6.0
+BARE: Final = 2.0
+"""Difference of BIC "not worth more than a bare mention" (the same): none is preferred."""
+
 _MODES_FOR_ALPHA: Final = 2
 
 
@@ -81,8 +86,8 @@ def _status(field: Field, profile: Profile, visible: tuple[int, ...], *, adequat
     if profile.admits_one:
         return "integer"
     if order not in best.fit.interval:
-        undecided = any(order in rival.fit.interval for rival in rivals(field, EVEN))
-        return "not supported" if undecided else "integer"
+        freed = math.log(best.values) - profile.gain
+        return "integer" if freed > BARE else "not supported"
     if not adequate or any(_integer(rival, order) for rival in rivals(field, STRONG)):
         return "not supported"
     return "fractional"

@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.selection.refit import Refit, adapted
+from analysis.selection.refit import Refit
+from analysis.selection.restart import adapted
 from analysis.structures import PARAMETERS, Structure
 from analysis.unknowns import ORDER_RANGE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.selection.candidates import Candidate, Field
+    from analysis.selection.candidate import Candidate
+    from analysis.selection.candidates import Field
 
 Order = Literal["alpha", "lambda"]
 
@@ -27,9 +29,19 @@ WIDEST_SHARE: Final = 0.25
 """Of the range 0 to 2: an order known to no better than ±0.25 tells no material from another."""
 
 _FAR: Final = 25.0
+_BEYOND: Final = 1.04
+"""How much further a step goes than to where it should reach a deviance."""
+
 _FIRST_STEP: Final = 0.02
-_GROWTH: Final = 2.0
+_SHORTEST: Final = 1.2
+_LONGEST: Final = 2.6
 _MAX_EVALUATIONS: Final = 30
+_TOLERANCE: Final = 1e-6
+"""Of the sum of squares: a hundredth in the deviance."""
+
+_NARROW: Final = 1.1
+"""Between two roots of a deviance: it is straight enough there to say where it is crossed."""
+
 _SHARPENINGS: Final = 2
 
 
@@ -53,6 +65,8 @@ class Profile:
         95 %, by the likelihood ratio; where it is open it ends at the edge of the range.
     open_below, open_above : bool
         Whether the record excludes no value on that side.
+    gain : float
+        Deviance that the structure saves by freeing the order; 0 if it was free.
     """
 
     order: Order
@@ -63,6 +77,7 @@ class Profile:
     interval: tuple[float, float]
     open_below: bool
     open_above: bool
+    gain: float
 
     @property
     def share(self) -> float:
@@ -80,15 +95,13 @@ class Profile:
         return self.interval[0] <= 1 <= self.interval[1]
 
 
-def with_order(structure: Structure, order: Order, value: float | None) -> Structure:
-    """Take a structure's damping with one order free, or held at a value.
+def with_order(structure: Structure, order: Order) -> Structure:
+    """Take a structure's damping with one order free.
 
     Damping that the structure lacks comes in, its coefficient free.
     """
     coefficient = "zeta" if order == "alpha" else "gamma"
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
-    if value is not None:
-        fixed[order] = value
     free = tuple(name for name in PARAMETERS if name not in fixed)
     return Structure(structure.name, free, MappingProxyType(fixed))
 
@@ -96,8 +109,9 @@ def with_order(structure: Structure, order: Order, value: float | None) -> Struc
 def profile(field: Field, candidate: Candidate, order: Order) -> Profile:
     """Walk away from the minimum both ways until the record excludes what lies beyond.
 
-    The steps double; each refit starts from the last. So the interval is that round the minimum,
-    and a second valley beyond a deviance of 25 is not looked for: `Field` has searched the range.
+    Each refit starts on the tangent of the last, and each step goes to where the deviance, were it
+    a parabola, would reach the next level. So the interval is that round the minimum, and a second
+    valley beyond a deviance of 25 is not looked for: `Field` has searched the range.
 
     Parameters
     ----------
@@ -107,9 +121,8 @@ def profile(field: Field, candidate: Candidate, order: Order) -> Profile:
     order : str
     """
     walk = _Walk(field, candidate, order)
-    centre, step = walk.start()
     for sign in (-1.0, 1.0):
-        walk.outwards(centre, sign * step)
+        walk.outwards(sign)
     values = np.array(sorted(walk.costs))
     costs = np.array([walk.costs[value] for value in values])
     deviance = candidate.values * np.log(costs / costs.min())
@@ -125,6 +138,9 @@ def profile(field: Field, candidate: Candidate, order: Order) -> Profile:
         interval=(low, high),
         open_below=open_below,
         open_above=open_above,
+        gain=0.0
+        if order in candidate.structure.free
+        else candidate.values * math.log(max(candidate.fit.cost / costs.min(), 1.0)),
     )
 
 
@@ -132,80 +148,85 @@ class _Walk:
     """Refits with one order held, and what they cost."""
 
     def __init__(self, field: Field, candidate: Candidate, order: Order) -> None:
-        self.field, self.candidate, self.order = field, candidate, order
-        self.costs: dict[float, float] = {}
-        self._at: dict[float, Refit] = {}
-        self._first: Refit | None = None
-
-    def start(self) -> tuple[float, float]:
-        """Minimum with the order free, and its standard deviation or what stands for it."""
-        structure = with_order(self.candidate.structure, self.order, None)
-        candidate = self.candidate
-        unknowns = self.field.unknowns(structure, candidate.uniform)
+        self.order = order
+        self._field, self._values = field, candidate.values
+        structure = with_order(candidate.structure, order)
+        self._unknowns = unknowns = field.unknowns(structure, candidate.uniform)
+        self._place = unknowns.names.index(order)
         seed = adapted(unknowns, candidate.fit.plant, candidate.structure)
-        found = self._descend(structure, seed)
-        damping = found.plant.damping
-        centre = damping.alpha if self.order == "alpha" else damping.lambda_
-        std = found.fit().std[self.order]
-        self.costs[centre] = found.cost
-        self._first = found
-        return centre, min(max(std or _FIRST_STEP, 1e-4), 0.25)
+        self._first = first = field.descent(unknowns, seed, _MAX_EVALUATIONS)
+        self._centre = float(first.x[self._place])
+        self.costs: dict[float, float] = {self._centre: first.cost}
+        self._at: dict[float, Refit] = {self._centre: first}
 
-    def outwards(self, centre: float, step: float) -> None:
-        """Cross the threshold, sharpen the crossing, and go on for a little of the curve."""
+    def outwards(self, sign: float) -> None:
+        """Cross the threshold, go on for a little of the curve, and sharpen the crossing."""
         low, high = ORDER_RANGE
-        last, here = self._first, centre
-        lowest = self.costs[centre]
-        inside, outside = centre, None
-        while low < here < high:
-            here = min(max(here + step, low), high)
-            step *= _GROWTH
-            last = self._hold(here, last)
-            deviance = self._deviance(here, lowest)
-            if deviance < CHI_SQUARE_95:
-                inside = here
-            elif outside is None:
-                outside = here
-            if deviance > _FAR:
-                break
+        here, distance, root = self._centre, self._spread(), 0.0
+        inside, outside = here, None
+        while low < here < high and root**2 < _FAR:
+            near = self._at[here]
+            here = min(max(self._centre + sign * distance, low), high)
+            root = self._hold(here, near)
+            if root**2 < CHI_SQUARE_95:
+                inside, level = here, CHI_SQUARE_95
+            else:
+                outside, level = outside if outside is not None else here, _FAR
+            growth = _BEYOND * math.sqrt(level) / max(root, 1e-3)
+            distance *= min(max(growth, _SHORTEST), _LONGEST)
         for _ in range(_SHARPENINGS if outside is not None else 0):
             assert outside is not None
-            middle = _between(
-                inside,
-                outside,
-                self._deviance(inside, lowest),
-                self._deviance(outside, lowest),
-            )
-            self._hold(middle, self._at.get(inside, self._first))
-            if self._deviance(middle, lowest) < CHI_SQUARE_95:
+            below, above = self._root(inside), self._root(outside)
+            if above - below < _NARROW:
+                break
+            middle = _between(inside, outside, below**2, above**2)
+            if self._hold(middle, self._at[inside]) ** 2 < CHI_SQUARE_95:
                 inside = middle
             else:
                 outside = middle
 
-    def _deviance(self, value: float, lowest: float) -> float:
-        return self.candidate.values * math.log(self.costs[value] / lowest)
+    def _spread(self) -> float:
+        """Give the standard deviation of the order, or what stands for it."""
+        hessian, place = self._first.equations.hessian, self._place
+        scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+        scaled = hessian / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
+        variance = np.linalg.inv(scaled)[place, place] / scale[place] ** 2
+        std = math.sqrt(variance * self._first.cost / self._values) if variance > 0 else _FIRST_STEP
+        return min(max(std, 1e-4), 0.25)
 
-    def _hold(self, value: float, near: Refit | None) -> Refit:
-        """Fit all else with the order at `value`."""
-        assert near is not None
-        structure = with_order(self.candidate.structure, self.order, value)
-        before = near.objective.unknowns
-        start = dict(zip(before.names, near.x.tolist(), strict=True))
-        unknowns = self.field.unknowns(structure, self.candidate.uniform)
-        found = self._descend(structure, np.array([start[name] for name in unknowns.names]))
-        self.costs[value], self._at[value] = found.cost, found
-        return found
+    def _root(self, value: float) -> float:
+        """Root of the deviance at a value."""
+        lowest = self.costs[self._centre]
+        return math.sqrt(max(self._values * math.log(self.costs[value] / lowest), 0.0))
 
-    def _descend(self, structure: Structure, start: NDArray[np.float64]) -> Refit:
-        field = self.field
-        return Refit.descend(
+    def _hold(self, value: float, near: Refit) -> float:
+        """Fit all else with the order at `value`; give the root of the deviance."""
+        field = self._field
+        found = Refit.descend(
             field.comparison,
-            field.unknowns(structure, self.candidate.uniform),
-            start,
+            self._unknowns,
+            self._tangent(value, near),
             field.noise,
             field.columns,
-            _MAX_EVALUATIONS,
+            max_evaluations=_MAX_EVALUATIONS,
+            relative_tolerance=_TOLERANCE,
+            hold=self.order,
         )
+        self.costs[value], self._at[value] = found.cost, found
+        return self._root(value)
+
+    def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
+        """Where all else would be with the order at `value`, to first order, shape (k,)."""
+        x, hessian, place = near.x.copy(), near.equations.hessian, self._place
+        lower, upper = self._unknowns.bounds
+        scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
+        others = (x > lower) & (x < upper) & (np.arange(x.size) != place)
+        scaled = hessian / np.outer(scale, scale)
+        block = scaled[np.ix_(others, others)] + 1e-9 * np.eye(int(others.sum()))
+        slope = -np.linalg.solve(block, scaled[others, place]) / scale[others] * scale[place]
+        x[others] += slope * (value - x[place])
+        x[place] = value
+        return x
 
 
 def _crossing(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, bool]:

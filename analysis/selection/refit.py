@@ -6,97 +6,27 @@ column of known shape and unknown size, which is projected out like the free dec
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.levenberg_marquardt import minimise
+from analysis.levenberg_marquardt import NormalEquations, minimise
 from analysis.whole_record.noise import Noise, smooth_power
 from analysis.whole_record.objective import Linearisation, Objective
 from analysis.whole_record.summary import summary
-from analysis.whole_record.unknowns import Unknowns
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.structures import Structure
     from analysis.whole_record import Plant, RecordFit
     from analysis.whole_record.comparison import Comparison
+    from analysis.whole_record.unknowns import Unknowns
 
 _TOLERANCE: Final = 1e-8
 """Of the sum of squares, which is some 1e4: a ten-thousandth of what BIC tells apart."""
 
 _FILLINGS: Final = 3
-_SMALL: Final = 1e-5
-"""Loss, relative to stiffness or inertia, at which a damping is brought in."""
-
-
-def vector(unknowns: Unknowns, plant: Plant) -> NDArray[np.float64]:
-    """Unknowns of a plant, shape (k,): the way back of `Unknowns.plant`.
-
-    Parameters
-    ----------
-    unknowns : Unknowns
-    plant : Plant
-        With damping wherever the structure has some.
-    """
-    damping, nominal = plant.damping, unknowns.nominal
-    first, second = unknowns.omega_rad_s
-    ratio = plant.beam.density_over_stiffness
-    at = {
-        "alpha": damping.alpha,
-        "lambda": damping.lambda_,
-        "density_over_stiffness": math.log(ratio / nominal.beam.density_over_stiffness),
-        "bending_stiffness_n_m2": math.log(
-            plant.beam.bending_stiffness_n_m2 / nominal.beam.bending_stiffness_n_m2
-        ),
-        "delay_s": plant.delay_s * 1e3,
-        "tool_inertia_kg_m2": plant.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
-        **{
-            name: value
-            for name, value in plant.parameters.items()
-            if name.startswith("stiffness_offset")
-        },
-    }
-    if unknowns.structure.internal:
-        size = damping.zeta * second**damping.alpha
-        turn = math.pi / 2 * damping.alpha
-        at["zeta"] = math.log(size * math.sin(turn))
-        stiffening = math.log(abs(1 + size * complex(math.cos(turn), math.sin(turn))))
-        at["density_over_stiffness"] -= stiffening
-        at["bending_stiffness_n_m2"] += stiffening
-    if unknowns.structure.external:
-        size = damping.gamma / ratio * first ** (damping.lambda_ - 2)
-        turn = math.pi / 2 * damping.lambda_
-        at["gamma"] = math.log(size * math.sin(turn))
-        at["density_over_stiffness"] += math.log(
-            abs(1 - size * complex(math.cos(turn), math.sin(turn)))
-        )
-    return np.array([at.get(name, 0.0) for name in unknowns.names])
-
-
-def adapted(unknowns: Unknowns, plant: Plant, of: Structure) -> NDArray[np.float64]:
-    """Start for one structure at the plant that another found, shape (k,).
-
-    Damping keeps its size at the first two modes where its order changes; damping that the other
-    lacks comes in small, of order 1.
-
-    Parameters
-    ----------
-    unknowns : Unknowns
-        Of the one.
-    plant : Plant
-    of : Structure
-        The other.
-    """
-    own = Unknowns(of, unknowns.nominal, unknowns.free, unknowns.offsets, unknowns.omega_rad_s)
-    start = dict(zip(own.names, vector(own, plant).tolist(), strict=True))
-    for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
-        start.setdefault(coefficient, math.log(_SMALL))
-        start.setdefault(order, 1.0)
-    return np.array([start[name] for name in unknowns.names])
 
 
 class WithColumns(Objective):
@@ -126,10 +56,21 @@ class WithColumns(Objective):
 
 @dataclass(frozen=True, slots=True)
 class Refit:
-    """A minimum: where, of which sum of squares, under which noise."""
+    """A minimum: where, of which sum of squares, under which noise.
+
+    Attributes
+    ----------
+    objective : Objective
+    x : ndarray, shape (k,)
+    equations : NormalEquations
+        At `x`.
+    noise : Noise
+    columns : ndarray of complex, shape (c, K)
+    """
 
     objective: Objective
     x: NDArray[np.float64]
+    equations: NormalEquations
     noise: Noise
     columns: NDArray[np.complex128]
 
@@ -141,7 +82,10 @@ class Refit:
         start: NDArray[np.float64],
         noise: Noise,
         columns: NDArray[np.complex128] | None = None,
+        *,
         max_evaluations: int = 60,
+        relative_tolerance: float = _TOLERANCE,
+        hold: str | None = None,
     ) -> Refit:
         """Descend from `start`, unknown torques being put as they are predicted there.
 
@@ -154,30 +98,44 @@ class Refit:
         columns : ndarray of complex, shape (c, K), or None
             Spectra to be projected out beside the free decay.
         max_evaluations : int
-            Of the sum of squares.
+            Of the sum of squares; with 1 nothing moves.
+        relative_tolerance : float
+            As `minimise` takes it.
+        hold : str, optional
+            An unknown that stays where it starts.
         """
         none = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         further = none if columns is None else columns
         lower, upper = unknowns.bounds
         x = np.clip(start, lower, upper)
+        if hold is not None:
+            place = unknowns.names.index(hold)
+            lower[place] = upper[place] = x[place]
         complete = bool(comparison.measurement.torque_known.all())
         for _ in range(1 if complete else _FILLINGS):
-            filled = comparison.filled(unknowns.plant(x))
-            objective = WithColumns(filled, unknowns, further)
-            x = minimise(
-                lambda at, objective=objective: objective.normal_equations(at, noise.weight),  # type: ignore[misc]
-                x,
-                lower,
-                upper,
-                relative_tolerance=_TOLERANCE,
-                max_evaluations=max_evaluations,
-            ).x
-        return cls(objective, x, noise, further)
+            objective = WithColumns(comparison.filled(unknowns.plant(x)), unknowns, further)
+            x, equations = _lowest(
+                objective, x, (lower, upper), noise.weight, relative_tolerance, max_evaluations
+            )
+        return cls(objective, x, equations, noise, further)
 
     @property
     def cost(self) -> float:
         """Sum of squares here."""
-        return self.objective.normal_equations(self.x, self.noise.weight).cost
+        return self.equations.cost
+
+    @property
+    def promised_cost(self) -> float:
+        """What it would be at the minimum, as far as can be seen from here."""
+        lower, upper = self.objective.unknowns.bounds
+        gradient, hessian = self.equations.gradient, self.equations.hessian
+        held = ((self.x <= lower) & (gradient > 0)) | ((self.x >= upper) & (gradient < 0))
+        free = ~held & (np.diag(hessian) > 0)
+        scale = np.sqrt(np.diag(hessian)[free])
+        slope = gradient[free] / scale
+        scaled = hessian[np.ix_(free, free)] / np.outer(scale, scale)
+        step = np.linalg.solve(scaled + 1e-12 * np.eye(scale.size), slope)
+        return max(self.cost - float(slope @ step), 0.0)
 
     @property
     def plant(self) -> Plant:
@@ -226,3 +184,28 @@ class Refit:
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         share = self.objective.comparison.measurement.torque_share
         return replace(self.noise, power=smooth_power(residual) / share)
+
+
+def _lowest(
+    objective: Objective,
+    start: NDArray[np.float64],
+    bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
+    weight: NDArray[np.float64],
+    relative_tolerance: float,
+    max_evaluations: int,
+) -> tuple[NDArray[np.float64], NormalEquations]:
+    """Descend, and keep the normal equations of where that ended."""
+    seen: dict[bytes, NormalEquations] = {}
+
+    def problem(x: NDArray[np.float64]) -> NormalEquations:
+        seen[x.tobytes()] = equations = objective.normal_equations(x, weight)
+        return equations
+
+    found = minimise(
+        problem,
+        start,
+        *bounds,
+        relative_tolerance=relative_tolerance,
+        max_evaluations=max_evaluations,
+    )
+    return found.x, seen[found.x.tobytes()]

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analysis.selection import sentences
-from analysis.selection.candidates import Candidate, Field, visible_modes
+from analysis.selection.candidates import Field
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
 from analysis.selection.nonlinear_search import nonlinear_forces
 from analysis.selection.orders import EVEN, order_verdict, rivals
 from analysis.selection.profile import profile
 from analysis.selection.verdict import Row, Verdict
+from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import InputRelation, Whiteness, input_relation, whiteness
 from analysis.whole_record import RecordAnalysis
 from analysis.whole_record.estimate import BAND_HZ
@@ -20,6 +21,7 @@ from analysis.whole_record.estimate import BAND_HZ
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from analysis.selection.candidate import Candidate
     from analysis.whole_record import Measurement, RecordFit, Setting
 
 
@@ -55,9 +57,9 @@ def select(
     """Choose the structure that a record supports, and say what is known.
 
     All structures are fitted under one spectrum of the noise, on a uniform beam, and those of
-    integer internal order also with the modes' stiffness free. The lowest BIC is selected. If
-    restoring forces that are not linear save far more than chance would, all are fitted again with
-    these beside the beam.
+    integer internal order also with the modes' stiffness free; if one of those is the best, its
+    orders are freed as well. The lowest BIC is selected. If restoring forces that are not linear
+    save far more than chance would, all are fitted again with these beside the beam.
 
     Parameters
     ----------
@@ -76,6 +78,8 @@ def select(
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = nonlinear_forces(linear, visible)
+    if not field.best.uniform:
+        field = field.with_orders_free()
     white, related = _tests(field)
     comparison, fit = field.comparison, field.best.fit
     multiples = harmonics(
@@ -99,8 +103,8 @@ def select(
     }
     said = [
         *sentences.selected(field, close, (alpha, lambda_), adequate=adequate),
-        sentences.order(alpha, visible),
-        sentences.order(lambda_, visible),
+        sentences.order(alpha, visible, adequate=adequate),
+        sentences.order(lambda_, visible, adequate=adequate),
         *(finding.sentence for finding in found),
     ]
     best = field.best
@@ -138,6 +142,7 @@ def _analysis(field: Field) -> RecordAnalysis:
         compared=noise.counts,
         noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
         lines=noise.lines,
+        comparison=comparison,
     )
 
 

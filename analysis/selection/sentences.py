@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from analysis.selection.candidates import Candidate, Field
+    from analysis.selection.candidate import Candidate
+    from analysis.selection.candidates import Field
     from analysis.selection.finding import Finding
     from analysis.selection.orders import OrderVerdict
 
@@ -49,16 +50,17 @@ def selected(
         others = [c for c in field.candidates[1:] if c.structure is not best.structure]
         if others:
             next_best = others[0]
+            behind = next_best.bic - best.bic
             said.append(
-                f"The next, type {next_best.name}, is worse by {next_best.bic - best.bic:.3g} in "
-                "BIC."
+                f"The next, type {next_best.name}, is worse by "
+                f"{behind:.{0 if behind > 100 else 1}f} in BIC (10 would be clear)."
             )
     if adequate:
         said.append("What it leaves is noise: nothing in the record asks for more.")
     return said
 
 
-def order(verdict: OrderVerdict, visible: tuple[int, ...]) -> str:
+def order(verdict: OrderVerdict, visible: tuple[int, ...], *, adequate: bool) -> str:
     """Say what is known of one order."""
     profile = verdict.profile
     low, high = profile.interval
@@ -89,10 +91,14 @@ def order(verdict: OrderVerdict, visible: tuple[int, ...]) -> str:
         )
     if verdict.status == "fractional":
         return f"The order {name} of the {of} is {profile.estimate:.3f} ({ends}); 1 is excluded."
+    but = (
+        "a structure of order 1 explains the record about as well"
+        if adequate
+        else "part of the record is unexplained"
+    )
     return (
         f"The order {name} of the {of} stays open: {profile.estimate:.3f} would fit ({ends}), but "
-        "so would an explanation of order 1, or part of the record is unexplained. It is not "
-        "reported."
+        f"{but}. It is not reported."
     )
 
 

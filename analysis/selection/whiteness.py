@@ -24,10 +24,16 @@ _LOUD: Final = 1.4
 """Power over that of the noise, which is itself known to 10-20 % only."""
 
 _COHERENT_BINS: Final = 9
+_DRIVEN: Final = 0.1
+"""Power of the angle relative to what is usual round it, from which a bin counts as driven."""
+
 _LOUDEST: Final = 4.0
 """Where the whitened residual is limited: chance exceeds it once in 3000 bins."""
 
 _LONGEST_LAG_S: Final = 1.0
+
+_NEIGHBOURS: Final = 64
+"""Bins over which the angle's power is averaged: more than lie between two lines of a multisine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +76,12 @@ class InputRelation:
     Attributes
     ----------
     coherence : float
-        Largest squared coherence of residual and angle over nine neighbouring bins.
+        Squared coherence of residual and angle over nine neighbouring bins, where it is least
+        likely to be chance.
     at_hz : float
         Where.
+    local : bool
+        Whether chance is ruled out there.
     deviate : float
         Of the coherence over the whole band, in standard deviations beyond chance.
     correlation : float
@@ -85,6 +94,7 @@ class InputRelation:
 
     coherence: float
     at_hz: float
+    local: bool
     deviate: float
     correlation: float
     lag_s: float
@@ -148,37 +158,46 @@ def input_relation(
     frequency_hz : ndarray, shape (K,)
         Equally spaced.
     """
-    turn = angle / np.maximum(np.abs(angle), np.finfo(float).tiny)
+    # Where the motor was not driven, the angle is what the loop makes of the torque's noise: such
+    # bins would say that the residual follows the angle, and count for next to nothing here.
+    power = np.abs(angle) ** 2
+    around = np.convolve(power, np.full(_NEIGHBOURS, 1 / _NEIGHBOURS), mode="same")
+    driven = angle / np.sqrt(np.maximum(around, np.finfo(float).tiny))
     # A hum is no linear dynamics, however loud.
-    cross = residual * turn.conj() / np.maximum(np.abs(residual) / _LOUDEST, 1.0)
+    limited = residual / np.maximum(np.abs(residual) / _LOUDEST, 1.0)
+    cross = limited * driven.conj()
     blocks = residual.size // _COHERENT_BINS
-    grouped = cross[: blocks * _COHERENT_BINS].reshape(blocks, _COHERENT_BINS)
-    # With the input of one size throughout, under chance (1 - coherence)^(m - 1) is uniform.
-    power = np.sum(np.abs(grouped) ** 2, axis=1)
-    together = np.abs(np.sum(grouped, axis=1)) ** 2
-    coherence = together / np.maximum(_COHERENT_BINS * power, np.finfo(float).tiny)
+    first = np.arange(0, blocks * _COHERENT_BINS, _COHERENT_BINS)
+
+    def added(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        total: NDArray[np.complex128] = np.add.reduceat(values[: blocks * _COHERENT_BINS], first)
+        return total
+
+    of_angle = added(driven * driven.conj()).real
+    used = np.flatnonzero(of_angle > _DRIVEN * _COHERENT_BINS)
+    most = added(limited * limited.conj()).real[used] * of_angle[used]
+    coherence = np.abs(added(cross)[used]) ** 2 / np.maximum(most, np.finfo(float).tiny)
+    # Under chance (1 - coherence)^(m - 1) is uniform, whatever the angle.
     surprise = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
     worst = int(np.argmax(surprise))
-    deviate = of_chi_square(2 * float(surprise.sum()), 2 * blocks)
+    local = bool(surprise[worst] > largest_of(used.size))
+    deviate = of_chi_square(2 * float(surprise.sum()), 2 * used.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
     length = 4 * residual.size
     lags = np.fft.ifft(cross, length)
     at_s = np.fft.fftfreq(length, spacing_hz)  # bins are spaced as the lags' inverse
     carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
-    correlation = np.abs((lags * carrier).real) * length / math.sqrt(residual.size)
+    correlation = np.abs((lags * carrier).real) * length / np.linalg.norm(driven)
     correlation[np.abs(at_s) > _LONGEST_LAG_S] = 0.0
     at = int(np.argmax(correlation))
     tried = int(np.count_nonzero(correlation))
     return InputRelation(
         coherence=float(coherence[worst]),
-        at_hz=float(frequency_hz[worst * _COHERENT_BINS + _COHERENT_BINS // 2]),
+        at_hz=float(frequency_hz[first[used[worst]] + _COHERENT_BINS // 2]),
+        local=local,
         deviate=deviate,
         correlation=float(correlation[at]),
         lag_s=float(at_s[at]),
-        related=bool(
-            deviate > SURE
-            or surprise[worst] > largest_of(blocks)
-            or correlation[at] ** 2 / 2 > largest_of(tried)
-        ),
+        related=bool(local or deviate > SURE or correlation[at] ** 2 / 2 > largest_of(tried)),
     )

@@ -8,11 +8,12 @@ import pytest
 from analysis.selection import select
 from analysis.selection.candidates import Field
 from analysis.selection.orders import EVEN
-from analysis.selection.profile import CHI_SQUARE_95, with_order
-from analysis.selection.refit import vector
-from analysis.structures import STRUCTURES
+from analysis.selection.profile import CHI_SQUARE_95
+from analysis.selection.restart import resonances_kept, vector
+from analysis.structures import STRUCTURES, Structure
 from analysis.whole_record import SETTINGS
 from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.free_decay import mode_poles
 from analysis.whole_record.noise import Noise
 from rigd.beam import Beam
 
@@ -153,12 +154,37 @@ def test_a_beam_that_is_not_uniform_is_no_fractional_order(field):
     assert fit.parameters["stiffness_offset_3"] == pytest.approx(-0.013, abs=1e-3)
 
 
+def test_a_fractional_order_on_a_beam_that_is_not_uniform(sessions):
+    made = sessions("IV", offsets=(0.006, -0.013))
+    verdict = select(made.measured(noise_nm=NOISE_NM, seed=47)).verdict
+    assert (verdict.structure, verdict.uniform, verdict.adequate) == ("IV", False, True)
+    assert kinds(verdict) == {"not uniform"}
+    assert verdict.alpha.status == "fractional"
+    low, high = verdict.alpha.interval
+    assert abs(verdict.alpha.value - 0.8) < 4 * (high - low) / (2 * 1.96)
+    assert verdict.lambda_.status == "absent"
+
+
 def test_unknowns_of_a_plant_lead_back_to_it(field):
     for candidate in field.candidates:
         unknowns = field.unknowns(candidate.structure, candidate.uniform)
         back = unknowns.plant(vector(unknowns, candidate.fit.plant)).parameters
         for name, value in candidate.fit.parameters.items():
             assert back[name] == pytest.approx(value, rel=1e-9, abs=1e-15), name
+
+
+def test_a_beam_freed_of_being_uniform_keeps_its_resonances(field):
+    """Type VI passes for the modes' offsets by its order: without it they must take its place."""
+    fits = {c.name: c.fit for c in field.candidates}
+    assert abs(fits["VI"].parameters["alpha"] - 1) > 0.3
+    modes = fits["VI"].modes
+    unknowns = field.unknowns(STRUCTURES["III"], uniform=False)
+    x = resonances_kept(unknowns, fits["III"], modes)
+    start = unknowns.plant(x)
+    assert start.damping.alpha == 1
+    after = [pole.at_rad_s.imag for pole in mode_poles(start, 3, ())]
+    assert after == pytest.approx([2 * np.pi * mode.frequency_hz for mode in modes], rel=2e-4)
+    assert field.descent(unknowns, x, 40).cost == pytest.approx(field.best.fit.cost, rel=1e-6)
 
 
 def test_a_refit_at_the_minimum_stays_there(field):
@@ -176,7 +202,7 @@ def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sess
     field = Field(comparison, noise, SETTINGS, type_iii.candidates, nothing)
     costs = []
     for value in (profile.estimate, *profile.interval):
-        held = with_order(STRUCTURES["III"], "alpha", value)
+        held = Structure("III", ("zeta", "gamma"), {"alpha": value, "lambda": 1.0})
         costs.append(field.refit(held, True, field.best.fit.plant).cost)
     deviance = field.best.values * np.log(np.array(costs) / costs[0])
     assert deviance[1:] == pytest.approx(CHI_SQUARE_95, rel=0.05)

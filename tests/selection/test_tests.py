@@ -76,10 +76,23 @@ def test_linear_dynamics_that_remain_are_told_from_noise_and_hum():
     left = 8 * angle / np.abs(angle).max() * resonance / np.abs(resonance).max()
     found = input_relation(noise(5) + left, angle, HZ)
     assert found.related
+    assert found.local
     assert found.at_hz == pytest.approx(20.0, abs=0.4)
     hum = noise(6)
     hum[3200:3203] += 300
     assert not input_relation(hum, angle, HZ).related
+
+
+def test_noise_that_the_loop_feeds_back_is_no_dynamics():
+    """Between the lines of a multisine the motor only follows the noise of the torque."""
+    for seed in range(20):
+        residual = noise(seed)
+        angle = 0.1 * residual * np.exp(2j * np.pi * HZ * 0.01) + 0.3 * noise(seed + 100)
+        angle[::16] += 50 * noise(seed + 200)[::16]
+        assert not input_relation(residual, angle, HZ).related
+    driven = angle[::16]
+    residual[::16] += driven / np.abs(driven) * 0.8
+    assert input_relation(residual, angle, HZ).related
 
 
 def test_an_echo_is_found_with_its_lag():

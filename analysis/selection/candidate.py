@@ -1,0 +1,63 @@
+"""One structure fitted to one record, and what the information criteria say of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analysis.structures import Structure
+    from analysis.whole_record import RecordFit
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One structure on one kind of beam, fitted.
+
+    Attributes
+    ----------
+    structure : Structure
+    uniform : bool
+        Whether all modes follow from one stiffness.
+    fit : RecordFit
+    columns : int
+        Parameters of what is not linear, beside those of the fit.
+    """
+
+    structure: Structure
+    uniform: bool
+    fit: RecordFit
+    columns: int = 0
+
+    @property
+    def parameters(self) -> int:
+        """Number of free parameters; the free decay's amplitudes, common to all, do not count."""
+        return len(self.fit.interval) + self.columns
+
+    @property
+    def values(self) -> int:
+        """Number of real values compared."""
+        fit = self.fit
+        decays = fit.ringing.degrees_of_freedom
+        return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns
+
+    @property
+    def deviance(self) -> float:
+        """``-2 ln`` likelihood but for a constant: noise of known shape and free level."""
+        return self.values * math.log(self.fit.cost / self.values)
+
+    @property
+    def bic(self) -> float:
+        """Schwarz, Annals of Statistics 6 (1978) 461-464."""
+        return self.deviance + self.parameters * math.log(self.values)
+
+    @property
+    def aic(self) -> float:
+        """Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723."""
+        return self.deviance + 2 * self.parameters
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        return self.structure.name if self.uniform else f"{self.structure.name}, modes free"
