@@ -2,20 +2,18 @@
 
 from analysis.campaigns.campaign import Campaign, campaign
 from analysis.campaigns.errors import CampaignError
+from analysis.campaigns.estimates import RecordEstimate, WelchFit
 from analysis.campaigns.nominal import MeanPeakDeviation, NominalModel
 from analysis.campaigns.parameter_statistics import ParameterStatistics
 from analysis.campaigns.pooled import PooledEstimate, PooledParameter
-from analysis.campaigns.session import (
-    RecordEstimate,
-    SessionFailure,
-    SessionResult,
-    WelchFit,
-)
+from analysis.campaigns.session import SessionFailure, SessionResult
 from analysis.campaigns.validation import LeftOutError
+from analysis.campaigns.verdict import CampaignVerdict
 
 __all__ = [
     "Campaign",
     "CampaignError",
+    "CampaignVerdict",
     "LeftOutError",
     "MeanPeakDeviation",
     "NominalModel",

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.campaigns.dask_workers import dask_cluster
 from analysis.campaigns.errors import CampaignError
+from analysis.campaigns.experiment import most_common
+from analysis.campaigns.local_workers import process_pool
 from analysis.campaigns.nominal import NominalModel, nominal_models
 from analysis.campaigns.parameter_statistics import ParameterStatistics, parameter_statistics
 from analysis.campaigns.pooled import PooledEstimate, pooled_estimates
@@ -18,15 +21,18 @@ from analysis.campaigns.session import (
     analyse_session,
 )
 from analysis.campaigns.validation import LeftOutError, forecasts, left_out_errors
-from analysis.campaigns.workers import available_cores, dask_cluster, process_pool, run_all
+from analysis.campaigns.verdict import CampaignVerdict, campaign_verdict
+from analysis.campaigns.workers import Lost, available_cores
 from analysis.settings import WelchSettings
 from analysis.structures import STRUCTURES
 from analysis.whole_record import BAND_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
+    from analysis.campaigns.workers import Workers
     from analysis.whole_record import Setting
 
 
@@ -47,7 +53,10 @@ class Campaign:
     nominal : tuple of NominalModel
         By type, then by weighting: Table 4 and Figures 6 and 7.
     pooled : tuple of PooledEstimate
-        Of the structures that two sessions or more determine; empty without whole-record fits.
+        Of the structures that two sessions or more determine, the lowest BIC first; empty without
+        whole-record fits.
+    verdict : CampaignVerdict or None
+        Which of them the data support, and what else they say; None without any.
     validation : tuple of LeftOutError
         Session by session; empty with fewer than three sessions.
     """
@@ -59,6 +68,7 @@ class Campaign:
     statistics: tuple[ParameterStatistics, ...]
     nominal: tuple[NominalModel, ...]
     pooled: tuple[PooledEstimate, ...]
+    verdict: CampaignVerdict | None
     validation: tuple[LeftOutError, ...]
 
 
@@ -75,8 +85,8 @@ def campaign(
 ) -> Campaign:
     """Analyse a campaign of sessions of one specimen on one rig.
 
-    Every session goes by the paper's route (`analysis.welch_route`) and by the whole-record
-    estimator (`analysis.whole_record`); each is then predicted from the others.
+    Every session goes by the paper's route (`analysis.welch_route`) and by the whole record
+    (`analysis.selection`); each is then predicted from the others.
 
     Parameters
     ----------
@@ -85,7 +95,8 @@ def campaign(
     settings : WelchSettings, optional
         Of the paper's route, by default the paper's.
     structures : sequence of str
-        Types fitted to the whole records; none leaves those fits, pooling and their validation out.
+        Types of the whole-record estimate to choose from; none leaves that estimate, the verdict
+        and the estimate's validation out.
     fixed : sequence of str
         Settings of rig and specimen that stay at the file's values in those fits.
     record_band_hz : tuple of float
@@ -121,15 +132,23 @@ def campaign(
         done += 1
         on_progress(done, total, name)
 
-    workers = process_pool(min(jobs or available_cores(), len(paths)))
-    with workers if dask is None else dask_cluster(dask) as executor:
-        results = run_all(
-            executor,
-            analyse_session,
-            [(path, task) for path in paths],
-            lambda i: step(paths[i].name),
+    made: AbstractContextManager[Workers] = (
+        process_pool(min(jobs or available_cores(), len(paths)))
+        if dask is None
+        else dask_cluster(dask)
+    )
+    with made as workers:
+        results = workers.run(
+            analyse_session, [(path, task) for path in paths], lambda i: step(paths[i].name)
         )
-        sessions, failures = _of_one_specimen(results)
+        sessions, failures = _of_one_experiment(
+            [
+                SessionFailure(path, f"{path}: {result.reason}; analyse it by itself.")
+                if isinstance(result, Lost)
+                else result
+                for path, result in zip(paths, results, strict=True)
+            ]
+        )
         if not sessions:
             raise CampaignError(
                 "No session could be analysed:\n" + "\n".join(f.message for f in failures)
@@ -142,8 +161,9 @@ def campaign(
                 for i, session in enumerate(sessions)
             ]
             names = [session.path.name for session in sessions]
-            errors = run_all(executor, left_out_errors, trials, lambda i: step(names[i]))
-            validation = tuple(error for each in errors for error in each)
+            errors = workers.run(left_out_errors, trials, lambda i: step(names[i]))
+            validation = tuple(e for each in errors if not isinstance(each, Lost) for e in each)
+    pooled = pooled_estimates(sessions)
     return Campaign(
         settings=settings,
         record_band_hz=record_band_hz,
@@ -151,57 +171,54 @@ def campaign(
         failures=tuple(failures),
         statistics=parameter_statistics(sessions),
         nominal=nominal_models(sessions),
-        pooled=pooled_estimates(sessions),
+        pooled=pooled,
+        verdict=campaign_verdict(sessions, pooled, validation),
         validation=validation,
     )
 
 
-def _of_one_specimen(
+def _of_one_experiment(
     results: Sequence[SessionResult | SessionFailure],
 ) -> tuple[list[SessionResult], list[SessionFailure]]:
-    """Set aside what failed, and what is not of the first session's specimen and bins."""
+    """Set aside what failed, and what is not the experiment that most of the sessions are."""
+    usable = [result for result in results if isinstance(result, SessionResult)]
+    if not usable:
+        return [], [result for result in results if isinstance(result, SessionFailure)]
+    common = usable[most_common([session.experiment for session in usable])]
     sessions: list[SessionResult] = []
     failures: list[SessionFailure] = []
     for result in results:
-        if isinstance(result, SessionFailure):
-            failures.append(result)
-            continue
-        difference = _difference(sessions[0], result) if sessions else None
-        if difference is None:
+        reason = _reason_against(result, common, sessions)
+        if reason is None and isinstance(result, SessionResult):
             sessions.append(result)
+        elif reason is None and isinstance(result, SessionFailure):
+            failures.append(result)
         else:
-            failures.append(SessionFailure(result.path, f"{result.path}: {difference}"))
+            failures.append(SessionFailure(result.path, f"{result.path}: {reason}"))
     return sessions, failures
 
 
-def _difference(first: SessionResult, other: SessionResult) -> str | None:
-    """Say why two sessions cannot be averaged, None if they can."""
-    for key, one, two, unit in (
-        ("beam_length_m", first.beam.length_m, other.beam.length_m, "m"),
-        (
-            "beam_density_kg_per_m",
-            first.beam.density_kg_per_m,
-            other.beam.density_kg_per_m,
-            "kg/m",
-        ),
-        (
-            "beam_bending_stiffness_n_m2",
-            first.beam.bending_stiffness_n_m2,
-            other.beam.bending_stiffness_n_m2,
-            "N·m²",
-        ),
-        ("tool_inertia_kg_m2", first.tool_inertia_kg_m2, other.tool_inertia_kg_m2, "kg·m²"),
-    ):
-        if one != two:
-            return (
-                f"{key} is {two:g} {unit}, but {one:g} {unit} in {first.path}; a campaign is of "
-                "one specimen: analyse this one by itself, or correct the metadata."
-            )
-    if not np.array_equal(first.frequency_hz, other.frequency_hz):
+def _reason_against(
+    result: SessionResult | SessionFailure, common: SessionResult, before: Sequence[SessionResult]
+) -> str | None:
+    """Say why a session does not belong to those it came with, None if nothing speaks against."""
+    experiment = result.experiment
+    difference = experiment and common.experiment.difference(experiment)
+    if difference:
         return (
-            f"its estimate has {len(other.frequency_hz)} bins from {other.frequency_hz[0]:g} Hz, "
-            f"but that of {first.path} {len(first.frequency_hz)} from {first.frequency_hz[0]:g} "
-            "Hz, so they cannot be averaged: their rates differ; analyse this one by itself, or "
-            "leave --segment and --nfft to the defaults."
+            f"{difference} in {common.path}, as in most; a campaign repeats one experiment on one "
+            "specimen: analyse this one by itself, or correct the metadata."
+        )
+    if isinstance(result, SessionFailure):
+        return None
+    for other in before:
+        if result.experiment.identity == other.experiment.identity:
+            return f"it is the same session as {other.path}, which would count twice."
+    if not np.array_equal(common.frequency_hz, result.frequency_hz):
+        return (
+            f"its estimate has {len(result.frequency_hz)} bins from {result.frequency_hz[0]:g} Hz, "
+            f"but that of {common.path} {len(common.frequency_hz)} from "
+            f"{common.frequency_hz[0]:g} Hz, so they cannot be averaged: their rates differ; "
+            "analyse this one by itself, or leave --segment and --nfft to the defaults."
         )
     return None

@@ -69,7 +69,7 @@ def campaign_command(
     from rich.console import Console
 
     from analysis.campaigns.campaign import campaign
-    from analysis.campaigns.rows import campaign_document
+    from analysis.campaigns.document import campaign_document
     from analysis.campaigns.tables import campaign_tables
     from analysis.report.document import document_text
     from analysis.report.folder import report_folders, write_new

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.campaigns.session import SessionResult, WelchFit
+    from analysis.campaigns.estimates import WelchFit
+    from analysis.campaigns.session import SessionResult
     from analysis.indices import Indices, Peak
     from analysis.structures import Parameter
     from rigd.beam import Beam, Damping

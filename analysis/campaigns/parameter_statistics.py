@@ -12,7 +12,8 @@ from analysis.structures import STRUCTURES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns.session import SessionResult, WelchFit
+    from analysis.campaigns.estimates import WelchFit
+    from analysis.campaigns.session import SessionResult
 
 
 @dataclass(frozen=True, slots=True)

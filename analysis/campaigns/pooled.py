@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.campaigns.estimates import structure_name
+from analysis.campaigns.pooled_modes import PooledMode, pooled_modes
 from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile_95
-from analysis.structures import STRUCTURES
+from analysis.structures import PARAMETERS, STRUCTURES
 from analysis.whole_record import SETTINGS, Plant
 from analysis.whole_record.plant import LOGARITHMIC
 from rigd.beam import Beam
@@ -19,7 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.campaigns.session import RecordEstimate, SessionResult
+    from analysis.campaigns.estimates import RecordEstimate
+    from analysis.campaigns.session import SessionResult
 
 _FEWEST: Final = 2
 
@@ -72,10 +75,13 @@ class PooledEstimate:
     ----------
     structure : str
         Name.
+    uniform : bool
+        Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
     plant : Plant
         Of the pooled parameters.
     parameters : tuple of PooledParameter
         Those that every session used determines.
+    modes : tuple of PooledMode
     sessions : int
         Used: those that determine the structure's damping.
     misfit : float
@@ -83,32 +89,38 @@ class PooledEstimate:
         nothing but noise. Where it is far beyond 1 the structure is wrong, and its standard
         deviations mean little.
     bic : float
-        Bayesian information criterion, summed over the sessions used; to be compared where these
-        are the same.
+        Of all sessions together, see `pooled_bic`.
     """
 
     structure: str
+    uniform: bool
     plant: Plant
     parameters: tuple[PooledParameter, ...]
+    modes: tuple[PooledMode, ...]
     sessions: int
     misfit: float
     bic: float
 
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        return structure_name(self.structure, self.uniform)
+
+    @property
+    def by_name(self) -> dict[str, PooledParameter]:
+        """Parameters by name."""
+        return {each.name: each for each in self.parameters}
+
 
 def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate, ...]:
-    """Pool every structure that two sessions or more determine."""
-    by_structure: dict[str, list[RecordEstimate]] = {}
+    """Pool every structure that all sessions tried and two or more determine; lowest BIC first."""
+    by_name: dict[str, list[RecordEstimate]] = {}
     for session in sessions:
         for estimate in session.record_estimates:
-            by_structure.setdefault(estimate.structure, []).append(estimate)
-    found = (pooled(estimates) for estimates in by_structure.values())
-    return tuple(each for each in found if each is not None)
-
-
-def best_estimate(estimates: Sequence[PooledEstimate]) -> PooledEstimate:
-    """Return that of the lowest BIC, of those that most sessions determine."""
-    most = max(each.sessions for each in estimates)
-    return min((each for each in estimates if each.sessions == most), key=lambda each: each.bic)
+            by_name.setdefault(estimate.name, []).append(estimate)
+    tried = max(map(len, by_name.values()), default=0)
+    found = [pooled(estimates) for estimates in by_name.values() if len(estimates) == tried]
+    return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
 
 
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
@@ -117,13 +129,11 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     A setting of rig or specimen (the tool's inertia, mostly) that rests on its bound in some
     session has no place in the common covariance; the plant gets its plain mean.
     """
-    free = STRUCTURES[estimates[0].structure].free
-    used = [each for each in estimates if set(free) <= set(each.determined)]
+    used = [each for each in estimates if set(_of_specimen(each)) <= set(each.determined)]
     if len(used) < _FEWEST:
         return None
     names = [name for name in used[0].determined if all(name in e.determined for e in used)]
-    values = np.array([[_coordinate(name, e.parameters[name]) for name in names] for e in used])
-    covariances = np.array([_block(e, names) for e in used])
+    values, covariances = _stacked(used, names)
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
     within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
@@ -136,13 +146,48 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     )
     means = {name: float(np.mean([e.parameters[name] for e in used])) for name in SETTINGS}
     return PooledEstimate(
-        structure=estimates[0].structure,
+        structure=used[0].structure,
+        uniform=used[0].uniform,
         plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
         parameters=parameters,
+        modes=pooled_modes(used),
         sessions=len(used),
         misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used])),
-        bic=sum(_bic(e) for e in used),
+        bic=pooled_bic(estimates),
     )
+
+
+def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
+    """Bayesian information criterion of one structure for all sessions together.
+
+    Damping and offsets of the modes belong to the specimen: one value for all sessions, and a
+    scatter between them if they differ by more than their uncertainties; each costs the logarithm
+    of the number of all data. What the sessions lose by sharing a value follows from their own
+    estimates and covariances (the likelihood is taken to be normal about each). Settings of rig and
+    beam are each session's own, with every structure alike, and so cost nothing here. A parameter
+    that some session leaves undetermined cannot be shared: it counts in every session.
+    """
+    of_specimen = _of_specimen(estimates[0])
+    shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]
+    deviance = sum(e.deviance for e in estimates)
+    if shared:
+        deviance += random_effects(*_stacked(estimates, shared)).deviance
+    each_its_own = (len(of_specimen) - len(shared)) * sum(math.log(e.values) for e in estimates)
+    return deviance + len(shared) * math.log(sum(e.values for e in estimates)) + each_its_own
+
+
+def _of_specimen(estimate: RecordEstimate) -> tuple[str, ...]:
+    """Name the free parameters that are the specimen's: damping, and offsets of the modes."""
+    offsets = (name for name in estimate.parameters if name not in {*PARAMETERS, *SETTINGS})
+    return (*STRUCTURES[estimate.structure].free, *offsets)
+
+
+def _stacked(
+    estimates: Sequence[RecordEstimate], names: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Estimates, shape (K, k), and their covariances, (K, k, k)."""
+    values = [[_coordinate(name, e.parameters[name]) for name in names] for e in estimates]
+    return np.array(values), np.array([_block(e, names) for e in estimates])
 
 
 def _parameter(
@@ -160,15 +205,6 @@ def _parameter(
         chance=chance,
         next_interval=_interval(name, mean, t * math.hypot(std, between)),
     )
-
-
-def _bic(estimate: RecordEstimate) -> float:
-    """Cost plus free parameters times the logarithm of the data's number.
-
-    The cost is in units of the noise, so it is twice the negative log-likelihood.
-    """
-    free = len(estimate.determined) + len(estimate.at_bounds)
-    return estimate.cost + free * math.log(estimate.degrees_of_freedom + free)
 
 
 def _interval(name: str, mean: float, half: float) -> tuple[float, float]:
@@ -196,4 +232,7 @@ def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
         damping=STRUCTURES[like.structure].damping({name: values[name] for name in free}),
         delay_s=values["delay_s"],
         tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
+        stiffness_offsets=tuple(
+            values[name] for name in like.parameters if name not in {*PARAMETERS, *SETTINGS}
+        ),
     )

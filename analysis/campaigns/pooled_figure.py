@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.pooled import best_estimate
+from analysis.campaigns.labels import label, with_unit
 from analysis.report import style
+from analysis.report.html.reported import MARK, unreported
+from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,18 +18,9 @@ if TYPE_CHECKING:
     from analysis.campaigns.campaign import Campaign
     from analysis.campaigns.pooled import PooledParameter
 
-NAMES: Final = {
-    "zeta": ("ζ", 1e5, "10⁻⁵ s^α"),
-    "alpha": ("α", 1.0, ""),
-    "gamma": ("γ", 1e2, "10⁻² s^λ/m⁴"),
-    "lambda": ("λ", 1.0, ""),
-    "density_over_stiffness": ("ρ/EI", 1e3, "10⁻³ s²/m⁴"),
-    "bending_stiffness_n_m2": ("EI", 1e3, "10⁻³ N·m²"),
-    "delay_s": ("delay of the torque", 1e6, "µs"),
-    "tool_inertia_kg_m2": ("tool's inertia", 1e6, "10⁻⁶ kg·m²"),
-}
-"""Symbol, factor and unit of each parameter."""
 _COLUMNS: Final = 4
+_POOLED: Final = "#C3DCED"
+"""Of an interval: the pooled line's blue, but light and opaque."""
 
 
 def pooled_figure(campaign: Campaign) -> Figure:
@@ -35,22 +28,26 @@ def pooled_figure(campaign: Campaign) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    estimate = best_estimate(campaign.pooled)
+    estimate = campaign.pooled[0]
+    withheld = campaign.verdict.withheld if campaign.verdict else ()
+    doubtful = unreported(STRUCTURES[estimate.structure], withheld)
+    note = f"  ·  {MARK} not reported: the data do not support it" if doubtful else ""
     rows = -(-len(estimate.parameters) // _COLUMNS)
     width_in, height_in = 13.0, 2.6 * rows + 1.35
     figure = style.new_figure(
         width_in, height_in,
-        f"{estimate.sessions} sessions — pooled whole-record estimate, type {estimate.structure}",
+        f"{estimate.sessions} sessions — pooled whole-record estimate, type {estimate.name}",
         f"type of the lowest BIC; its residual is {estimate.misfit:.3g} times the noise  ·  "
-        "p: probability of so much scatter if sessions differed by their own uncertainty alone",
+        "p: probability of so much scatter if sessions differed by their own uncertainty alone"
+        f"{note}",
     )  # fmt: skip
     grid = figure.add_gridspec(
         rows, _COLUMNS, left=0.06, right=0.99, top=1 - 1.2 / height_in, bottom=0.5 / height_in,
-        wspace=0.3, hspace=0.4,
+        wspace=0.42, hspace=0.4,
     )  # fmt: skip
     for number, parameter in enumerate(estimate.parameters):
         axes = figure.add_subplot(grid[number // _COLUMNS, number % _COLUMNS])
-        _panel(campaign, estimate.structure, parameter, axes)
+        _panel(campaign, estimate.name, parameter, axes, reported=parameter.name not in doubtful)
         if number + _COLUMNS >= len(estimate.parameters):
             axes.set_xlabel("Session", labelpad=1)
     figure.legend(
@@ -58,7 +55,7 @@ def pooled_figure(campaign: Campaign) -> Figure:
             Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                    label="session, ± 1.96 of its standard deviation"),
             Line2D([], [], color=style.BLUE, label="pooled"),
-            Patch(facecolor=style.BLUE, alpha=0.25, label="its 95 % interval"),
+            Patch(facecolor=_POOLED, label="its 95 % interval"),
             Patch(facecolor=style.SHADE, label="true value in one more session, 95 %"),
         ],
         loc="upper left", ncols=4, borderaxespad=0.0,
@@ -67,26 +64,30 @@ def pooled_figure(campaign: Campaign) -> Figure:
     return figure
 
 
-def _panel(campaign: Campaign, structure: str, parameter: PooledParameter, axes: Axes) -> None:
-    symbol, factor, unit = NAMES[parameter.name]
+def _panel(
+    campaign: Campaign, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
+) -> None:
+    symbol, factor, _ = label(parameter.name)
     places, values, spreads = [], [], []
     for number, session in enumerate(campaign.sessions, start=1):
         for each in session.record_estimates:
-            std = each.std[parameter.name]
-            if each.structure == structure and std is not None:
+            std = each.std.get(parameter.name)
+            if each.name == name and std is not None:
                 places.append(number)
                 values.append(factor * each.parameters[parameter.name])
                 spreads.append(1.96 * factor * std)
     axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
     axes.axhspan(
-        *(factor * end for end in parameter.interval), color=style.BLUE, alpha=0.25, linewidth=0
+        *(factor * end for end in parameter.interval),
+        color=_POOLED if reported else style.FAINT,
+        zorder=0.6,
     )
-    axes.axhline(factor * parameter.value, color=style.BLUE)
-    axes.errorbar(
-        places, values, yerr=spreads, fmt="o", markersize=2.6, color=style.INK, linewidth=0.8
-    )
-    axes.set_title(f"{symbol}   p = {parameter.chance:.2g}")
-    axes.set_ylabel(f"{symbol} ({unit})" if unit else symbol)
+    ink, line = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
+    axes.axhline(factor * parameter.value, color=line)
+    axes.errorbar(places, values, yerr=spreads, fmt="o", markersize=2.6, color=ink, linewidth=0.8)
+    mark = "" if reported else MARK
+    axes.set_title(f"{symbol}{mark}   p = {parameter.chance:.2g}")
+    axes.set_ylabel(with_unit(parameter.name))
     axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
     axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
     axes.ticklabel_format(axis="y", useOffset=False)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,12 +35,16 @@ class RandomEffects:
     cochran_q : ndarray, shape (k,)
         Squares of the deviations from the weighted mean over the sessions' variances, summed:
         about K − 1 without scatter between sessions.
+    deviance : float
+        ``-2 ln`` likelihood of the mean and tau, above that of a value of its own for each
+        session: ``sum_k ln|I + S_k⁻¹ diag(tau²)| + r_kᵀ (S_k + diag(tau²))⁻¹ r_k``.
     """
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
     between_std: NDArray[np.float64]
     cochran_q: NDArray[np.float64]
+    deviance: float
 
 
 def random_effects(
@@ -64,17 +69,23 @@ def random_effects(
     unit = 1 / np.sqrt(weight.mean(axis=0))
     units = np.outer(unit, unit)
     origin = estimates.mean(axis=0)
-    precision = np.linalg.inv(covariances / units + np.diag(between / unit**2))
+    own, every = covariances / units, covariances / units + np.diag(between / unit**2)
+    precision = np.linalg.inv(every)
     spread = np.linalg.inv(precision.sum(axis=0))
-    shift = spread @ np.einsum("kij,kj->i", precision, (estimates - origin) / unit)
+    away = (estimates - origin) / unit
+    shift = spread @ np.einsum("kij,kj->i", precision, away)
+    left = away - shift
+    widening = np.linalg.slogdet(every)[1] - np.linalg.slogdet(own)[1]
     return RandomEffects(
         mean=origin + unit * shift,
         covariance=units * spread,
         between_std=np.sqrt(between),
         cochran_q=q,
+        deviance=float(widening.sum() + np.einsum("ki,kij,kj->", left, precision, left)),
     )
 
 
+@cache
 def t_quantile_95(degrees_of_freedom: int) -> float:
     """Two-sided 95 % point of Student's t.
 

@@ -1,19 +1,16 @@
-"""Tables of a campaign as rows of plain values, for CSV files and JSON; in SI units, exact."""
+"""Tables of a campaign as rows of plain values, for CSV files and JSON; in SI units, in full."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import platform
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-import rigd
 from analysis.campaigns import paper
 from analysis.campaigns.nominal import best_models
+from analysis.report.html.reported import unreported
 from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
@@ -103,10 +100,12 @@ def record_rows(campaign: Campaign) -> list[Row]:
         {
             "file": str(session.path),
             "type": each.structure,
+            "uniform": each.uniform,
             **each.parameters,
             **{f"{name}_std": value for name, value in each.std.items()},
             "cost": each.cost,
             "degrees_of_freedom": each.degrees_of_freedom,
+            "bic": each.bic,
             "at_bounds": " ".join(each.at_bounds),
         }
         for session in campaign.sessions
@@ -114,12 +113,36 @@ def record_rows(campaign: Campaign) -> list[Row]:
     ]
 
 
+def candidate_rows(campaign: Campaign) -> list[Row]:
+    """Structures on all whole records together, the lowest BIC first."""
+    alone = campaign.verdict.alone if campaign.verdict else {}
+    return [
+        {
+            "type": each.structure,
+            "uniform": each.uniform,
+            "sessions": each.sessions,
+            "bic_above_lowest": each.bic - campaign.pooled[0].bic,
+            "misfit": each.misfit,
+            "selected_alone": alone.get(each.name, 0),
+        }
+        for each in campaign.pooled
+    ]
+
+
+def mode_rows(campaign: Campaign) -> list[Row]:
+    """Modes over all sessions, of the structure selected."""
+    return [asdict(mode) for estimate in campaign.pooled[:1] for mode in estimate.modes]
+
+
 def pooled_rows(campaign: Campaign) -> list[Row]:
-    """Pooled whole-record estimates."""
+    """Pooled whole-record estimates, the lowest BIC first."""
+    withheld = campaign.verdict.withheld if campaign.verdict else ()
     return [
         {
             "type": estimate.structure,
+            "uniform": estimate.uniform,
             "sessions": estimate.sessions,
+            "bic": estimate.bic,
             "misfit": estimate.misfit,
             "parameter": each.name,
             "value": each.value,
@@ -131,6 +154,7 @@ def pooled_rows(campaign: Campaign) -> list[Row]:
             "chance": each.chance,
             "next_low_95": each.next_interval[0],
             "next_high_95": each.next_interval[1],
+            "reported": each.name not in unreported(STRUCTURES[estimate.structure], withheld),
         }
         for estimate in campaign.pooled
         for each in estimate.parameters
@@ -143,7 +167,7 @@ def validation_rows(campaign: Campaign) -> list[Row]:
         {
             "file": str(each.path),
             "method": each.method,
-            "type": each.structure,
+            "type": each.name,
             "weighting": each.weighting,
             "error": each.error,
             "own_error": each.own_error,
@@ -163,27 +187,12 @@ def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, lis
     found |= {
         "sessions_welch": session_rows(campaign),
         "sessions_record": record_rows(campaign),
+        "structures": candidate_rows(campaign),
         "pooled": pooled_rows(campaign),
+        "pooled_modes": mode_rows(campaign),
         "validation": validation_rows(campaign),
     }
     return {name: [_known_row(row) for row in rows] for name, rows in found.items() if rows}
-
-
-def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Any]:
-    """Collect the campaign as one JSON document, without NaN: what is not known is null."""
-    return {
-        "versions": {
-            "rigd": rigd.__version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-        },
-        "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
-        "files": [
-            {"file": str(each.path), "warnings": list(each.warnings)} for each in campaign.sessions
-        ],
-        "errors": [{"file": str(each.path), "message": each.message} for each in campaign.failures],
-        **all_tables(campaign, with_paper=with_paper),
-    }
 
 
 def csv_text(rows: Sequence[Row]) -> str:

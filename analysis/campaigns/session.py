@@ -2,113 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from analysis.campaigns.errors import task_errors
+from analysis.campaigns.estimates import RecordEstimate, WelchFit, structure_name
+from analysis.campaigns.experiment import Experiment
+from analysis.indices import fit_indices
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.fit_frf import FrfFit
     from analysis.indices import Peak
+    from analysis.record import Record
+    from analysis.selection import Candidate, Verdict
     from analysis.settings import WelchSettings
-    from analysis.whole_record import Plant, RecordFit, Setting
-    from rigd.beam import Beam, Damping
+    from analysis.whole_record import Setting
+    from rigd.beam import Beam
+    from rigd.spectral import FrequencyResponse
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFailure:
-    """A session of which nothing is used, and why, in the operator's words."""
+    """A session of which nothing is used, why, and what experiment it is as far as is known."""
 
     path: Path
     message: str
-
-
-@dataclass(frozen=True, slots=True)
-class WelchFit:
-    """One structure fitted to one session by the paper's route, with one weighting.
-
-    Attributes
-    ----------
-    structure, weighting : str
-        Names.
-    damping : Damping
-    parameters : dict
-        zeta, alpha, gamma and lambda, the fixed ones included.
-    cost : float
-        Eq. (26) at the minimum, in (N·m/rad)².
-    at_bounds : tuple of str
-        Free parameters that rest on the edge of the range searched.
-    """
-
-    structure: str
-    weighting: str
-    damping: Damping
-    parameters: Mapping[str, float]
-    cost: float
-    at_bounds: tuple[str, ...]
-
-    @classmethod
-    def of(cls, fit: FrfFit) -> WelchFit:
-        """Keep of a fit what a campaign needs."""
-        return cls(
-            structure=fit.structure.name,
-            weighting=fit.weighting,
-            damping=fit.damping,
-            parameters=dict(fit.parameters),
-            cost=fit.cost,
-            at_bounds=fit.at_bounds,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class RecordEstimate:
-    """One structure fitted to one whole record.
-
-    Attributes
-    ----------
-    structure : str
-        Name.
-    plant : Plant
-    parameters : dict of str to float
-        See `analysis.whole_record.RecordFit`, as for the following.
-    std : dict of str to (float or None)
-    determined : tuple of str
-    covariance : ndarray, shape (k, k)
-    at_bounds : tuple of str
-    cost : float
-    degrees_of_freedom : int
-    """
-
-    structure: str
-    plant: Plant
-    parameters: Mapping[str, float]
-    std: Mapping[str, float | None]
-    determined: tuple[str, ...]
-    covariance: NDArray[np.float64]
-    at_bounds: tuple[str, ...]
-    cost: float
-    degrees_of_freedom: int
-
-    @classmethod
-    def of(cls, fit: RecordFit) -> RecordEstimate:
-        """Keep of a fit what a campaign needs: all but the residual."""
-        return cls(
-            structure=fit.structure.name,
-            plant=fit.plant,
-            parameters=dict(fit.parameters),
-            std=dict(fit.std),
-            determined=fit.determined,
-            covariance=fit.covariance,
-            at_bounds=fit.at_bounds,
-            cost=fit.cost,
-            degrees_of_freedom=fit.degrees_of_freedom,
-        )
+    experiment: Experiment | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +42,7 @@ class SessionResult:
     Attributes
     ----------
     path : Path
+    experiment : Experiment
     beam : Beam
         As the file states it.
     tool_inertia_kg_m2, delay_s : float
@@ -131,11 +56,15 @@ class SessionResult:
     welch_fits : tuple of WelchFit
         By type, then by weighting.
     record_estimates : tuple of RecordEstimate
-        By type; empty if none was asked for, or the record could not be used.
+        By type, those of a uniform beam first; empty if none was asked for, or the record could
+        not be used.
+    verdict : Verdict or None
+        What the whole record says by itself, None without estimates.
     warnings : tuple of str
     """
 
     path: Path
+    experiment: Experiment
     beam: Beam
     tool_inertia_kg_m2: float
     delay_s: float
@@ -144,7 +73,15 @@ class SessionResult:
     peaks: tuple[Peak | None, ...]
     welch_fits: tuple[WelchFit, ...]
     record_estimates: tuple[RecordEstimate, ...]
+    verdict: Verdict | None
     warnings: tuple[str, ...]
+
+    @property
+    def selected(self) -> str | None:
+        """Name of the structure that the session selects by itself, None without a verdict."""
+        if self.verdict is None:
+            return None
+        return structure_name(self.verdict.structure, self.verdict.uniform)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +92,7 @@ class SessionTask:
     ----------
     settings : WelchSettings
     structures : tuple of str
-        Names of those fitted to the whole record.
+        Names of those that are kept of the whole-record fits; without any there are none.
     fixed : tuple of str
         Settings that stay at the file's values in those fits.
     record_band_hz : tuple of float
@@ -169,47 +106,75 @@ class SessionTask:
 
 
 def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFailure:
-    """Read a session, estimate and fit by both routes.
+    """Read a session, analyse it by both routes.
 
     A session that cannot be analysed is told, not raised: it is one of many.
     """
     from analysis.record import load_record
-    from analysis.structures import STRUCTURES
     from analysis.welch_route import analyse
-    from analysis.whole_record import Measurement, fit_record
 
     failures = task_errors()
+    experiment = None
     try:
         record = load_record(path)
+        experiment = Experiment.of(record)
+        unfinished = experiment.unfinished(record.outcome)
+        if unfinished:
+            return SessionFailure(path, f"{path}: {unfinished}", experiment)
         welch = analyse(record, task.settings)
     except failures as error:
-        return SessionFailure(path, str(error))
+        return SessionFailure(path, str(error), experiment)
     except MemoryError:
         return SessionFailure(
             path, f"{path}: there is not memory enough to analyse it; use fewer --jobs."
         )
     warnings = welch.warnings
     estimates: tuple[RecordEstimate, ...] = ()
+    verdict = None
     if task.structures:
         try:
-            fits = fit_record(
-                Measurement.of_record(record),
-                [STRUCTURES[name] for name in task.structures],
-                fixed=task.fixed,
-                band_hz=task.record_band_hz,
-            ).fits
-            estimates = tuple(RecordEstimate.of(fit) for fit in fits)
+            estimates, verdict = _whole_record(record, task, welch.response)
         except failures as error:
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
     return SessionResult(
         path=path,
+        experiment=experiment,
         beam=record.beam,
         tool_inertia_kg_m2=record.tool_inertia_kg_m2,
         delay_s=record.torque_delay_s - record.angle_delay_s,
         frequency_hz=welch.response.frequency_hz,
         response=welch.response.response,
         peaks=welch.peaks,
-        welch_fits=tuple(WelchFit.of(model.fit) for model in welch.models),
+        welch_fits=tuple(map(WelchFit.of, welch.models)),
         record_estimates=estimates,
+        verdict=verdict,
         warnings=warnings,
     )
+
+
+def _whole_record(
+    record: Record, task: SessionTask, measured: FrequencyResponse
+) -> tuple[tuple[RecordEstimate, ...], Verdict]:
+    """Select a structure on the whole record; of all fits, keep those asked for."""
+    from analysis.selection import select
+    from analysis.structures import STRUCTURES
+    from analysis.whole_record import Measurement
+    from analysis.whole_record.response import ResponseGrid
+
+    measurement = Measurement.of_record(record)
+    selection = select(measurement, fixed=task.fixed, band_hz=task.record_band_hz)
+    omega = 2 * np.pi * measured.frequency_hz
+    grid = ResponseGrid(1j * omega)
+
+    def kept(candidate: Candidate) -> RecordEstimate:
+        # The measured response is free of the delay that the file states.
+        plant = candidate.fit.plant
+        plant = replace(plant, delay_s=plant.delay_s - measurement.delay_s)
+        response = grid.evaluate(plant)[0]
+        return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
+
+    order = list(STRUCTURES)
+    estimates = [kept(each) for each in selection.candidates]
+    asked = [each for each in estimates if each.structure in task.structures]
+    asked.sort(key=lambda each: (not each.uniform, order.index(each.structure)))
+    return tuple(asked), selection.verdict

@@ -12,59 +12,68 @@ from rich.table import Table
 from rich.text import Text
 
 from analysis.campaigns import paper
+from analysis.campaigns.labels import label, with_unit
 from analysis.campaigns.nominal import best_models
-from analysis.campaigns.pooled import best_estimate
-from analysis.campaigns.pooled_figure import NAMES
 from analysis.campaigns.validation import by_model
+from analysis.report.html.reported import MARK, footnotes, unreported
 from analysis.report.tables import with_spread
 from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection
 
     from rich.console import RenderableType
 
     from analysis.campaigns.campaign import Campaign
     from analysis.campaigns.pooled import PooledEstimate
+    from analysis.campaigns.verdict import CampaignVerdict
 
 _FACTORS: Final = {"zeta": ("ζ (1e-4)", 1e4), "alpha": ("α", 1.0), "gamma": ("γ (1e-1)", 10.0),
                    "lambda": ("λ", 1.0)}  # fmt: skip
 """Heading and factor of each parameter, the powers of ten of the paper's Table 3."""
 _STATISTICS: Final = ("mean", "median", "std", "min", "max")
 _ABSENT: Final = "–"
-_SIGNIFICANT: Final = 0.01
-_CLOSE: Final = 1.02
-_WRONG: Final = 1.5
-"""Residual, in units of the noise, from which a structure is called wrong."""
+NO_VERDICT: Final = (
+    "No verdict on the whole records: it takes two sessions that determine a structure's damping."
+)
 
 
 def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> RenderableType:
-    """Return Tables 3 to 5, the pooled estimate and the validation, with what they mean."""
-    parts: list[RenderableType] = [
-        statistics_table(campaign, with_paper=with_paper), "",
-        peaks_table(campaign, with_paper=with_paper), "",
-        best_table(campaign, with_paper=with_paper), "",
-    ]  # fmt: skip
+    """Return the verdict, what it rests on, and the paper's Tables 3 to 5."""
+    parts: list[RenderableType] = []
+    if campaign.verdict is not None:
+        parts.extend((verdict_text(campaign.verdict), ""))
+    elif campaign.sessions[0].record_estimates:
+        parts.extend((Text(NO_VERDICT, style="bold"), ""))
+    withheld = campaign.verdict.withheld if campaign.verdict else ()
+    for estimate in likely_estimates(campaign):
+        parts.extend((pooled_table(estimate, withheld), ""))
     if campaign.pooled:
-        for estimate in likely_estimates(campaign.pooled):
-            parts.extend((pooled_table(estimate), ""))
-        parts.extend((Text(pooled_meaning(campaign)), ""))
+        parts.extend((candidates_table(campaign), ""))
     if campaign.validation:
         parts.extend((validation_table(campaign), ""))
+    parts.extend(
+        (
+            statistics_table(campaign, with_paper=with_paper), "",
+            peaks_table(campaign, with_paper=with_paper), "",
+            best_table(campaign, with_paper=with_paper), "",
+        )
+    )  # fmt: skip
     parts.extend(
         Text(f"Warning: {session.path.name}: {warning}", style="yellow")
         for session in campaign.sessions
         for warning in session.warnings
     )
-    parts.extend(Text(f"Not used: {each.message}", style="red") for each in campaign.failures)
     return Group(*parts)
 
 
 def tables_text(campaign: Campaign, *, with_paper: bool = False, width: int = 120) -> str:
-    """Return the same as plain text."""
+    """Return the same as plain text, with the files that were left out."""
     console = Console(width=width, color_system=None, force_terminal=False)
     with console.capture() as capture:
         console.print(campaign_tables(campaign, with_paper=with_paper))
+        for failure in campaign.failures:
+            console.print(Text(f"Left out: {failure.message}"))
     return capture.get()
 
 
@@ -137,80 +146,67 @@ def best_table(campaign: Campaign, *, with_paper: bool) -> Table:
     return table
 
 
-def likely_estimates(estimates: Sequence[PooledEstimate]) -> list[PooledEstimate]:
-    """Return the best estimate, and after it those whose residual is next to as small."""
-    best = best_estimate(estimates)
-    close = [e for e in estimates if e is not best and e.misfit < _CLOSE * best.misfit]
-    return [best, *sorted(close, key=lambda e: e.bic)]
+def verdict_text(verdict: CampaignVerdict) -> Text:
+    """Write the verdict, one sentence a line, and what would tell more."""
+    first, *others = verdict.sentences
+    text = Text(first, style="bold")
+    for sentence in others:
+        text.append(f"\n{sentence}", style="not bold")
+    if verdict.experiments:
+        text.append("\nWhat would tell more:", style="not bold")
+        for advice in verdict.experiments:
+            text.append(f"\n  {advice}", style="not bold")
+    return text
 
 
-def pooled_table(estimate: PooledEstimate) -> Table:
-    """Pooled whole-record estimate of one structure."""
+def candidates_table(campaign: Campaign) -> Table:
+    """All structures, the lowest BIC first."""
+    table = _table("Structures on the whole records of all sessions together")
+    table.add_column("type")
+    for heading in ("sessions", "BIC above the lowest", "residual (noise = 1)", "selected alone"):
+        table.add_column(heading, justify="right")
+    alone = campaign.verdict.alone if campaign.verdict else {}
+    for each in campaign.pooled:
+        table.add_row(
+            each.name, str(each.sessions), f"{each.bic - campaign.pooled[0].bic:.1f}",
+            f"{each.misfit:.4g}", str(alone.get(each.name, 0)),
+        )  # fmt: skip
+    table.caption = (
+        "sessions: that determine its damping; selected alone: sessions whose own BIC is lowest so"
+    )
+    return table
+
+
+def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
+    """Return the estimate selected, and those that all data together cannot tell from it."""
+    close = campaign.verdict.rivals if campaign.verdict else ()
+    return [*campaign.pooled[:1], *(each for each in campaign.pooled if each.name in close)]
+
+
+def pooled_table(estimate: PooledEstimate, withheld: Collection[str] = ()) -> Table:
+    """Pooled whole-record estimate of one structure; orders withheld are marked."""
     table = _table(
-        f"Pooled whole-record estimate, type {estimate.structure}, {estimate.sessions} sessions; "
-        f"residual {estimate.misfit:.4g} times the noise, BIC {estimate.bic:.1f}"
+        f"Pooled whole-record estimate, type {estimate.name}, {estimate.sessions} sessions; "
+        f"residual {estimate.misfit:.4g} times the noise"
     )
     table.add_column("parameter")
     for heading in ("pooled ±std", "95 % interval", "one session's std", "between sessions", "p"):
         table.add_column(heading, justify="right")
+    doubtful = unreported(STRUCTURES[estimate.structure], withheld)
     for each in estimate.parameters:
-        symbol, factor, unit = NAMES[each.name]
+        _, factor, _ = label(each.name)
         low, high = (factor * end for end in each.interval)
         digits = max(2 - math.floor(math.log10(max(high - low, 1e-12))), 0)
+        marked = each.name in doubtful
         table.add_row(
-            f"{symbol} ({unit})" if unit else symbol,
+            with_unit(each.name) + (f" {MARK}" if marked else ""),
             with_spread(factor * each.value, factor * each.std),
             f"{low:.{digits}f} … {high:.{digits}f}",
             f"{factor * each.within_std:.2g}", f"{factor * each.between_std:.2g}",
-            f"{each.chance:.2g}",
+            f"{each.chance:.2g}", style="dim" if marked else "",
         )  # fmt: skip
+    table.caption = " ".join(footnotes(withheld)) if doubtful else None
     return table
-
-
-def pooled_meaning(campaign: Campaign) -> str:
-    """Say in words what the pooled estimate tells."""
-    estimate = best_estimate(campaign.pooled)
-    if estimate.misfit > _WRONG:
-        first = (
-            f"The residual of type {estimate.structure} is {estimate.misfit:.3g} times the noise: "
-            "no structure tried describes the beam, and standard deviations mean little."
-        )
-    else:
-        first = (
-            f"Type {estimate.structure} has the lowest BIC, each session with parameters of its "
-            "own; beyond noise it leaves nothing to describe."
-        )
-    for each in likely_estimates(campaign.pooled)[1:]:
-        first += _objection(estimate, each)
-    moved = [NAMES[e.name][0] for e in estimate.parameters if e.chance < _SIGNIFICANT]
-    if not moved:
-        second = (
-            "Sessions differ by no more than their own uncertainties (p: probability of so much "
-            "scatter by these alone); they repeat."
-        )
-    else:
-        second = (
-            f"Sessions differ by more than their own uncertainties in {', '.join(moved)} (p: "
-            "probability of so much scatter by these alone): something changes between sessions, "
-            "such as clamp, temperature or motor, and the interval of one session alone is too "
-            "narrow for the specimen."
-        )
-    return f"{first} {second}"
-
-
-def _objection(best: PooledEstimate, other: PooledEstimate) -> str:
-    """Say if a type that frees an order finds, over all sessions, another value than the best's."""
-    found = ""
-    fixed = dict[str, float](STRUCTURES[best.structure].fixed.items())
-    for each in other.parameters:
-        held = fixed.get(each.name) if each.name in ("alpha", "lambda") else None
-        low, high = each.interval
-        if held and not low <= held <= high:
-            found += (
-                f" But all sessions together put {NAMES[each.name][0]} of type {other.structure} "
-                f"between {low:.4f} and {high:.4f}, and not at {held:g}."
-            )
-    return found
 
 
 def validation_table(campaign: Campaign) -> Table:
@@ -233,6 +229,7 @@ def validation_table(campaign: Campaign) -> Table:
 
 def _table(title: str) -> Table:
     return Table(
+        min_width=len(title),
         title=Text(title, style="bold"), title_justify="left", caption_justify="left",
         box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
     )  # fmt: skip

@@ -30,7 +30,8 @@ class LeftOutError:
     method : {"record", "welch"}
         Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
         of the others by the paper's route.
-    structure : str
+    name : str
+        The structure, as tables call it.
     weighting : str or None
         None with "record".
     error : float
@@ -43,7 +44,7 @@ class LeftOutError:
 
     path: Path
     method: str
-    structure: str
+    name: str
     weighting: str | None
     error: float
     own_error: float | None
@@ -54,7 +55,7 @@ class Forecast:
     """What others say of a session: a model's name and its plant, the session's own beside it."""
 
     method: str
-    structure: str
+    name: str
     weighting: str | None
     plant: Plant
     own: Plant | None
@@ -64,11 +65,11 @@ def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecas
     """Models of all sessions but one, to be tried on that one."""
     session = sessions[left_out]
     others = [*sessions[:left_out], *sessions[left_out + 1 :]]
-    own = {each.structure: each.plant for each in session.record_estimates}
+    own = {each.name: each.plant for each in session.record_estimates}
     found = [
-        Forecast("record", each.structure, None, each.plant, own[each.structure])
+        Forecast("record", each.name, None, each.plant, own[each.name])
         for each in pooled_estimates(others)
-        if each.structure in own
+        if each.name in own
     ]
     for number, fit in enumerate(session.welch_fits):
         damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
@@ -102,7 +103,7 @@ def left_out_errors(
         LeftOutError(
             path=path,
             method=each.method,
-            structure=each.structure,
+            name=each.name,
             weighting=each.weighting,
             error=error(each.plant),
             own_error=None if each.own is None else error(each.own),
@@ -114,9 +115,9 @@ def left_out_errors(
 def by_model(
     errors: Sequence[LeftOutError],
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
-    """Group errors by method, structure and weighting, the smallest mean error first."""
+    """Group errors by method, name and weighting, the smallest mean error first."""
     found: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
     for each in errors:
-        found.setdefault((each.method, each.structure, each.weighting), []).append(each)
+        found.setdefault((each.method, each.name, each.weighting), []).append(each)
     groups = [(*key, tuple(group)) for key, group in found.items()]
     return sorted(groups, key=lambda group: float(np.mean([each.error for each in group[3]])))

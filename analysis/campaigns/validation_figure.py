@@ -32,7 +32,7 @@ def validation_figure(campaign: Campaign) -> Figure:
         f"{campaign.record_band_hz[0]:g} to {campaign.record_band_hz[1]:g} Hz",
     )  # fmt: skip
     axes = figure.add_axes(
-        (1.6 / width_in, 0.5 / height_in, 1 - 1.8 / width_in, _ROW_IN * len(models) / height_in)
+        (2.0 / width_in, 0.5 / height_in, 1 - 2.2 / width_in, _ROW_IN * len(models) / height_in)
     )
     rng = np.random.default_rng(0)  # so that equal errors lie side by side
     for row, (_, _, weighting, errors) in enumerate(models):
@@ -68,5 +68,5 @@ def validation_figure(campaign: Campaign) -> Figure:
     return figure
 
 
-def _name(method: str, structure: str, weighting: str | None) -> str:
-    return f"{structure} {method}" if weighting is None else f"{structure} Welch {weighting}"
+def _name(_method: str, structure: str, weighting: str | None) -> str:
+    return f"{structure}: {'whole record' if weighting is None else f'Welch, {weighting}'}"

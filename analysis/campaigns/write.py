@@ -1,21 +1,27 @@
-"""A campaign's folder: figures as PNG and SVG, tables as CSV, text and JSON."""
+"""A campaign's folder: the page, figures as PNG and SVG, tables as CSV, text and JSON."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from datetime import datetime
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns.rows import all_tables, campaign_document, csv_text
+from analysis.campaigns.document import campaign_document
+from analysis.campaigns.rows import all_tables, csv_text
 from analysis.report.document import document_text
 from analysis.report.folder import OutputError, write_new
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
     from analysis.campaigns.campaign import Campaign
+
+_CROWDED: Final = frozenset({"figure5_signals", "figure6_nominal", "figure8_best"})
 
 
 def write_campaign(
@@ -25,7 +31,7 @@ def write_campaign(
     with_paper: bool = False,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> None:
-    """Write every figure and table.
+    """Write the page ``report.html``, every figure and every table.
 
     Parameters
     ----------
@@ -42,37 +48,75 @@ def write_campaign(
     OutputError
         A file cannot be written.
     """
+    from analysis.campaigns.page import campaign_page
     from analysis.campaigns.tables import tables_text
     from analysis.report import style
+    from analysis.report.html.drawing import drawing, photograph, svg_text
 
-    for name, draw in _figures(campaign):
+    shown = {}
+    for name, (draw, description) in _figures(campaign).items():
         with style.styled():
             figure = draw()
-            for suffix in ("png", "svg"):
-                _save(figure, folder / f"{name}.{suffix}")
+            png = io.BytesIO()
+            figure.savefig(png, format="png")
+            svg = svg_text(figure)
+        _write_bytes(folder / f"{name}.png", png.getvalue())
+        write_new(folder / f"{name}.svg", svg)
+        # Of many sessions' responses a picture is the smaller one.
+        shown[name] = (
+            photograph(png.getvalue(), name, description)
+            if name in _CROWDED
+            else drawing(svg, name, description)
+        )
         on_step(f"figure {name}")
     for name, rows in all_tables(campaign, with_paper=with_paper).items():
         write_new(folder / f"{name}.csv", csv_text(rows))
     text = document_text(campaign_document(campaign, with_paper=with_paper))
     write_new(folder / "campaign.json", text)
     write_new(folder / "tables.txt", tables_text(campaign, with_paper=with_paper))
+    made_at = datetime.now().astimezone()
+    write_new(
+        folder / "report.html", campaign_page(campaign, shown, made_at, with_paper=with_paper)
+    )
 
 
-def _figures(campaign: Campaign) -> Iterator[tuple[str, Callable[[], Figure]]]:
-    """Names and drawings, those for which there are data."""
+def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
+    """Drawings by name, with what is seen in them: those for which there are data."""
     from analysis.campaigns.index_figure import index_figure
     from analysis.campaigns.pooled_figure import pooled_figure
     from analysis.campaigns.response_figures import best_figure, nominal_figure
     from analysis.campaigns.validation_figure import validation_figure
 
-    yield "figure5_signals", lambda: _signals(campaign)
-    yield "figure6_nominal", lambda: nominal_figure(campaign)
-    yield "figure7_indices", lambda: index_figure(campaign)
-    yield "figure8_best", lambda: best_figure(campaign)
+    found: dict[str, tuple[Callable[[], Figure], str]] = {}
     if campaign.pooled:
-        yield "pooled", lambda: pooled_figure(campaign)
+        found["pooled"] = (
+            partial(pooled_figure, campaign),
+            "Whole-record estimate of each session with its 95 % interval, and the pooled one.",
+        )
     if campaign.validation:
-        yield "validation", lambda: validation_figure(campaign)
+        found["validation"] = (
+            partial(validation_figure, campaign),
+            "Each session's torque predicted from the other sessions: error by model.",
+        )
+    return found | {
+        "figure5_signals": (
+            partial(_signals, campaign),
+            "Reference, angle and torque of the first session (Figure 5 of the paper).",
+        ),
+        "figure6_nominal": (
+            partial(nominal_figure, campaign),
+            "Measured responses of all sessions, and the nominal models of each type (Figure 6).",
+        ),
+        "figure7_indices": (
+            partial(index_figure, campaign),
+            "Mean square error, its weighted kind and maximum deviation of each nominal model "
+            "over the sessions (Figure 7).",
+        ),
+        "figure8_best": (
+            partial(best_figure, campaign),
+            "Measured responses of all sessions, and the two best nominal models (Figure 8).",
+        ),
+    }
 
 
 def _signals(campaign: Campaign) -> Figure:
@@ -85,12 +129,9 @@ def _signals(campaign: Campaign) -> Figure:
     return signals_figure(analyse(record, replace(campaign.settings, types=())))
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _write_bytes(path: Path, content: bytes) -> None:
     try:
         with path.open("xb") as stream:
-            figure.savefig(
-                stream, format=path.suffix[1:],
-                metadata={"Date": None} if path.suffix == ".svg" else None,
-            )  # fmt: skip
+            stream.write(content)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error

@@ -6,11 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns.session import RecordEstimate, SessionResult, WelchFit
-from analysis.indices import Peak
+from analysis.campaigns.estimates import RecordEstimate, WelchFit
+from analysis.campaigns.experiment import Experiment
+from analysis.campaigns.session import SessionResult
+from analysis.indices import Indices, Peak
 from analysis.settings import WelchSettings
 from analysis.structures import STRUCTURES
-from analysis.whole_record import Plant
+from analysis.whole_record import ModeEstimate, Plant
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionWriter
 from rigd.session.format import SAMPLE_SIZE, pack_sample_into
@@ -24,7 +26,7 @@ SETTINGS = WelchSettings(
 )
 
 
-def short_session(path, seed, beam=LINK, damping=PLANT):
+def short_session(path, seed, beam=LINK, damping=PLANT, **stated):
     """One second of rest, 0.5-50 Hz in 30 s, 5 s after it."""
     t = np.arange(round(36 * RATE_HZ)) / RATE_HZ - 1.0
     phase = 2 * np.pi * (0.5 * t + (50 - 0.5) * t**2 / 60)
@@ -50,11 +52,17 @@ def short_session(path, seed, beam=LINK, damping=PLANT):
         "beam_length_m": repr(beam.length_m),
         "beam_density_kg_per_m": repr(beam.density_kg_per_m),
         "beam_bending_stiffness_n_m2": repr(beam.bending_stiffness_n_m2),
+        **stated,
     }
     ends = round(RATE_HZ), round(31 * RATE_HZ)
     writer.begin(1_700_000_000_000_000_000, metadata, {"rest": (0, ends[0]), "sweep": ends}, {})
     writer.write_samples(block)
     return writer.close({"outcome": "complete"})
+
+
+@pytest.fixture(scope="session")
+def make_file():
+    return short_session
 
 
 @pytest.fixture(scope="session")
@@ -87,7 +95,9 @@ def welch_fit(structure, weighting, at_bounds=(), **free):
     return WelchFit(structure, weighting, damping, values, 1.0, at_bounds)
 
 
-def record_estimate(structure, values, covariance, determined, at_bounds=(), cost=100.0):
+def record_estimate(
+    structure, values, covariance, determined, at_bounds=(), cost=100.0, uniform=True, bic=0.0
+):
     """Estimate with the link's own settings where `values` says nothing."""
     every = Plant(LINK, Damping()).parameters | dict(STRUCTURES[structure].fixed) | values
     beam = Beam(
@@ -100,17 +110,28 @@ def record_estimate(structure, values, covariance, determined, at_bounds=(), cos
         Damping(every["zeta"], every["alpha"], every["gamma"], every["lambda"]),
         every["delay_s"],
         every["tool_inertia_kg_m2"],
+        tuple(value for name, value in every.items() if name.startswith("stiffness_offset")),
     )
     return RecordEstimate(
-        structure, plant, every, dict.fromkeys(every, 0.0), tuple(determined),
-        np.asarray(covariance), at_bounds, cost, 100,
+        structure=structure, uniform=uniform, plant=plant, parameters=every,
+        std=dict.fromkeys(every, 0.0), determined=tuple(determined),
+        covariance=np.asarray(covariance), at_bounds=at_bounds,
+        modes=(ModeEstimate(1, 2.5, 1e-4, 0.01, 1e-5),), cost=cost, degrees_of_freedom=100,
+        deviance=cost, bic=bic, values=100, indices=Indices(1.0, 1.0, 1.0),
     )  # fmt: skip
 
 
-def session_result(name="a.mcap", fits=(), estimates=(), peaks=(), response=(1 + 0j, 2 + 0j)):
+def experiment(name="a.mcap", sweep_s=30.0, **facts):
+    return Experiment({"beam_length_m": 0.98, **facts}, sweep_s, (name,))
+
+
+def session_result(
+    name="a.mcap", fits=(), estimates=(), peaks=(), response=(1 + 0j, 2 + 0j), verdict=None
+):
     response = np.array(response)
     return SessionResult(
         path=Path(name),
+        experiment=experiment(name),
         beam=LINK,
         tool_inertia_kg_m2=0.0,
         delay_s=0.0,
@@ -119,6 +140,7 @@ def session_result(name="a.mcap", fits=(), estimates=(), peaks=(), response=(1 +
         peaks=tuple(Peak(*each) if each else None for each in peaks),
         welch_fits=tuple(fits),
         record_estimates=tuple(estimates),
+        verdict=verdict,
         warnings=(),
     )
 
@@ -136,3 +158,8 @@ def make_estimate():
 @pytest.fixture(scope="session")
 def make_session():
     return session_result
+
+
+@pytest.fixture(scope="session")
+def make_experiment():
+    return experiment

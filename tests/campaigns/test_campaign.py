@@ -4,17 +4,18 @@ import csv
 import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from analysis.campaigns import CampaignError, campaign
+from analysis.campaigns.document import campaign_document
 from analysis.campaigns.session import SessionTask, analyse_session
-from analysis.campaigns.tables import campaign_tables, pooled_meaning, tables_text
+from analysis.campaigns.tables import campaign_tables, tables_text
 from analysis.campaigns.validation import forecasts, left_out_errors
 from analysis.campaigns.write import write_campaign
+from analysis.model import FrequencyResponseModel
 from analysis.whole_record import BAND_HZ, Plant
 
 
@@ -59,7 +60,7 @@ def test_workers_find_what_this_process_finds(done, short_sessions, settings):
 def test_the_pooled_estimate_is_the_truth_within_its_interval(done, truth):
     found, _ = done
     _, damping = truth
-    estimates = {each.structure: each for each in found.pooled}
+    estimates = {each.name: each for each in found.pooled}
     three = estimates["III"]
     values = {each.name: each for each in three.parameters}
     assert abs(values["zeta"].value - damping.zeta) < 4 * values["zeta"].std
@@ -71,11 +72,11 @@ def test_the_pooled_estimate_is_the_truth_within_its_interval(done, truth):
 
 def test_left_out_sessions_are_predicted_to_within_noise(done):
     found, _ = done
-    right = [e for e in found.validation if (e.method, e.structure) == ("record", "III")]
+    right = [e for e in found.validation if (e.method, e.name) == ("record", "III")]
     assert len(right) == len(found.sessions)
     for each in right:
         assert each.error < 1.05 * each.own_error
-    wrong = [e.error for e in found.validation if (e.method, e.structure) == ("record", "I")]
+    wrong = [e.error for e in found.validation if (e.method, e.name) == ("record", "I")]
     assert min(wrong) > 1.5 * max(e.error for e in right)
 
 
@@ -140,24 +141,51 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert content["pooled"][0].keys() >= {"type", "parameter", "value", "between_std"}
     assert len(content["errors"]) == 2
     assert len(content["sessions_welch"]) == len(found.sessions) * 4
+    page = (tmp_path / "report.html").read_text()
+    assert page.index("Type III: damping") < page.index("<figure") < page.index('id="table3"')
+    assert "torn.mcap" in page
+    assert "http" not in page.replace("http://www.w3.org", "")
     text = (tmp_path / "tables.txt").read_text()
     for words in ("Table 3", "Table 4", "Table 5", "Pooled", "predicted from the others", "torn"):
         assert words in text
     assert {f"{name}.csv" for name in ("table5", "pooled", "validation")} <= names
 
 
-def test_words_about_scatter(done):
+def test_the_verdict_names_the_structure_and_comes_first(done, tmp_path):
     found, _ = done
-    assert "they repeat" in pooled_meaning(found)
-    (best,) = (each for each in found.pooled if each.structure == "III")
-    shaken = replace(
-        best, parameters=tuple(replace(each, chance=1e-4) for each in best.parameters[:1])
-    )
-    told = pooled_meaning(replace(found, pooled=(shaken,)))
-    assert "differ by more than their own uncertainties in ζ" in told
-    assert "no structure tried" in pooled_meaning(
-        replace(found, pooled=(replace(best, misfit=9.0),))
-    )
+    verdict = found.verdict
+    assert (verdict.structure, verdict.uniform, verdict.sessions) == ("III", True, 4)
+    assert verdict.adequate == 4
+    assert (verdict.alpha.status, verdict.alpha.value) == ("integer", 1.0)
+    assert (verdict.lambda_.status, verdict.lambda_.value) == ("integer", 1.0)
+    assert verdict.dissent == ()
+    assert verdict.sentences[0].startswith("Type III: damping by the material (of order 1)")
+    assert any("they repeat" in sentence for sentence in verdict.sentences)
+    assert tables_text(found).startswith("Type III: damping")
+    document = campaign_document(found)
+    assert document["verdict"]["structure"] == "III"
+    assert document["verdict"]["alpha"]["value"] == 1.0
+    assert document["files"][0]["verdict"]["structure"]
+    fits = {(fit["file"], fit["estimator"], fit["type"], fit["weighting"]) for fit in
+            document["fits"]}  # fmt: skip
+    assert (str(found.sessions[0].path), "record", "III", None) in fits
+    three = next(f for f in document["fits"] if (f["estimator"], f["type"]) == ("record", "III"))
+    assert three["std"]["zeta"] > 0
+    assert three["std"]["alpha"] is None
+    assert {mode["mode"] for mode in document["modes"]} == {1, 2, 3}
+
+
+def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
+    found, _ = done
+    session = found.sessions[0]
+    for each in session.record_estimates:
+        plant = each.plant
+        model = FrequencyResponseModel(session.frequency_hz, plant.beam, plant.tool_inertia_kg_m2)
+        late = np.exp(-2j * np.pi * session.frequency_hz * plant.delay_s)
+        away = np.abs(model.evaluate(plant.damping) * late - session.response)
+        if each.uniform:
+            assert each.indices.mse == pytest.approx(np.mean(away**2), rel=1e-6)
+            assert each.indices.md == pytest.approx(away.max(), rel=1e-6)
 
 
 def test_the_paper_s_numbers_stand_beside_only_on_request(done):
@@ -165,23 +193,6 @@ def test_the_paper_s_numbers_stand_beside_only_on_request(done):
     assert campaign_tables(found)
     assert "the paper's" not in tables_text(found)
     assert "(1.33)" in tables_text(found, with_paper=True)
-
-
-def test_a_cluster_finds_the_same(done, short_sessions, settings, monkeypatch):
-    """From another folder than the workers', by relative paths."""
-    distributed = pytest.importorskip("distributed", reason="the extra `dask` is not installed")
-    found, _ = done
-    monkeypatch.chdir(short_sessions[0].parent)
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
-    ) as cluster:
-        there = campaign(
-            [Path(path.name) for path in short_sessions], settings, structures=("III",),
-            dask=cluster.scheduler_address,
-        )  # fmt: skip
-    assert [each.path for each in there.sessions] == short_sessions
-    for one, two in zip(there.statistics, found.statistics, strict=True):
-        assert one.mean == pytest.approx(two.mean, rel=1e-9)
 
 
 def test_no_session_left(tmp_path, settings):

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.campaigns.pooled import best_estimate, pooled
+from analysis.campaigns.pooled import pooled, pooled_bic
 
 WITHIN = np.array([[0.02**2, -0.99 * 0.02 * 0.004], [-0.99 * 0.02 * 0.004, 0.004**2]])
 
@@ -74,13 +74,68 @@ def test_a_setting_on_its_bound_in_some_session_gets_the_plain_mean(make_estimat
     assert found.plant.damping.zeta == found.parameters[0].value
 
 
-def test_the_best_structure_is_of_the_lowest_criterion(make_estimate):
-    two = [
-        [make_estimate(name, {"zeta": 1e-4, "alpha": 1.0}, cov, free, cost=cost)] * 2
-        for name, cov, free, cost in (
-            ("I", [[1e-4]], ("zeta",), 103.0),
-            ("IV", WITHIN, ("zeta", "alpha"), 100.0),
+def evidence(make_estimate, alphas, std):
+    """Types I and IV on sessions of 1000 values: what an alpha of 1 costs each of them."""
+    cov = np.diag([1e-4, std**2])
+    one = [
+        make_estimate(
+            "I", {"zeta": 1e-4}, [[1e-4]], ("zeta",), cost=1000 + ((alpha - 1) / std) ** 2
         )
+        for alpha in alphas
     ]
-    # An order more costs ln(100) = 4.6 a session, and gains 3.
-    assert best_estimate([pooled(each) for each in two]).structure == "I"
+    free = [
+        make_estimate("IV", {"zeta": 1e-4, "alpha": a}, cov, ("zeta", "alpha"), cost=1000.0)
+        for a in alphas
+    ]
+    return one, free
+
+
+def test_all_sessions_tell_what_none_can_alone(make_estimate):
+    """An alpha 1.5 standard deviations from 1, twenty times: 45 of deviance for one parameter."""
+    rng = np.random.default_rng(5)
+    one, free = evidence(make_estimate, rng.normal(0.985, 0.01, 20), 0.01)
+    gain = np.array([a.deviance - b.deviance for a, b in zip(one, free, strict=True)])
+    assert np.median(gain) < math.log(100)
+    assert pooled_bic(free) < pooled_bic(one) - 10
+
+
+def test_an_order_of_one_is_not_made_fractional_by_many_sessions(make_estimate):
+    """A hundred campaigns of twenty: the simpler structure wins but for chance."""
+    wins = 0
+    for seed in range(100):
+        alphas = np.random.default_rng(seed).normal(1.0, 0.01, 20)
+        one, free = evidence(make_estimate, alphas, 0.01)
+        wins += pooled_bic(one) < pooled_bic(free)
+    assert wins >= 97
+
+
+def test_what_sharing_a_value_costs(make_estimate):
+    """Two sessions a and b of one std: (a-b)²/2 of it², and ln of the number of all data."""
+    _, free = evidence(make_estimate, [1.00, 1.01], 0.01)
+    assert pooled_bic(free) == pytest.approx(2000.0 + 0.5 + 2 * math.log(200), abs=1e-9)
+
+
+def test_what_a_session_leaves_undetermined_counts_in_each(make_estimate):
+    _, (good, _) = evidence(make_estimate, [1.0, 1.0], 0.01)
+    lost = make_estimate(
+        "IV", {"zeta": 1e-4, "alpha": 0.0}, [[1e-4]], ("zeta",), ("alpha",), cost=1000.0
+    )
+    found = pooled_bic([good, lost])
+    assert found == pytest.approx(2000.0 + math.log(200) + 2 * math.log(100), abs=1e-9)
+
+
+def test_modes_with_a_stiffness_of_their_own_are_pooled(make_estimate):
+    names = ("zeta", "gamma", "stiffness_offset_2")
+    estimates = [
+        make_estimate(
+            "III", {"zeta": 1e-4, "gamma": 0.1, "stiffness_offset_2": offset},
+            np.diag([1e-4, 1e-4, 1e-6]), names, uniform=False,
+        )
+        for offset in (0.019, 0.021)
+    ]  # fmt: skip
+    found = pooled(estimates)
+    assert found.name == "III, modes free"
+    assert found.plant.stiffness_offsets == pytest.approx((0.02,))
+    (mode,) = found.modes
+    assert (mode.number, mode.frequency_hz) == (1, 2.5)
+    assert mode.frequency_std_hz == pytest.approx(1e-4 / math.sqrt(2))

@@ -1,0 +1,144 @@
+"""What a campaign keeps of the fits of one session."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from analysis.indices import Indices
+    from analysis.selection import Candidate
+    from analysis.welch_route import FittedModel
+    from analysis.whole_record import ModeEstimate, Plant
+    from rigd.beam import Damping
+
+
+def structure_name(structure: str, uniform: bool) -> str:
+    """Name a structure on a uniform beam, or on one whose modes each have a stiffness of theirs."""
+    return structure if uniform else f"{structure}, modes free"
+
+
+@dataclass(frozen=True, slots=True)
+class WelchFit:
+    """One structure fitted to one session by the paper's route, with one weighting.
+
+    Attributes
+    ----------
+    structure, weighting : str
+        Names.
+    damping : Damping
+    parameters : dict
+        zeta, alpha, gamma and lambda, the fixed ones included.
+    cost : float
+        Eq. (26) at the minimum, in (N·m/rad)².
+    at_bounds : tuple of str
+        Free parameters that rest on the edge of the range searched.
+    std : dict or None
+        See `analysis.fit_frf.FrfFit`.
+    indices : Indices or None
+        Distance of this fit from the session's own response.
+    """
+
+    structure: str
+    weighting: str
+    damping: Damping
+    parameters: Mapping[str, float]
+    cost: float
+    at_bounds: tuple[str, ...]
+    std: Mapping[str, float] | None = None
+    indices: Indices | None = None
+
+    @classmethod
+    def of(cls, model: FittedModel) -> WelchFit:
+        """Keep of a fit what a campaign needs."""
+        fit = model.fit
+        return cls(
+            structure=fit.structure.name,
+            weighting=fit.weighting,
+            damping=fit.damping,
+            parameters=dict(fit.parameters),
+            cost=fit.cost,
+            at_bounds=fit.at_bounds,
+            std=None if fit.std is None else dict(fit.std),
+            indices=model.indices,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RecordEstimate:
+    """One structure, on a uniform beam or not, fitted to one whole record.
+
+    Attributes
+    ----------
+    structure : str
+        Its name.
+    uniform : bool
+        Whether all modes follow from one stiffness.
+    plant : Plant
+    parameters : dict of str to float
+        See `analysis.whole_record.RecordFit`, as for the following.
+    std : dict of str to (float or None)
+    determined : tuple of str
+    covariance : ndarray, shape (k, k)
+    at_bounds : tuple of str
+    modes : tuple of ModeEstimate
+    cost : float
+    degrees_of_freedom : int
+    deviance : float
+        ``-2 ln`` likelihood, but for a constant that all estimates of the session share.
+    bic : float
+        Of the session by itself.
+    values : int
+        Real values compared.
+    indices : Indices
+        Distance of its response from the session's by Welch's method: on the same bins as for the
+        paper's fits, and so with the bias of that method in it.
+    """
+
+    structure: str
+    uniform: bool
+    plant: Plant
+    parameters: Mapping[str, float]
+    std: Mapping[str, float | None]
+    determined: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    at_bounds: tuple[str, ...]
+    modes: tuple[ModeEstimate, ...]
+    cost: float
+    degrees_of_freedom: int
+    deviance: float
+    bic: float
+    values: int
+    indices: Indices
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        return structure_name(self.structure, self.uniform)
+
+    @classmethod
+    def of(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
+        """Keep of a fit what a campaign needs: all but the residual."""
+        fit = candidate.fit
+        return cls(
+            structure=fit.structure.name,
+            uniform=candidate.uniform,
+            plant=fit.plant,
+            parameters=dict(fit.parameters),
+            std=dict(fit.std),
+            determined=fit.determined,
+            covariance=fit.covariance,
+            at_bounds=fit.at_bounds,
+            modes=fit.modes,
+            cost=fit.cost,
+            degrees_of_freedom=fit.degrees_of_freedom,
+            deviance=candidate.deviance,
+            bic=candidate.bic,
+            values=candidate.values,
+            indices=indices,
+        )

@@ -1,0 +1,185 @@
+"""The verdict on a campaign in the operator's words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns.labels import label
+from analysis.structures import STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping, Sequence
+
+    from analysis.campaigns.pooled import PooledEstimate
+    from analysis.campaigns.pooled_modes import PooledMode
+    from analysis.campaigns.pooled_orders import PooledOrder
+    from analysis.campaigns.validation import LeftOutError
+
+_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_WRONG: Final = 1.5
+"""Residual, in units of the noise, from which a structure is called wrong."""
+
+_SIGNIFICANT: Final = 0.01
+_NORMAL_95: Final = 1.959963984540054
+_MANY: Final = 5
+_AS_GOOD: Final = 1.01
+
+
+def selected(
+    ranked: Sequence[PooledEstimate],
+    close: Sequence[PooledEstimate],
+    alone: Mapping[str, int],
+    sessions: int,
+    withheld: Collection[str],
+) -> str:
+    """Say what all sessions together select, what it cannot be told from, and who agrees.
+
+    Orders withheld are called open.
+    """
+    best = ranked[0]
+    beam = "" if best.uniform else ", on a beam whose modes each have a stiffness of their own"
+    said = f"Type {best.name}: damping {_damping(best.structure, withheld)}{beam}."
+    if close:
+        names = " or ".join(f"type {each.name}" for each in close)
+        said += (
+            f" All sessions together cannot tell it from {names} (BIC differs by "
+            f"{close[0].bic - best.bic:.1f}; 10 would be clear)."
+        )
+    elif len(ranked) > 1:
+        margin = ranked[1].bic - best.bic
+        said += f" The next, type {ranked[1].name}, is worse by {margin:.3g} in BIC."
+    return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
+
+
+def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
+    """Say how many sessions select or say what when each is looked at by itself."""
+    (first, count), *others = counts.items()
+    verb = do if count > 1 else f"{do}s"
+    more = "".join(f", {n} {what}" for what, n in others)
+    return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
+
+
+def _damping(structure: str, withheld: Collection[str]) -> str:
+    """Say which kinds of damping a structure has, and of which orders."""
+    shape = STRUCTURES[structure]
+
+    def of_order(order: str) -> str:
+        if order in withheld:
+            return "an order that stays open"
+        return "an order of its own" if order in shape.free else "order 1"
+
+    kinds = [
+        f"by the {what} (of {of_order(order)})"
+        for what, order, present in (
+            ("material", "alpha", shape.internal),
+            ("surroundings", "lambda", shape.external),
+        )
+        if present
+    ]
+    return " and ".join(kinds)
+
+
+def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
+    """Say whether what the structure leaves is noise."""
+    if best.misfit > _WRONG:
+        return (
+            f"What it leaves is {best.misfit:.3g} times the noise: no structure tried describes "
+            "the beam, and standard deviations mean little."
+        )
+    if adequate == sessions:
+        return "What it leaves is noise in every session: nothing in the records asks for more."
+    return (
+        f"What is left is noise in {adequate} of {sessions} sessions; in the others something is "
+        "unexplained."
+    )
+
+
+def modes(best: PooledEstimate) -> list[str]:
+    """Say how the modes are damped."""
+    if not best.modes:
+        return []
+    said = "; ".join(map(_mode, best.modes))
+    return [f"Modes: {said} (± 95 % of the mean over the sessions)."]
+
+
+def _mode(mode: PooledMode) -> str:
+    half = _NORMAL_95 * 100 * mode.damping_ratio_std
+    digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
+    return (
+        f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
+        f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"
+    )
+
+
+def order(found: PooledOrder) -> str:
+    """Say what is known of one order."""
+    name, of = found.order, _OF[found.order]
+    counts = {f"“{status}”": count for status, count in found.alone.items()}
+    alone = " " + _alone(counts, sum(counts.values()), "say")
+    if found.status == "absent":
+        return f"No {of} shows, so its order {name} means nothing here.{alone}"
+    if found.status == "not identifiable":
+        return f"The order {name} of the {of} is not identifiable.{alone}"
+    low, high = found.interval or (1.0, 1.0)
+    ends = f"95 %: {low:.4f} to {high:.4f}, scatter between sessions included"
+    if found.status == "integer":
+        free = f" ({ends}, if it is left free)" if found.interval else ""
+        chance = "" if low <= 1 <= high else ", and differs from 1 by no more than chance may"
+        said = f"is 1 as far as all sessions together tell{free}{chance}"
+    elif found.status == "fractional":
+        said = f"is {found.estimate:.4f} ({ends}); 1 is excluded"
+    else:
+        said = (
+            f"stays open: {found.estimate:.4f} would fit ({ends}), but so would an explanation of "
+            "order 1, or part of the records is unexplained; it is not reported"
+        )
+    return f"The order {name} of the {of} {said}.{alone}"
+
+
+def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
+    """Name the sessions, with what they select, that by themselves dismiss it."""
+    if not who:
+        return []
+    names = ", ".join(f"{file} (type {structure})" for file, structure in who[:_MANY])
+    more = f" and {len(who) - _MANY} more" if len(who) > _MANY else ""
+    return [
+        f"Type {best.name} is dismissed by {len(who)} session{'s' if len(who) > 1 else ''} alone: "
+        f"{names}{more}. Look at their reports (analyze --each) before you trust the mean."
+    ]
+
+
+def scatter(best: PooledEstimate) -> str:
+    """Say whether the sessions repeat: one alarm in a hundred campaigns that do is false."""
+    level = _SIGNIFICANT / max(len(best.parameters), 1)
+    moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
+    if not moved:
+        return (
+            "Sessions differ by no more than their own uncertainties (p: probability of so much "
+            "scatter by these alone); they repeat."
+        )
+    return (
+        f"Sessions differ by more than their own uncertainties in {', '.join(moved)} (p: "
+        "probability of so much scatter by these alone): something changes between sessions, "
+        "such as clamp, temperature or motor, and the interval of one session alone is too "
+        "narrow for the specimen."
+    )
+
+
+def foresight(best: PooledEstimate, validation: Sequence[LeftOutError]) -> list[str]:
+    """Say how well the sessions predict one that they have not seen."""
+    of_best = [each for each in validation if each.method == "record" and each.name == best.name]
+    own = [each.own_error for each in of_best if each.own_error is not None]
+    if not own:
+        return []
+    error, alone = float(np.mean([each.error for each in of_best])), float(np.mean(own))
+    verdict = (
+        "as well as by a fit to itself"
+        if error <= _AS_GOOD * alone
+        else "worse than by a fit to itself: the parameters wander"
+    )
+    return [
+        f"From the others, the torque of a session is predicted to {100 * error:.2f} % (its own "
+        f"fit: {100 * alone:.2f} %, noise included), {verdict}."
+    ]

@@ -1,0 +1,154 @@
+"""The verdict on a campaign: one structure for the specimen, and what is known of its damping."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from analysis.campaigns import sentences
+from analysis.campaigns.common_findings import CommonFinding, common_findings
+from analysis.campaigns.pooled_orders import PooledOrder, pooled_order, rivals
+from analysis.selection.orders import EVEN, STRONG
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from analysis.campaigns.pooled import PooledEstimate
+    from analysis.campaigns.session import SessionResult
+    from analysis.campaigns.validation import LeftOutError
+
+
+@dataclass(frozen=True, slots=True)
+class Dissent:
+    """A session that by itself dismisses what all together select.
+
+    Attributes
+    ----------
+    file : str
+        Name.
+    structure : str
+        What it selects, as tables call it.
+    margin : float
+        By how much its own BIC is lower so.
+    """
+
+    file: str
+    structure: str
+    margin: float
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignVerdict:
+    """What can be said of a specimen from all its sessions.
+
+    Attributes
+    ----------
+    structure : str
+        Selected: "I" to "VII".
+    uniform : bool
+        Whether the beam selected is uniform.
+    rivals : tuple of str
+        Structures, as tables call them, that all data together cannot tell from it.
+    sessions : int
+        Those with a verdict of their own, on which this one rests.
+    alone : mapping of str to int
+        How many sessions select which structure by themselves.
+    adequate : int
+        Sessions in which what it leaves is noise.
+    alpha, lambda_ : PooledOrder
+    findings : tuple of CommonFinding
+        What else is in the records.
+    dissent : tuple of Dissent
+    sentences : tuple of str
+        The verdict in words, the most important first.
+    experiments : tuple of str
+        What would tell more.
+    """
+
+    structure: str
+    uniform: bool
+    rivals: tuple[str, ...]
+    sessions: int
+    alone: Mapping[str, int]
+    adequate: int
+    alpha: PooledOrder
+    lambda_: PooledOrder
+    findings: tuple[CommonFinding, ...]
+    dissent: tuple[Dissent, ...]
+    sentences: tuple[str, ...]
+    experiments: tuple[str, ...]
+
+    @property
+    def withheld(self) -> frozenset[str]:
+        """Orders that are not to be reported."""
+        return _withheld(self.alpha, self.lambda_)
+
+
+def campaign_verdict(
+    sessions: Sequence[SessionResult],
+    pooled: Sequence[PooledEstimate],
+    validation: Sequence[LeftOutError],
+) -> CampaignVerdict | None:
+    """Judge a campaign; None if fewer than two sessions determine any structure's damping.
+
+    Parameters
+    ----------
+    sessions : sequence of SessionResult
+    pooled : sequence of PooledEstimate
+        The lowest BIC first.
+    validation : sequence of LeftOutError
+    """
+    verdicts = [session.verdict for session in sessions if session.verdict is not None]
+    if not pooled or not verdicts:
+        return None
+    best = pooled[0]
+    alpha, lambda_ = (pooled_order(order, pooled, verdicts) for order in ("alpha", "lambda"))
+    found = common_findings(sessions)
+    close = rivals(pooled, EVEN)
+    alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
+    adequate = sum(verdict.adequate for verdict in verdicts)
+    dissent = _dissent(sessions, best)
+    advice = Counter(advice for verdict in verdicts for advice in verdict.experiments)
+    return CampaignVerdict(
+        structure=best.structure,
+        uniform=best.uniform,
+        rivals=tuple(each.name for each in close),
+        sessions=len(verdicts),
+        alone=alone,
+        adequate=adequate,
+        alpha=alpha,
+        lambda_=lambda_,
+        findings=found,
+        dissent=dissent,
+        sentences=(
+            sentences.selected(pooled, close, alone, len(verdicts), _withheld(alpha, lambda_)),
+            sentences.left_over(best, adequate, len(verdicts)),
+            *sentences.modes(best),
+            sentences.order(alpha),
+            sentences.order(lambda_),
+            *(finding.sentence for finding in found),
+            *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
+            sentences.scatter(best),
+            *sentences.foresight(best, validation),
+        ),
+        experiments=tuple(
+            what for what, count in advice.most_common() if 2 * count > len(verdicts)
+        ),
+    )
+
+
+def _withheld(*orders: PooledOrder) -> frozenset[str]:
+    return frozenset(each.order for each in orders if each.value is None)
+
+
+def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[Dissent, ...]:
+    found = []
+    for session in sessions:
+        by_name = {each.name: each for each in session.record_estimates}
+        if by_name:
+            own = min(by_name.values(), key=lambda each: each.bic)
+            margin = by_name[best.name].bic - own.bic
+            if margin > STRONG:
+                found.append(Dissent(session.path.name, own.name, margin))
+    return tuple(sorted(found, key=lambda each: -each.margin))

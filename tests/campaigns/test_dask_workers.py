@@ -1,0 +1,122 @@
+"""Campaigns on a Dask cluster of this machine: in this process, and once as processes."""
+
+import re
+import sys
+import time
+from pathlib import Path
+
+import dask
+import distributed
+import pytest
+
+from analysis.campaigns import CampaignError, campaign, dask_workers
+from analysis.campaigns.dask_workers import dask_cluster, versions
+from analysis.campaigns.workers import Lost
+
+ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Scheduler and one worker with two threads, in this process."""
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0"
+    ) as made:
+        yield made
+
+
+def test_results_come_in_order_and_each_call_counts(cluster):
+    seen = []
+    with dask_cluster(cluster.scheduler_address) as workers:
+        assert workers.run(pow, [(2, n) for n in range(9)], seen.append) == [2**n for n in range(9)]
+        first, second = workers.run(time.monotonic_ns, [(), ()])
+    assert first != second
+    assert sorted(seen) == list(range(9))
+
+
+def test_a_campaign_finds_what_it_finds_here(cluster, short_sessions, settings, monkeypatch):
+    """From another folder than the workers', by relative paths."""
+    monkeypatch.chdir(short_sessions[0].parent)
+    paths = [Path(path.name) for path in short_sessions[:2]]
+    there = campaign(paths, settings, structures=(), dask=cluster.scheduler_address)
+    here = campaign(paths, settings, structures=(), jobs=1)
+    assert [each.path for each in there.sessions] == short_sessions[:2]
+    for one, two in zip(there.statistics, here.statistics, strict=True):
+        assert one.mean == pytest.approx(two.mean, rel=1e-9)
+
+
+class Elsewhere:
+    """A client whose one worker says this of its versions."""
+
+    def __init__(self, said):
+        self.said = said
+
+    def wait_for_workers(self, *_, **__):
+        pass
+
+    def run(self, *_, **__):
+        return {"tcp://10.0.0.7:1": self.said}
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (versions() | {"rigd": "9.9"}, f"7:1 has rigd 9.9 and not {versions()['rigd']}: install"),
+        (ModuleNotFoundError("no", name="analysis"), "7:1 has no module analysis: install rigd"),
+        (OSError("no"), "7:1 cannot be used: no"),
+    ],
+)
+def test_a_worker_of_other_versions_is_told(said, words):
+    with pytest.raises(CampaignError, match=re.escape(words)):
+        dask_workers._check_workers(Elsewhere(said), "tcp://10.0.0.5:8786")
+    dask_workers._check_workers(Elsewhere(versions()), "tcp://10.0.0.5:8786")
+
+
+def test_a_cluster_without_workers_is_told(monkeypatch):
+    monkeypatch.setattr(dask_workers, "_WORKERS_S", 0.5)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
+        pytest.raises(CampaignError, match="has no workers; start some with 'dask worker"),
+        dask_cluster(empty.scheduler_address),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "nobody", "tcp://[::1]:9"])
+def test_a_scheduler_that_is_not_there_is_told(address):
+    with (
+        pytest.raises(CampaignError, match=rf"No Dask scheduler answers at {re.escape(address)}"),
+        dask_cluster(address),
+    ):
+        pass
+
+
+def test_without_dask_it_is_said_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(CampaignError, match=r"pip install 'rigd\[dask\]'"), dask_cluster("tcp://x"):
+        pass
+
+
+def test_a_worker_that_is_lost_takes_one_task_with_it_and_no_more():
+    with (
+        dask.config.set(ONE_DEATH_IS_ENOUGH),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0"
+        ) as processes,
+        dask_cluster(processes.scheduler_address) as workers,
+    ):
+        one, lost, two = workers.run(eval, [("1",), ("__import__('os')._exit(1)",), ("2",)])
+    assert isinstance(lost, Lost)
+    assert (one, two) == (1, 2)
+
+
+def test_a_scheduler_that_goes_away_is_told(monkeypatch):
+    processes = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"
+    )
+    with (
+        processes,
+        pytest.raises(CampaignError, match="went away; look at its log"),
+        dask_cluster(processes.scheduler_address) as workers,
+    ):
+        workers.run(time.sleep, [(0.0,), (0.2,), (0.2,)], lambda _done: processes.close())

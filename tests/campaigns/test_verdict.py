@@ -1,0 +1,164 @@
+"""The verdict on a campaign from made-up estimates: what it may say, and what it must not."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from analysis.campaigns import sentences
+from analysis.campaigns.common_findings import common_findings
+from analysis.campaigns.pooled import pooled
+from analysis.campaigns.pooled_orders import pooled_order
+from analysis.campaigns.verdict import campaign_verdict
+from analysis.selection import Finding
+
+COVARIANCE = {"zeta": 1e-4, "alpha": 1e-4, "gamma": 1e-4, "lambda": 1e-4}
+
+
+def said(structure="VI", alpha="fractional", adequate=True, modes=(1, 2, 3), findings=()):
+    return SimpleNamespace(
+        structure=structure, uniform=True, adequate=adequate, visible_modes=modes,
+        findings=findings, experiments=("Sweep longer.",),
+        alpha=SimpleNamespace(status=alpha), lambda_=SimpleNamespace(status="fractional"),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def estimates_of(make_estimate):
+    """Type by type: the same estimate of each of four sessions, alpha and its std as wanted."""
+
+    def make(structure, deviance, alpha=0.8, std=0.01):
+        values = {"zeta": 1e-4, "alpha": alpha, "gamma": 0.1, "lambda": 0.6}
+        fixed = {"I": {"alpha": 1.0}, "IV": {}, "VI": {}, "VII": {"alpha": 1.0}}[structure]
+        kept = ("zeta", "alpha") if structure in ("I", "IV") else tuple(values)
+        names = [name for name in kept if name not in fixed]
+        covariance = np.diag([(std if n == "alpha" else 0.01) ** 2 for n in names])
+        return [
+            make_estimate(
+                structure, {n: values[n] for n in names}, covariance, names, cost=deviance,
+                bic=deviance,
+            )
+        ] * 4  # fmt: skip
+
+    return make
+
+
+def ranked(*groups):
+    return sorted(map(pooled, groups), key=lambda each: each.bic)
+
+
+def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_of):
+    order = pooled_order(
+        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0)), [said()] * 4
+    )
+    assert order.status == "fractional"
+    assert order.value == pytest.approx(0.8)
+    assert order.interval[0] < 0.8 < order.interval[1] < 1
+    assert order.alone == {"fractional": 4}
+
+
+@pytest.mark.parametrize(
+    ("rival", "verdict", "status"),
+    [
+        (101.5, said(), "not supported"),  # an integer explains as much: 6 in BIC, less one ln 400
+        (150.0, said(adequate=False), "not supported"),  # something is unexplained
+        (150.0, said(modes=(1,)), "not identifiable"),  # one mode shows no order
+    ],
+)
+def test_an_order_is_withheld(estimates_of, rival, verdict, status):
+    order = pooled_order(
+        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", rival)), [verdict] * 4
+    )
+    assert order.status == status
+    assert order.value is None
+
+
+def test_one_session_in_ten_may_hold_something_else(estimates_of):
+    groups = ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0))
+    verdicts = [*[said()] * 9, said(adequate=False)]
+    assert pooled_order("alpha", groups, verdicts).status == "fractional"
+
+
+def test_an_order_that_could_be_anything_is_not_identifiable(estimates_of):
+    groups = ranked(estimates_of("VI", 100.0, std=0.5), estimates_of("VII", 101.0))
+    order = pooled_order("alpha", groups, [said()] * 4)
+    assert (order.status, order.value, order.interval) == ("not identifiable", None, None)
+    assert "not identifiable" in sentences.order(order)
+
+
+@pytest.mark.parametrize(("alpha", "rival", "status"), [(1.005, 99.0, "integer"),
+                                                        (0.97, 101.0, "integer"),
+                                                        (0.97, 97.5, "not supported")])  # fmt: skip
+def test_an_order_of_one_is_told_with_what_it_would_be_if_free(estimates_of, alpha, rival, status):
+    """1 inside the interval; outside, but dismissed by BIC; outside, and not dismissed."""
+    groups = ranked(estimates_of("VI", rival, alpha), estimates_of("VII", 100.0))
+    assert groups[0].structure == "VII" or status == "not supported"
+    order = pooled_order("alpha", groups, [said("VII", "integer")] * 4)
+    assert order.status == status
+    assert order.interval[0] < alpha < order.interval[1]
+
+
+def test_damping_that_no_session_needs_is_absent(estimates_of):
+    order = pooled_order("lambda", ranked(estimates_of("IV", 100.0)), [said("IV")] * 4)
+    assert (order.status, order.value) == ("absent", None)
+    assert "No external damping shows" in sentences.order(order)
+
+
+def delay(value):
+    return Finding(
+        kind="delay", sentence=f"The torque comes {1e3 * value:.3f} ms later than the file says.",
+        value=value, interval=None, unit="s", remedy="Declare it.",
+    )  # fmt: skip
+
+
+def stiffening(mode):
+    return Finding(
+        kind="nonlinear stiffness", sentence=f"The stiffness of mode {mode} rises by 1.0 %.",
+        value=0.01, interval=None, unit="1", remedy="",
+    )  # fmt: skip
+
+
+def test_findings_are_counted_over_the_sessions(make_session):
+    sessions = [
+        make_session(f"{number}.mcap", verdict=said(findings=(delay(value), *more)))
+        for number, (value, more) in enumerate(
+            [(0.29e-3, ()), (0.31e-3, (stiffening(1),)), (0.30e-3, (stiffening(2),))]
+        )
+    ]
+    late, first, second = common_findings([*sessions, make_session("none.mcap")])
+    assert late.files == ("0.mcap", "1.mcap", "2.mcap")
+    assert late.span == pytest.approx((0.29e-3, 0.31e-3))
+    assert late.sentence.startswith("In 3 of 3 sessions: The torque comes 0.300 ms later")
+    assert "0.29 to 0.31 ms" in late.sentence
+    # Of two modes: two things, though the sentences differ by a figure only.
+    assert {first.files, second.files} == {("1.mcap",), ("2.mcap",)}
+    assert first.sentence.startswith("In 1 of 3 sessions (1.mcap):")
+
+
+def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimates_of):
+    six, seven = estimates_of("VI", 100.0), estimates_of("VII", 150.0)
+    sessions = [
+        make_session(f"{n}.mcap", estimates=pair, verdict=said())
+        for n, pair in enumerate(zip(six, seven, strict=True))
+    ]
+    other = (replace(six[0], bic=180.0), seven[0])
+    sessions[2] = make_session("2.mcap", estimates=other, verdict=said("VII"))
+    found = campaign_verdict(sessions, ranked(six, seven), ())
+    assert found.structure == "VI"
+    assert found.alone == {"VI": 3, "VII": 1}
+    ((name, structure, margin),) = [(d.file, d.structure, d.margin) for d in found.dissent]
+    assert (name, structure, margin) == ("2.mcap", "VII", 30.0)
+    (told,) = (s for s in found.sentences if "dismissed" in s)
+    assert "2.mcap (type VII)" in told
+    assert found.experiments == ("Sweep longer.",)
+    assert campaign_verdict(sessions, (), ()) is None
+
+
+def test_words_about_scatter_and_misfit(estimates_of):
+    (best,) = ranked(estimates_of("VI", 100.0))
+    assert "they repeat" in sentences.scatter(best)
+    shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
+    assert "differ by more than their own uncertainties in ζ" in sentences.scatter(shaken)
+    assert "no structure tried" in sentences.left_over(replace(best, misfit=9.0), 4, 4)
+    assert "noise in 3 of 4 sessions" in sentences.left_over(best, 3, 4)
