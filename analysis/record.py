@@ -11,7 +11,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigd.beam import Beam
+from analysis.record_checks import (
+    MAX_FILLED_SHARE,
+    MAX_GAP_S,
+    MAX_TICKS,
+    RecordError,
+    check_clock,
+    check_fillable,
+    check_finite,
+    check_sensor,
+    check_span,
+    longest_run,
+)
+from analysis.stated_values import (
+    stated_beam,
+    stated_delay_s,
+    stated_rate_hz,
+    stated_tool_inertia_kg_m2,
+)
 from rigd.session import Session, Status, read_session
 
 if TYPE_CHECKING:
@@ -20,18 +37,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-MAX_FILLED_SHARE = 0.01
-"""Largest share of the sweep that may be interpolated, in each of angle and torque."""
+    from rigd.beam import Beam
 
-MAX_GAP_S = 0.1
-"""Longest single gap in the sweep that is interpolated; a longer one is refused."""
+__all__ = ["MAX_FILLED_SHARE", "MAX_GAP_S", "Gaps", "Record", "RecordError", "load_record"]
 
-MAX_SPAN = 10
-"""Most ticks per recorded sample: a file with next to no samples in its span would only fill the
-memory, and no sweep in it could be analysed."""
-
-MAX_CLOCK_ERROR = 1e-3
-"""Largest relative difference between the rate stated and the rate of the time stamps."""
+MAX_SESSION_BYTES = 150 * MAX_TICKS
+"""Most memory for the messages of a session, which take so much a sample."""
 
 _REPORTED_FLAGS = (
     (Status.TORQUE_SATURATED, "torque command saturated"),
@@ -48,10 +59,6 @@ _CONSEQUENCES: tuple[tuple[str, str], ...] = (
     ("torque command saturated", "The angle did not follow its reference there."),
     ("torque off", "The motor was not driven there."),
 )
-
-
-class RecordError(ValueError):
-    """A session that was read but cannot be analysed; the message names file, cause and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,16 +170,17 @@ def load_record(path: Path) -> Record:
     RecordError
         It was read, but its samples cannot be analysed.
     """
-    session = read_session(path)
+    session = read_session(path, max_bytes=MAX_SESSION_BYTES)
     samples = session.samples
     if len(samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
-    rate_hz = _positive(session, "rate_hz", "Hz")
+    rate_hz = stated_rate_hz(session)
     ticks = samples["tick"].astype(np.int64)
-    _check_span(path, ticks)
-    _check_clock(path, ticks, samples["t_ns"], rate_hz)
+    check_span(path, ticks)
+    check_clock(path, ticks, samples["t_ns"], rate_hz)
     for field in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
-        _check_finite(path, field, samples[field], ticks)
+        check_finite(path, field, samples[field], ticks)
+    check_sensor(path, samples["coupling_torque_nm"])
 
     first_tick = int(ticks[0])
     index = ticks - first_tick
@@ -188,11 +196,11 @@ def load_record(path: Path) -> Record:
         ("angle", missing | stale_angle),
         ("torque", missing | stale_torque),
     ):
-        _check_fillable(path, channel, unknown[sweep], first_tick + sweep.start, rate_hz)
+        check_fillable(path, channel, unknown[sweep], first_tick + sweep.start, rate_hz)
 
     gaps = Gaps(
         missing_ticks=int(missing.sum()),
-        longest_gap_ticks=_longest_run(missing)[0],
+        longest_gap_ticks=longest_run(missing)[0],
         sweep_missing_ticks=int(missing[sweep].sum()),
         sweep_stale_angles=int(stale_angle[sweep].sum()),
         sweep_stale_torques=int(stale_torque[sweep].sum()),
@@ -208,10 +216,10 @@ def load_record(path: Path) -> Record:
         angle_known=~(missing | stale_angle),
         torque_known=~(missing | stale_torque | ((status & Status.WRENCH_SATURATED) != 0)),
         rate_hz=rate_hz,
-        beam=_beam(session),
-        angle_delay_s=session.number("angle_delay_s", 0.0),
-        torque_delay_s=session.number("torque_delay_s", 0.0),
-        tool_inertia_kg_m2=_tool_inertia(session),
+        beam=stated_beam(session, rate_hz, length),
+        angle_delay_s=stated_delay_s(session, "angle_delay_s"),
+        torque_delay_s=stated_delay_s(session, "torque_delay_s"),
+        tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
         sweep=sweep,
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
@@ -220,70 +228,6 @@ def load_record(path: Path) -> Record:
         metadata=session.metadata,
         outcome=outcome.get("outcome", "unknown"),
     )
-
-
-def _positive(session: Session, key: str, unit: str) -> float:
-    value = session.number(key)
-    if not value > 0.0:
-        raise RecordError(
-            f"{session.path}: {key} is {value:g} {unit}, but must be positive; "
-            "correct the file's metadata."
-        )
-    return value
-
-
-def _beam(session: Session) -> Beam:
-    return Beam(
-        length_m=_positive(session, "beam_length_m", "m"),
-        density_kg_per_m=_positive(session, "beam_density_kg_per_m", "kg/m"),
-        bending_stiffness_n_m2=_positive(session, "beam_bending_stiffness_n_m2", "N·m²"),
-    )
-
-
-def _tool_inertia(session: Session) -> float:
-    inertia_kg_m2 = session.number("tool_inertia_kg_m2", 0.0)
-    if inertia_kg_m2 < 0.0:
-        raise RecordError(
-            f"{session.path}: tool_inertia_kg_m2 is {inertia_kg_m2:g} kg·m², but an inertia cannot "
-            "be negative; correct the file's metadata."
-        )
-    return inertia_kg_m2
-
-
-def _check_span(path: Path, ticks: NDArray[np.int64]) -> None:
-    """Refuse a span of ticks that is all but empty."""
-    span = int(ticks[-1] - ticks[0]) + 1
-    if span > MAX_SPAN * len(ticks):
-        raise RecordError(
-            f"{path}: only {len(ticks)} of the {span} ticks from {ticks[0]} to {ticks[-1]} have a "
-            "sample, too few to analyse; record the session again."
-        )
-
-
-def _check_clock(
-    path: Path, ticks: NDArray[np.int64], t_ns: NDArray[np.int64], rate_hz: float
-) -> None:
-    """Refuse time stamps that contradict the rate."""
-    if len(ticks) < 2:
-        return
-    elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
-    rate_of_stamps_hz = 1e9 * int(ticks[-1] - ticks[0]) / elapsed_ns
-    if abs(rate_of_stamps_hz / rate_hz - 1.0) > MAX_CLOCK_ERROR:
-        raise RecordError(
-            f"{path}: rate_hz is {rate_hz:g} Hz, but the time stamps t_ns advance at "
-            f"{rate_of_stamps_hz:g} ticks per second; correct whichever is wrong."
-        )
-
-
-def _check_finite(
-    path: Path, field: str, values: NDArray[np.float64], ticks: NDArray[np.int64]
-) -> None:
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
-        raise RecordError(
-            f"{path}: {field} is {values[bad[0]]} at tick {ticks[bad[0]]} and not finite in "
-            f"{bad.size} of {len(values)} samples; no estimate is made from such a record."
-        )
 
 
 def _sweep(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
@@ -309,39 +253,9 @@ def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
     return float(np.median(session.samples["angle_rad"][at_rest])) if at_rest.any() else None
 
 
-def _longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
-    """Length and start of the longest run of True, (0, 0) without any."""
-    edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    if starts.size == 0:
-        return 0, 0
-    longest = int(np.argmax(ends - starts))
-    return int(ends[longest] - starts[longest]), int(starts[longest])
-
-
 def _flag_counts(status: NDArray[np.uint32]) -> dict[str, int]:
     counts = {meaning: int(np.count_nonzero(status & flag)) for flag, meaning in _REPORTED_FLAGS}
     return {meaning: count for meaning, count in counts.items() if count}
-
-
-def _check_fillable(
-    path: Path, channel: str, unknown: NDArray[np.bool_], first_tick: int, rate_hz: float
-) -> None:
-    count = int(unknown.sum())
-    share = count / len(unknown)
-    if share > MAX_FILLED_SHARE:
-        raise RecordError(
-            f"{path}: {count} of {len(unknown)} samples ({100 * share:.2g} %) of the {channel} in "
-            f"the sweep are missing or stale, more than the {100 * MAX_FILLED_SHARE:g} % that are "
-            "interpolated; record the session again."
-        )
-    run, start = _longest_run(unknown)
-    if run > MAX_GAP_S * rate_hz:
-        raise RecordError(
-            f"{path}: {run} ticks of the {channel} in a row are missing or stale from tick "
-            f"{first_tick + start} on ({1e3 * run / rate_hz:.0f} ms), longer than the "
-            f"{1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
-        )
 
 
 def _filled(

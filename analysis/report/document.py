@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
+from analysis.report.html.reported import unreported
+from analysis.report.record_indices import whole_record_indices
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from analysis.report.html import Subject
     from analysis.welch_route import FittedModel, WelchAnalysis
@@ -42,6 +44,7 @@ def document(
         lists of flat objects that name their file. Finite numbers only.
     """
     of_records = [_record_entries(subject) for subject in subjects]
+    withheld = {subject.record.path: subject.verdict.withheld for subject in subjects}
     content: dict[str, Any] = _finite(
         {
             "versions": {
@@ -51,7 +54,11 @@ def document(
             },
             "files": [_file(analysis) for analysis in analyses],
             "fits": [
-                *(_fit(analysis, model) for analysis in analyses for model in analysis.models),
+                *(
+                    fit
+                    for analysis in analyses
+                    for fit in _fits(analysis, withheld.get(analysis.record.path, ()))
+                ),
                 *(fit for entries in of_records for fit in entries["fits"]),
             ],
             "modes": [
@@ -123,13 +130,22 @@ def _file(analysis: WelchAnalysis) -> dict[str, Any]:
     }
 
 
-def _fit(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
+def _fits(analysis: WelchAnalysis, withheld: Collection[str]) -> list[dict[str, Any]]:
+    indices = whole_record_indices(analysis)
+    return [
+        {**_fit(analysis, model, withheld), "indices_whole_record": of_record}
+        for model, of_record in zip(analysis.models, indices, strict=True)
+    ]
+
+
+def _fit(analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str]) -> dict[str, Any]:
     fit = model.fit
     return {
         **_name(analysis, model),
         "frf": analysis.settings.estimator,
         "free": list(fit.structure.free),
         "parameters": dict(fit.parameters),
+        "withheld": sorted(unreported(fit.structure, withheld)),
         # What a structure fixes is not known exactly: it was not asked for.
         "std": None
         if fit.std is None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from analysis.welch_route import FittedModel, WelchAnalysis
 
-_COLUMNS: Final = 700
+_COLUMNS: Final = 500
 _LEGEND_COLUMNS: Final = 4
 _LINES: Final[dict[str, dict[str, Any]]] = {
     "const": {"color": style.BLUE, "linestyle": "-"},

@@ -59,14 +59,17 @@ def signals_figure(record: Record, fit: RecordFit, highest_hz: float) -> Figure:
     ----------
     record : Record
     fit : RecordFit
+        With the modes that are enlarged.
     highest_hz : float
         End of the band that was compared.
     """
     torque = torque_in_band(record, fit.plant, highest_hz)
     found = replace(record, beam=fit.plant.beam)
+    modes = {mode.number: mode for mode in fit.modes}
     moments = tuple(
-        replace(moment, name=f"Mode {mode.number}, {mode.frequency_hz:.4g} Hz")
-        for moment, mode in zip(resonance_moments(found, len(fit.modes)), fit.modes, strict=False)
+        replace(moment, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
+        for number, moment in enumerate(resonance_moments(found, max(modes, default=0)), start=1)
+        if number in modes
     )
     rms = float(np.sqrt(np.mean(torque.residual**2)))
     share = rms / float(np.sqrt(np.mean(torque.measured**2)) or np.nan)

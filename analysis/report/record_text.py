@@ -57,5 +57,7 @@ def _text_table(table: Table) -> RichTable:
     return shown
 
 
-def _text(cell: Cell) -> str:
-    return cell.text if isinstance(cell, Number) else cell
+def _text(cell: Cell) -> str | Text:
+    if not isinstance(cell, Number):
+        return cell
+    return Text(cell.text, style="dim italic") if cell.doubtful else cell.text

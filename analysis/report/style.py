@@ -34,8 +34,9 @@ FAINT: Final = "#D2D2D2"
 SHADE: Final = "#F0E9D8"
 
 DPI: Final = 150
-COLUMNS: Final = 1400
-"""Columns into which a line is decimated: about one for each pixel of a full-width panel."""
+_COMPRESSION: Final = 1
+COLUMNS: Final = 1000
+"""Columns into which a line is decimated: as many as a full-width panel has pixels on a screen."""
 
 _FREQUENCY_TICKS_HZ: Final = tuple(
     digit * 10.0**decade for decade in range(-4, 5) for digit in (1, 2, 5)
@@ -45,6 +46,9 @@ _RC: Final[dict[Any, Any]] = {
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    # Where they stand anyway, as no axis is on top: to look for labels in the way takes a tenth of
+    # all drawing.
+    "axes.titley": 1.0,
     "axes.labelcolor": INK,
     "axes.edgecolor": "#9A9A9A",
     "axes.linewidth": 0.7,
@@ -91,7 +95,8 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG; an existing file is not overwritten (FileExistsError)."""
     with path.open("xb") as stream:
-        figure.savefig(stream, format="png", dpi=DPI)
+        # Fast compression: a tenth more bytes for a quarter of the time.
+        figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"compress_level": _COMPRESSION})
 
 
 def envelope(

@@ -11,8 +11,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from analysis.report.html.reported import MARK, footnotes, unreported
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from rich.console import RenderableType
 
@@ -26,14 +28,22 @@ _COEFFICIENT: Final = {"zeta": "zeta", "alpha": "zeta", "gamma": "gamma", "lambd
 _ABSENT: Final = "–"
 
 
-def analysis_tables(analysis: WelchAnalysis) -> RenderableType:
-    """Return the fits, the resonant peaks and the modes of one record, with its warnings."""
-    parts: list[RenderableType] = [fits_table(analysis), "", peaks_table(analysis), ""]
+def analysis_tables(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> RenderableType:
+    """Return the fits, the resonant peaks and the modes of one record, with its warnings.
+
+    Parameters
+    ----------
+    analysis : WelchAnalysis
+    withheld : collection of str
+        Orders that the whole record does not support: they are marked.
+    """
+    parts: list[RenderableType] = [fits_table(analysis, withheld), "", peaks_table(analysis), ""]
     if any(model.modes for model in analysis.models):
         parts.extend((modes_table(analysis), ""))
     notes = [
+        *footnotes(withheld),
         "± is one standard deviation from the scatter of the measured response about the model; "
-        "the bias of the estimate itself (leakage of the window) is not in it."
+        "the bias of the estimate itself (leakage of the window) is not in it.",
     ]
     if any(model.fit.at_bounds for model in analysis.models):
         notes.append("* rests on the edge of the range searched: the data do not determine it.")
@@ -42,14 +52,20 @@ def analysis_tables(analysis: WelchAnalysis) -> RenderableType:
     return Group(*parts)
 
 
-def fits_table(analysis: WelchAnalysis) -> Table:
+def fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
     """Parameters with standard deviation, and the indices of fit."""
     table = _fits_table(f"{analysis.record.path.name}: fits")
     for model in analysis.models:
         indices = model.indices
+        doubtful = unreported(model.fit.structure, withheld)
         table.add_row(
             *_names(model),
-            *(_parameter_text(model, name, factor) for name, _heading, factor in _COLUMNS),
+            *(
+                Text(f"{_parameter_text(model, name, factor)}{MARK}", style="dim")
+                if name in doubtful
+                else _parameter_text(model, name, factor)
+                for name, _heading, factor in _COLUMNS
+            ),
             *(f"{value:.4g}" for value in (indices.mse, indices.wmse, indices.md)),
             end_section=_is_last_of_type(model, analysis.models),
         )

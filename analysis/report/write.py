@@ -8,7 +8,7 @@ from analysis.report.document import document, document_text
 from analysis.report.folder import OutputError, write_new
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
     from pathlib import Path
 
     from analysis.report.html import Subject
@@ -61,7 +61,8 @@ def write_report(
                     f"{folder / name}.png cannot be written: {error.strerror or error}."
                 ) from error
         on_step(f"figure {name}")
-    write_new(folder / "tables.txt", tables_text(analysis))
+    withheld = () if subject is None else subject.verdict.withheld
+    write_new(folder / "tables.txt", tables_text(analysis, withheld))
     if subject is not None:
         from analysis.report.html.write import write_html_report
 
@@ -70,13 +71,13 @@ def write_report(
     write_new(folder / "analysis.json", document_text(document([analysis], subjects=subjects)))
 
 
-def tables_text(analysis: WelchAnalysis) -> str:
-    """Return the tables as plain text."""
+def tables_text(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> str:
+    """Return the tables as plain text, with orders marked that the data do not support."""
     from rich.console import Console
 
     from analysis.report.tables import analysis_tables
 
     console = Console(width=TEXT_WIDTH, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(analysis_tables(analysis))
+        console.print(analysis_tables(analysis, withheld))
     return capture.get()

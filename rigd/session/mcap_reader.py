@@ -6,7 +6,8 @@ for a file that was cut off how far it can be read. Messages of equal length tha
 another, as those of a session do, are taken as one run of bytes.
 
 Nothing in the file is believed before it is checked: what a chunk claims to decompress to is
-bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`.
+bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`, and what is kept of it
+by what the caller allows: a few kilobytes may unpack to as many records as there is memory for.
 """
 
 import struct
@@ -31,6 +32,14 @@ from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
 
 MAX_CHUNK_BYTES: Final = 256 << 20
 MAX_TOTAL_BYTES: Final = 2 << 30
+MAX_DECLARED_BYTES: Final = 64 << 20
+"""Most memory for schemas, channels, metadata and attachments together."""
+
+_DECLARED_COST: Final = 1000
+"""Bytes that an object for one of them takes, about, however small its record."""
+_MESSAGE_COST: Final = 112
+_RUN_COST: Final = 500
+"""Likewise of a message, decoded, and of a run of messages."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
@@ -38,6 +47,7 @@ _RUN_KEY: Final = np.dtype(
     {"names": ["head", "tail"], "formats": ["<u8", "<u8"], "offsets": [0, 3], "itemsize": 11}
 )
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
+_DECLARATIONS: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _CHANNEL_ID: Final = struct.Struct("<H")
 _FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
@@ -50,7 +60,11 @@ _Record = TypeVar("_Record")
 
 
 class McapError(Exception):
-    """The bytes are no MCAP file; the message is a predicate to the file's name."""
+    """The bytes are no MCAP file of use; the message is a predicate to the file's name."""
+
+
+class McapTooLargeError(McapError):
+    """The file holds more messages than may be kept; the message likewise."""
 
 
 @dataclass(slots=True)
@@ -66,12 +80,15 @@ class Run:
         """Yield the records, joined to blocks that stay in a processor's cache."""
         joined: list[Buffer] = []
         length = 0
+        most = max(_BLOCK_BYTES // self.size, 1) * self.size
         for piece in self.pieces:
-            joined.append(piece)
-            length += len(piece)
-            if length >= _BLOCK_BYTES:
-                yield b"".join(joined)
-                joined, length = [], 0
+            for start in range(0, len(piece), most):
+                part = piece[start : start + most]
+                joined.append(part)
+                length += len(part)
+                if length >= _BLOCK_BYTES:
+                    yield b"".join(joined)
+                    joined, length = [], 0
         yield b"".join(joined)
 
 
@@ -115,6 +132,7 @@ def read_mcap(
     topics: Collection[str],
     *,
     salvage: bool = False,
+    max_bytes: int = MAX_TOTAL_BYTES,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Read an MCAP file as far as it is sound.
@@ -126,6 +144,7 @@ def read_mcap(
     salvage
         Get as much as there is: keep `McapContents.chunks`, skip damaged records outside of
         chunks, which no message depends on, and look for the statistics of a damaged file.
+    max_bytes : most memory for the messages wanted, raw or decoded, about
     on_progress : called now and then with the share of the file that is done
 
     Returns
@@ -135,11 +154,14 @@ def read_mcap(
     Raises
     ------
     McapError
-        If the file does not begin as an MCAP file does.
+        If the file does not begin as an MCAP file does, or declares more than
+        `MAX_DECLARED_BYTES`.
+    McapTooLargeError
+        If it holds more than `max_bytes` of messages.
     """
     if bytes(data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
-    reader = _Reader(data, topics, salvage=salvage)
+    reader = _Reader(data, topics, salvage=salvage, max_bytes=max_bytes)
     contents = reader.contents
     contents.complete = _has_end(data)
     try:
@@ -182,13 +204,18 @@ def _record_at(data: memoryview, position: int, where: str) -> tuple[int, int, i
 class _Reader:
     """One pass over a file."""
 
-    def __init__(self, data: memoryview, topics: Collection[str], *, salvage: bool) -> None:
+    def __init__(
+        self, data: memoryview, topics: Collection[str], *, salvage: bool, max_bytes: int
+    ) -> None:
         self.contents = McapContents(sound_bytes=len(MAGIC))
         self._salvage = salvage
         self._data = data
         self._topics = topics
         self._wanted: dict[int, str | None] = {}  # channel → its topic if wanted
         self._uncompressed = 0
+        self._max_bytes = max_bytes
+        self._kept = 0
+        self._declared = 0
         self._zstd = zstandard.ZstdDecompressor()
 
     def read(self, on_progress: Callable[[float], None] | None) -> None:
@@ -235,6 +262,13 @@ class _Reader:
     def _read_other(self, opcode: int, content: memoryview, where: str) -> None:
         """Take a record that is neither chunk nor message; skip what is not needed."""
         contents = self.contents
+        if opcode in _DECLARATIONS:
+            self._declared += len(content) + _DECLARED_COST
+            if self._declared > MAX_DECLARED_BYTES:
+                raise McapError(
+                    f"declares channels, schemas, metadata and attachments without end: more than "
+                    f"{MAX_DECLARED_BYTES >> 20} MiB of them{where}"
+                )
         if opcode == Opcode.SCHEMA:
             schema = _parsed(Schema.read, content, where)
             if contents.schemas.setdefault(schema.id, schema) != schema:
@@ -328,8 +362,15 @@ class _Reader:
         if topic is None:
             return
         runs = self.contents.runs[topic]
+        self._kept += max(len(run), count * _MESSAGE_COST)
         if not runs or (runs[-1].channel, runs[-1].size) != (channel, size):
             runs.append(Run(channel, size))
+            self._kept += _RUN_COST
+        if self._kept > self._max_bytes:
+            raise McapTooLargeError(
+                f"holds more than the {self._max_bytes >> 20} MiB of messages that are accepted in "
+                f"{' and '.join(sorted(self._topics))}"
+            )
         # A slice keeps the chunk in memory, which is well where it is most of it.
         runs[-1].pieces.append(run if 2 * len(run) > total else bytes(run))
 

@@ -27,7 +27,13 @@ from rigd.session.format import (
     is_fixed_layout,
     to_native,
 )
-from rigd.session.mcap_reader import McapContents, McapError, read_mcap
+from rigd.session.mcap_reader import (
+    MAX_TOTAL_BYTES,
+    McapContents,
+    McapError,
+    McapTooLargeError,
+    read_mcap,
+)
 from rigd.session.mcap_writer import MESSAGE_HEAD
 from rigd.session.schema import (
     CONTROL_SCHEMA,
@@ -45,6 +51,9 @@ from rigd.session.schema import (
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
+
+MAX_EVENTS: Final = 100_000
+"""Most lines of a session's log that are read."""
 
 _UNITS: Final = {
     "_kg_m2": "kg·m²",
@@ -171,20 +180,21 @@ class Session:
         return value
 
 
-def read_session(path: Path) -> Session:
+def read_session(path: Path, *, max_bytes: int = MAX_TOTAL_BYTES) -> Session:
     """Read a whole session file.
 
     Parameters
     ----------
     path : a complete file as docs/session_format.md defines it
+    max_bytes : most memory that its messages may take, about; a sample takes 150 bytes
 
     Raises
     ------
     SessionError
-        If the file is missing, empty, not an MCAP file, incomplete, damaged, of a later format
-        version, or no session.
+        If the file is missing, empty, not an MCAP file, incomplete, damaged, too large, of a later
+        format version, or no session.
     """
-    contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC))
+    contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC), max_bytes=max_bytes)
     metadata = merged_metadata(contents, "session") or {}
     version = metadata.get("format_version", FORMAT_VERSION)
     if version != FORMAT_VERSION:
@@ -241,9 +251,9 @@ def _quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:40] + "…")
 
 
-def _load(path: Path, topics: Sequence[str]) -> McapContents:
+def _load(path: Path, topics: Sequence[str], *, max_bytes: int = MAX_TOTAL_BYTES) -> McapContents:
     """Read the container of a session file that must be complete and sound."""
-    contents = load_contents(path, topics)
+    contents = load_contents(path, topics, max_bytes=max_bytes)
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:
@@ -259,6 +269,7 @@ def load_contents(
     topics: Sequence[str],
     *,
     salvage: bool = False,
+    max_bytes: int = MAX_TOTAL_BYTES,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Read the container of a file as far as it is sound.
@@ -266,12 +277,12 @@ def load_contents(
     Parameters
     ----------
     path : the file
-    topics, salvage, on_progress : as `rigd.session.mcap_reader.read_mcap` takes them
+    topics, salvage, max_bytes, on_progress : as `rigd.session.mcap_reader.read_mcap` takes them
 
     Raises
     ------
     SessionError
-        If the file is missing, empty or not an MCAP file.
+        If the file is missing, empty, too large or not an MCAP file.
     """
     try:
         status = path.stat()
@@ -281,11 +292,16 @@ def load_contents(
             raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
         with path.open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        return read_mcap(memoryview(mapped), topics, salvage=salvage, on_progress=on_progress)
+        return read_mcap(
+            memoryview(mapped), topics, salvage=salvage, max_bytes=max_bytes,
+            on_progress=on_progress,
+        )  # fmt: skip
     except OSError as error:
         raise SessionError(
             f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
         ) from None
+    except McapTooLargeError as error:
+        raise SessionError(f"{path} {error}. Give a shorter session.") from None
     except McapError as error:
         raise SessionError(f"{path} {error}. Give a session file (*.mcap).") from None
 
@@ -399,27 +415,19 @@ def _decode_topic(path: Path, contents: McapContents, layout: _Layout) -> npt.ND
         if channel.topic == layout.topic
     }
     native = np.empty(contents.count(layout.topic), layout.dtype)
-    others: dict[int, tuple[float, ...]] = {}  # place → fields of what is not of the fixed layout
     start = 0
     for run in contents.runs[layout.topic]:
         is_fixed = has_fixed_schema[run.channel] and run.size == layout.record_dtype.itemsize
         for block in run.blocks():
             out = native[start : start + len(block) // run.size]
             places = _take_fixed(block, layout, out) if is_fixed else range(len(out))
-            for i in places:
+            if len(places):
                 decode = _message_class(path, contents, run.channel).FromString
-                data = block[i * run.size + MESSAGE_HEAD.size : (i + 1) * run.size]
-                message = _decoded(path, layout.topic, decode, data)
-                others[start + i] = tuple([getattr(message, name, 0) for name in layout.types])
+                heads = [i * run.size + MESSAGE_HEAD.size for i in places]
+                tail = run.size - MESSAGE_HEAD.size
+                messages = [block[head : head + tail] for head in heads]
+                out[places] = _decoded_fields(path, layout, decode, messages)
             start += len(out)
-    if others:
-        try:
-            native[list(others)] = np.array(list(others.values()), layout.dtype)
-        except OverflowError as error:
-            raise SessionError(
-                f"{path}: a message of {layout.topic} holds a number that its field cannot take "
-                f"({error}). Whoever writes the file must keep to the types of the format."
-            ) from None
     return native
 
 
@@ -429,6 +437,23 @@ def _take_fixed(block: bytes, layout: _Layout, out: npt.NDArray[np.void]) -> Seq
     to_native(wire, layout.types, out)
     fixed = is_fixed_layout(wire, layout.types)
     return () if fixed.all() else np.flatnonzero(~fixed).tolist()
+
+
+def _decoded_fields(
+    path: Path, layout: _Layout, decode: "Callable[[bytes], Message]", messages: list[bytes]
+) -> npt.NDArray[np.void]:
+    """Decode messages with protobuf to the layout's fields, absent ones as 0."""
+    decoded = [_decoded(path, layout.topic, decode, data) for data in messages]
+    try:
+        return np.array(
+            [tuple([getattr(each, name, 0) for name in layout.types]) for each in decoded],
+            layout.dtype,
+        )
+    except OverflowError as error:
+        raise SessionError(
+            f"{path}: a message of {layout.topic} holds a number that its field cannot take "
+            f"({error}). Whoever writes the file must keep to the types of the format."
+        ) from None
 
 
 def _decoded(
@@ -499,6 +524,11 @@ def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
 def _events(path: Path, contents: McapContents, start_utc_ns: int) -> list[Event]:
     """Decode the log; a log that is not protobuf is left out, because no reader needs one."""
     events: list[Event] = []
+    if contents.count(EVENT_TOPIC) > MAX_EVENTS:
+        raise SessionError(
+            f"{path} has {contents.count(EVENT_TOPIC)} messages in {EVENT_TOPIC}, more than the "
+            f"{MAX_EVENTS} that are read. Whoever writes the file must log less."
+        )
     for run in contents.runs[EVENT_TOPIC]:
         if contents.channels[run.channel].message_encoding != "protobuf":
             continue

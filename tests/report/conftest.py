@@ -107,16 +107,18 @@ METADATA = {
 
 
 def write_session_file(
-    path, signals, *, metadata=(), segments=None, status=None, ticks=None, outcome="complete"
-):
+    path, signals, *, metadata=(), segments=None, status=None, ticks=None, t_ns=None,
+    outcome="complete",
+):  # fmt: skip
     """Write signals as a session; `ticks` and `status` default to all there and all well."""
     n = len(signals.angle_rad)
     ticks = np.arange(n) if ticks is None else ticks
+    t_ns = np.asarray(ticks) * 1_000_000 if t_ns is None else t_ns
     status = np.zeros(n, int) if status is None else status
     block = bytearray(n * SAMPLE_SIZE)
     for i in range(n):
         pack_sample_into(
-            block, i * SAMPLE_SIZE, int(ticks[i]) * 1_000_000, int(ticks[i]),
+            block, i * SAMPLE_SIZE, int(t_ns[i]), int(ticks[i]),
             float(signals.reference_rad[i]), float(signals.angle_rad[i]), 0.0,
             float(signals.torque_nm[i]), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, int(status[i]), 0, 0,
         )  # fmt: skip

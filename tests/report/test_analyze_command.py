@@ -202,6 +202,12 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, fi
         (("--segment", "1000", "--nfft", "999"), ("--nfft", "1000")),
         (("--nfft", "100"), ("--nfft", "17266")),
         (("--colour", "blue"), ("--colour",)),
+        (("--paper",), ("--paper", "give several sessions, or leave it out")),
+        (("--jobs", "2"), ("--jobs", "one session is no campaign")),
+        (("--dask", "tcp://x:1", "--paper"), ("--paper and --dask", "one session")),
+        (("b.mcap", "--each", "--jobs", "2"), ("--jobs", "--each", "leave one of the two out")),
+        (("b.mcap", "--dask", "tcp://x:1", "--jobs", "2"), ("--jobs", "those of --dask")),
+        (("--method", "welch", "--fix", "delay_s"), ("--fix", "--method all")),
     ],
 )
 def test_wrong_options_are_refused(session, tmp_path, options, words):
@@ -288,7 +294,7 @@ def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, fil
         fixed.append(options["fixed"])
         return 0
 
-    monkeypatch.setattr("analysis.cli._run", run)
+    monkeypatch.setattr("analysis.cli.session_command", run)
     monkeypatch.setattr("analysis.campaigns.command.campaign_command", campaign)
     result = CliRunner().invoke(app, [*files, "--fix", "tool_inertia_kg_m2, delay_s"])
     assert result.exit_code == 0, result.output

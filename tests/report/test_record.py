@@ -148,11 +148,40 @@ def test_values_that_are_not_finite_are_refused_by_field_and_tick(
     ("key", "value"),
     [("rate_hz", "0"), ("rate_hz", "-1000"), ("beam_length_m", "0"),
      ("beam_density_kg_per_m", "-1"), ("tool_inertia_kg_m2", "-1e-5"), ("rate_hz", "nan"),
-     ("beam_bending_stiffness_n_m2", "stiff")],
+     ("beam_bending_stiffness_n_m2", "stiff"), ("beam_length_m", "1e300"),
+     ("beam_length_m", "980"), ("beam_length_m", "0.01"), ("beam_density_kg_per_m", "1e300"),
+     ("beam_bending_stiffness_n_m2", "1e-300"), ("beam_bending_stiffness_n_m2", "1e300"),
+     ("torque_delay_s", "300"), ("angle_delay_s", "-1e300"), ("tool_inertia_kg_m2", "1e300")],
 )  # fmt: skip
 def test_absurd_metadata_is_refused_by_key(tmp_path, write_session, short_signals, key, value):
     path = write_session(tmp_path / "a.mcap", short_signals, metadata={key: value})
     with pytest.raises((RecordError, SessionError), match=key):
+        load_record(path)
+
+
+def test_a_beam_in_wrong_units_is_told_by_where_its_first_mode_would_be(
+    tmp_path, write_session, short_signals
+):
+    """Millimetres for metres: 2.55 Hz a million times lower."""
+    path = write_session(tmp_path / "a.mcap", short_signals, metadata={"beam_length_m": "980"})
+    with pytest.raises(RecordError, match=r"the first mode would be at 2\.55e-06 Hz, which 5 s"):
+        load_record(path)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.5])
+def test_a_sensor_that_gave_nothing_is_told(tmp_path, write_session, short_signals, value):
+    dead = replace(short_signals, torque_nm=np.full(5000, value))
+    path = write_session(tmp_path / "a.mcap", dead)
+    with pytest.raises(RecordError, match=rf"is {value:g} N·m in every sample, so the sensor"):
+        load_record(path)
+
+
+@pytest.mark.parametrize("value", [1e200, -1e10])
+def test_values_that_no_rig_has_are_refused(tmp_path, write_session, short_signals, value):
+    values = short_signals.torque_nm.copy()
+    values[[1234, 2000]] = value
+    path = write_session(tmp_path / "a.mcap", replace(short_signals, torque_nm=values))
+    with pytest.raises(RecordError, match=r"coupling_torque_nm .* tick 1234 .* 2 of 5000"):
         load_record(path)
 
 

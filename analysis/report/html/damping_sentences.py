@@ -9,20 +9,26 @@ from analysis.report.html.table import estimate
 from analysis.report.record_figure_bands import NORMAL_95
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from analysis.whole_record import DampingSize, ModeEstimate, RecordFit
 
 _SMALL = 1e-3
 """Sizes below are told in the power of ten that zeta has in the paper."""
 
 
-def damping_sentences(fit: RecordFit, withheld: frozenset[str]) -> tuple[str, ...]:
+def damping_sentences(
+    fit: RecordFit, withheld: Collection[str], visible: Collection[int] | None = None
+) -> tuple[str, ...]:
     """Say how the modes are damped, and by which internal and external damping.
 
     Parameters
     ----------
     fit : RecordFit
-    withheld : frozenset of str
+    withheld : collection of str
         Orders that the data do not support.
+    visible : collection of int, optional
+        Modes that the record shows, by default all: of others nothing is said.
 
     Returns
     -------
@@ -30,10 +36,10 @@ def damping_sentences(fit: RecordFit, withheld: frozenset[str]) -> tuple[str, ..
         95 % intervals in brackets.
     """
     found = []
-    if fit.modes:
+    shown = [_mode(mode) for mode in fit.modes if visible is None or mode.number in visible]
+    if shown:
         found.append(
-            f"The antenna's damping ratio is {_listed([_mode(mode) for mode in fit.modes])} "
-            "(in brackets: 95 % intervals)."
+            f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals)."
         )
     found.extend(
         f"The {what} damping is {_size(size, symbol, unit)}{_order(fit, order, name, withheld)}."
@@ -69,7 +75,7 @@ def _size(size: DampingSize, symbols: tuple[str, str], unit: str) -> str:
     return f"{coefficient}\u00a0{power}\u00a0=\u00a0{bounds} at {hertz:.3g} Hz"
 
 
-def _order(fit: RecordFit, name: str, symbol: str, withheld: frozenset[str]) -> str:
+def _order(fit: RecordFit, name: str, symbol: str, withheld: Collection[str]) -> str:
     interval = fit.interval.get(name)
     if name not in fit.structure.free:
         return f", of the fixed order {symbol}\u00a0=\u00a0{fit.parameters[name]:g}"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.report.supported_band import supported_band_hz
 from analysis.whole_record.decimation import fast_length
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
@@ -39,23 +40,29 @@ def illustrations(subject: Subject) -> Iterator[Illustration]:
     from analysis.report.record_figure_residual import residual_figure
     from analysis.report.record_figure_signals import signals_figure
 
-    fit, name, highest_hz = subject.fit, subject.name, subject.band_hz[1]
-    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in fit.modes)
+    name, highest_hz, shown = subject.name, subject.band_hz[1], subject.visible_modes
+    # Details and lines are of modes that the record shows, not of what the model adds.
+    fit = replace(subject.fit, modes=tuple(m for m in subject.fit.modes if m.number in shown))
+    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in subject.fit.modes)
     frf, loss, residual, signals = NAMES
     measured = measured_response(subject)
     yield Illustration(
         frf,
-        frf_figure(name, measured, fit),
+        frf_figure(name, measured, subject.fit),
         f"Frequency response from motor angle to coupling torque: magnitude and phase as measured "
         f"and of the model, half-width of the model's 95 % band, and details of the modes ({modes} "
         "Hz). The band is narrower than the line where it is not seen.",
     )
     yield Illustration(
         loss,
-        loss_figure(name, fit, (float(measured.frequency_hz[0]), highest_hz)),
-        "Loss factor of internal, external and all damping against frequency with 95 % bands; at a "
-        "mode it is about twice the damping ratio (points). Between the modes the model "
-        "interpolates, outside them it extrapolates.",
+        loss_figure(
+            name,
+            fit,
+            (float(measured.frequency_hz[0]), highest_hz),
+            supported_band_hz(subject),
+            withheld=subject.verdict.withheld,
+        ),
+        _loss_description(subject),
     )
     yield Illustration(
         residual,
@@ -70,6 +77,22 @@ def illustrations(subject: Subject) -> Iterator[Illustration]:
         signals_figure(subject.record, fit, highest_hz),
         "Motor angle, coupling torque as measured and as the model makes it of the measured angle, "
         "and their difference; below, where each mode rings most.",
+    )
+
+
+def _loss_description(subject: Subject) -> str:
+    if subject.verdict.withheld:
+        return (
+            "Loss factor of all damping against frequency with its 95 % band, and at each mode "
+            "that shows (points: twice its damping ratio). It is drawn between these modes only, "
+            "and not split into internal and external: elsewhere, and for either part, the result "
+            "would follow from an order that the data do not support."
+        )
+    return (
+        "Loss factor of internal, external and all damping against frequency with 95 % bands; at a "
+        "mode it is about twice the damping ratio (points). Between the modes the model "
+        "interpolates, outside them it extrapolates; where the torque does not stand out of the "
+        "noise nothing is drawn."
     )
 
 

@@ -62,7 +62,7 @@ def section(identifier: str, title: str, *children: str) -> Markup:
 def table(content: Table) -> Markup:
     """Make a table, its numbers readable for machines (``data``), and its notes."""
     columns = content.columns
-    head = element("tr", *(_heading(column) for column in columns))
+    head = element("tr", *(_heading(column) for column in columns if column.heading))
     body = [
         element("tr", *_cells(row, columns), class_="selected" if i == content.selected else "")
         for i, row in enumerate(content.rows)
@@ -84,6 +84,8 @@ def _heading(column: Column) -> Markup:
 
 def _cells(row: tuple[Cell, ...], columns: tuple[Column, ...]) -> Iterable[Markup]:
     for place, (cell, column) in enumerate(zip(row, columns, strict=True)):
+        if not column.heading:
+            continue
         tag, scope = ("td", "") if place else ("th", "row")
         kind = "number" if column.numeric else ""
         if not isinstance(cell, Number):
@@ -93,5 +95,8 @@ def _cells(row: tuple[Cell, ...], columns: tuple[Column, ...]) -> Iterable[Marku
         else:
             shown = element("data", cell.text, value=repr(cell.value))
             yield element(
-                tag, element("strong", shown) if cell.strong else shown, scope=scope, class_=kind
+                tag,
+                element("strong", shown) if cell.strong else shown,
+                scope=scope,
+                class_=f"{kind} withheld" if cell.doubtful else kind,
             )

@@ -85,7 +85,9 @@ def page(
 def _verdict(subject: Subject, title: str) -> Markup:
     damping = [
         element("p", sentence, class_="damping")
-        for sentence in damping_sentences(subject.fit, subject.verdict.withheld)
+        for sentence in damping_sentences(
+            subject.fit, subject.verdict.withheld, subject.visible_modes
+        )
     ]
     said = [element("p", sentence) for sentence in subject.verdict.sentences]
     advice = [element("li", sentence) for sentence in subject.verdict.experiments]

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.report.html.reported import unreported
 from analysis.report.record_figure_bands import loss_factors, response_band
+from analysis.report.record_indices import NOT_COMPARED, indices_of_record_fit
+from analysis.report.supported_band import supported_band_hz
 
 if TYPE_CHECKING:
     from analysis.report.html.subject import Subject
@@ -26,7 +29,11 @@ def record_entries(subject: Subject) -> dict[str, Any]:
         ``fits`` and ``modes``: lists of objects as the document has them of the paper's route,
         with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
         selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
-        not finite, as `analysis.report.document` takes them.
+        not finite, as `analysis.report.document` takes them. What is not reported is flagged, not
+        left out: ``withheld`` of a fit names its parameters that the data do not support,
+        ``visible`` of a mode says whether the record shows it. ``indices`` are against Welch's
+        response, as those of the paper's fits, ``indices_whole_record`` against the ratio of the
+        whole record's transforms.
     """
     names = [
         (
@@ -36,10 +43,16 @@ def record_entries(subject: Subject) -> dict[str, Any]:
                 "type": fit.structure.name,
                 "weighting": None,
                 "candidate": name,
+                "selected": name == subject.verdict.selected,
             },
             fit,
         )
         for name, fit in subject.fits.items()
+    ]
+    welch = subject.welch
+    indices = [
+        (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
+        for _, fit in names
     ]
     return {
         "fits": [
@@ -47,6 +60,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
                 **name,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
+                "withheld": sorted(unreported(fit.structure, subject.verdict.withheld)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
                     key: None if ends is None else list(ends) for key, ends in fit.interval.items()
@@ -59,14 +73,16 @@ def record_entries(subject: Subject) -> dict[str, Any]:
                 "internal_size": _size(fit.internal),
                 "external_size": _size(fit.external),
                 "ringing": {**asdict(fit.ringing), "significant": fit.ringing.significant},
-                "indices": {"mse": None, "wmse": None, "md": None},
+                "indices": of_welch,
+                "indices_whole_record": of_record,
             }
-            for name, fit in names
+            for (name, fit), (of_welch, of_record) in zip(names, indices, strict=True)
         ],
         "modes": [
             {
                 **name,
                 "mode": mode.number,
+                "visible": mode.number in subject.visible_modes,
                 "frequency_hz": mode.frequency_hz,
                 "frequency_std_hz": mode.frequency_std_hz,
                 "damping_ratio": mode.damping_ratio,
@@ -74,7 +90,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
             }
             # Of the fit that is believed: they are what narrow sweeps are planned by.
             for name, fit in names
-            if name["candidate"] == subject.verdict.selected
+            if name["selected"]
             for mode in fit.modes
         ],
         "records": [
@@ -84,6 +100,14 @@ def record_entries(subject: Subject) -> dict[str, Any]:
                 "verdict": list(subject.verdict.sentences),
                 "experiments": list(subject.verdict.experiments),
                 "withheld": sorted(subject.verdict.withheld),
+                "orders": {
+                    each.order: {
+                        "status": each.status,
+                        "value": each.value,
+                        "interval_95": None if each.interval is None else list(each.interval),
+                    }
+                    for each in subject.verdict.orders
+                },
                 "band_hz": list(subject.band_hz),
                 "fixed": list(subject.fixed),
                 "hum": [asdict(line) for line in subject.analysis.lines],
@@ -104,6 +128,7 @@ def _curves(subject: Subject) -> dict[str, Any]:
     band = response_band(subject.fit, frequency_hz)
     low, high = band.magnitude_limits()
     factors = loss_factors(subject.fit, frequency_hz)
+    supported_hz = supported_band_hz(subject)
     return {
         "frequency_hz": frequency_hz.tolist(),
         "magnitude_nm_per_rad": np.abs(band.response).tolist(),
@@ -111,6 +136,7 @@ def _curves(subject: Subject) -> dict[str, Any]:
         "magnitude_high_nm_per_rad": high.tolist(),
         "phase_rad": np.angle(band.response).tolist(),
         "phase_std_rad": band.phase_std_rad.tolist(),
+        "loss_factor_supported_hz": None if supported_hz is None else list(supported_hz),
         "loss_factor": _factor(factors.total),
         "internal_loss_factor": _factor(factors.internal),
         "external_loss_factor": _factor(factors.external),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from analysis.report.html.reported import MARK, footnotes, greyed, has, marked, unreported
 from analysis.report.html.table import ABSENT, Cell, Column, Table, count, estimate, number
 from analysis.report.record_figure_bands import NORMAL_95
 
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from analysis.report.html.subject import Subject
     from analysis.whole_record import DampingSize, RecordFit
 
-_PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
+PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
     "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
     "alpha": ("α", "its order", "1", 1.0),
     "gamma": ("γ", "external damping", "1e-2 s^λ/m⁴", 1e2),
@@ -25,22 +26,24 @@ _PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
 """Symbol, meaning, unit shown, and how many of that make one SI unit."""
 
 _STRONG_CORRELATION: Final = 0.9
+_HOLDS_FOR: Final = {"zeta": "depends on α", "gamma": "depends on λ"}
 
 
 def modes_table(subject: Subject) -> Table:
-    """Frequencies and damping ratios of the selected fit."""
+    """Frequencies and damping ratios of the selected fit; modes that do not show are marked."""
     rows: list[tuple[Cell, ...]] = []
+    visible = subject.visible_modes
     for mode in subject.fit.modes:
         f, f_std = mode.frequency_hz, mode.frequency_std_hz
         ratio, ratio_std = mode.damping_ratio, mode.damping_ratio_std
         half = NORMAL_95 * ratio_std
-        rows.append(
-            (
-                count(mode.number),
-                *estimate((f, f_std), f_std),
-                *estimate((ratio, ratio_std, ratio - half, ratio + half), ratio_std, 100.0),
-            )
+        row = (
+            count(mode.number),
+            *estimate((f, f_std), f_std),
+            *estimate((ratio, ratio_std, ratio - half, ratio + half), ratio_std, 100.0),
         )
+        shows = mode.number in visible
+        rows.append(row if shows else (marked(row[0]), *map(greyed, row[1:])))
     return Table(
         "modes",
         f"Modes of the beam on a motor that stands still: type {subject.verdict.selected}",
@@ -54,16 +57,20 @@ def modes_table(subject: Subject) -> Table:
             Column("to (%)", "damping_ratio_high"),
         ),
         tuple(rows),
+        ()
+        if len(visible) == len(rows)
+        else (f"{MARK} computed from the model: the record does not show this mode.",),
     )
 
 
 def parameters_table(subject: Subject) -> Table:
     """Parameters of the selected fit with their uncertainty."""
     fit = subject.fit
+    doubtful = unreported(fit.structure, subject.verdict.withheld)
     rows = tuple(
-        _withheld_row(name) if name in subject.verdict.withheld else _parameter_row(fit, name)
+        _unreported_row(name) if name in doubtful else _parameter_row(fit, name)
         for name in fit.parameters
-        if _has(fit, name)
+        if has(fit.structure, name)
     )
     return Table(
         "parameters",
@@ -88,12 +95,13 @@ def parameters_table(subject: Subject) -> Table:
 
 def sizes_table(subject: Subject) -> Table:
     """Sizes of the damping where they are uncorrelated with its orders."""
-    fit = subject.fit
+    fit, withheld = subject.fit, subject.verdict.withheld
     rows = [
-        _size_row(what, symbol, unit, size)
-        for what, symbol, unit, size in (
-            ("internal", "ζ ω^α", "1", fit.internal),
-            ("external", "γ ω^λ", "1/m⁴", fit.external),
+        # Without its frequency a size is the coefficient for an order that was only assumed.
+        _size_row(what, symbol, unit, size, doubtful=size.omega_rad_s is None and order in withheld)
+        for what, symbol, unit, size, order in (
+            ("internal", "ζ ω^α", "1", fit.internal, "alpha"),
+            ("external", "γ ω^λ", "1/m⁴", fit.external, "lambda"),
         )
         if size is not None
     ]
@@ -110,7 +118,7 @@ def sizes_table(subject: Subject) -> Table:
             Column("std (%)", "relative_std"),
         ),
         tuple(rows),
-        ("Coefficient and order are strongly correlated; these are not.",),
+        ("Coefficient and order are strongly correlated; these are not.", *footnotes(withheld)),
     )
 
 
@@ -133,79 +141,9 @@ def correlations_table(subject: Subject) -> Table:
     )
 
 
-def structures_table(subject: Subject) -> Table:
-    """All fits beside each other."""
-    lowest = min(fit.cost for fit in subject.fits.values())
-    delta_bic = subject.verdict.delta_bic
-    rows: list[tuple[Cell, ...]] = []
-    for name, fit in subject.fits.items():
-        shown: list[Cell] = []
-        for parameter in ("zeta", "alpha", "gamma", "lambda"):
-            factor = _PARAMETERS[parameter][3]
-            if not _has(fit, parameter):
-                shown += [number(None), number(None)]
-                continue
-            std = fit.std[parameter]
-            free = parameter in fit.structure.free
-            value, spread = estimate(
-                (fit.parameters[parameter], std if free else None), std, factor
-            )
-            held = "*" if parameter in fit.at_bounds else ""
-            shown += [replace(value, text=value.text + held), spread]
-        rows.append(
-            (
-                name,
-                *shown,
-                *([number(delta_bic[name], ".4g")] if delta_bic else []),
-                number(fit.cost, ".6g"),
-                number(fit.cost - lowest, ".4g"),
-                count(fit.degrees_of_freedom),
-                count(fit.free_parameters),
-            )
-        )
-    return Table(
-        "structures",
-        "All structures on the whole record",
-        (
-            Column("Type", "type", numeric=False),
-            *(
-                column
-                for parameter in ("zeta", "alpha", "gamma", "lambda")
-                for column in (
-                    Column(_heading(parameter), parameter),
-                    Column("std", f"{parameter}_std"),
-                )
-            ),
-            *([Column("ΔBIC", "delta_bic")] if delta_bic else []),
-            Column("Sum of squares", "cost"),
-            Column("Excess", "cost_above_lowest"),
-            Column("Expected", "degrees_of_freedom"),
-            Column("Free", "free_parameters"),
-        ),
-        tuple(rows),
-        (
-            "ΔBIC: Bayesian information criterion above the lowest; 10 is clear. "
-            "Sum of squares of the whitened residual; by how much it is above the lowest; what it "
-            "would be by chance alone (degrees of freedom); number of free parameters, those of "
-            "rig and beam included. * rests on the edge of the range searched. The marked row is "
-            "the one selected.",
-        ),
-        selected=list(subject.fits).index(subject.verdict.selected),
-    )
-
-
-def _has(fit: RecordFit, name: str) -> bool:
-    """Whether a parameter means anything in the fit's structure."""
-    if name in ("zeta", "alpha"):
-        return fit.structure.internal
-    if name in ("gamma", "lambda"):
-        return fit.structure.external
-    return True
-
-
 def _parameter_row(fit: RecordFit, name: str) -> tuple[Cell, ...]:
     default = (_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
-    symbol, meaning, unit, factor = _PARAMETERS.get(name, default)
+    symbol, meaning, unit, factor = PARAMETERS.get(name, default)
     std = fit.std[name]
     low, high = fit.interval.get(name) or (None, None)
     free = name in fit.interval
@@ -219,35 +157,30 @@ def _parameter_row(fit: RecordFit, name: str) -> tuple[Cell, ...]:
     return (symbol, meaning, unit, *shown, status)
 
 
-def _withheld_row(name: str) -> tuple[Cell, ...]:
-    symbol, meaning, unit, _factor = _PARAMETERS[name]
+def _unreported_row(name: str) -> tuple[Cell, ...]:
+    symbol, meaning, unit, _factor = PARAMETERS[name]
     unknown = [number(None)] * 4
-    return (symbol, meaning, unit, *unknown, "not supported by the data")
+    remark = _HOLDS_FOR.get(name, "not supported by the data")
+    return (symbol, meaning, unit, *unknown, remark)
 
 
-def _size_row(what: str, symbol: str, unit: str, size: DampingSize) -> tuple[Cell, ...]:
+def _size_row(
+    what: str, symbol: str, unit: str, size: DampingSize, *, doubtful: bool
+) -> tuple[Cell, ...]:
     if size.omega_rad_s is None:
         symbol, unit = symbol[0], ABSENT
-    return (
-        what,
-        symbol,
-        unit,
-        number(size.omega_rad_s, ".4g"),
-        *estimate((size.value, size.std), size.std),
-        number(size.std / size.value, "#.2g", 100.0),
-    )
+    at = number(size.omega_rad_s, ".4g")
+    value, std = estimate((size.value, size.std), size.std)
+    relative = number(size.std / size.value, "#.2g", 100.0)
+    if doubtful:
+        value, std, relative = marked(value), greyed(std), greyed(relative)
+    return (what, symbol, unit, at, value, std, relative)
 
 
 def _symbol(name: str) -> str:
-    if name in _PARAMETERS:
-        return _PARAMETERS[name][0]
+    if name in PARAMETERS:
+        return PARAMETERS[name][0]
     return f"δ{name.rsplit('_', 1)[-1]}"
-
-
-def _heading(name: str) -> str:
-    """Symbol with its power of ten; the units, which depend on the orders, would be too long."""
-    symbol, _meaning, unit, factor = _PARAMETERS[name]
-    return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
 
 
 def _correlation(own: bool, value: float) -> Cell:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.record import Record
-    from analysis.selection import Selection
+    from analysis.selection import OrderVerdict, Selection
     from analysis.welch_route import WelchAnalysis
     from analysis.whole_record import RecordAnalysis, RecordFit, Setting
 
@@ -30,6 +30,10 @@ class Verdict:
         Orders of the selected fit that the data do not support: they are not reported.
     delta_bic : dict of str to float
         BIC above the lowest by the name of the fit; may be empty.
+    orders : tuple of OrderVerdict
+        What is known of each order; may be empty.
+    visible : tuple of int or None
+        Modes that stand out of the noise; None if that was not asked.
     """
 
     selected: str
@@ -37,6 +41,8 @@ class Verdict:
     experiments: tuple[str, ...] = ()
     withheld: frozenset[str] = frozenset()
     delta_bic: Mapping[str, float] = field(default_factory=dict)
+    orders: tuple[OrderVerdict, ...] = ()
+    visible: tuple[int, ...] | None = None
 
     @classmethod
     def of(cls, selection: Selection) -> Verdict:
@@ -48,6 +54,8 @@ class Verdict:
             experiments=said.experiments,
             withheld=frozenset(best.fit.parameters.keys() - said.parameters.keys()),
             delta_bic={each.name: each.bic - best.bic for each in selection.candidates},
+            orders=(said.alpha, said.lambda_),
+            visible=said.visible_modes,
         )
 
 
@@ -103,6 +111,13 @@ class Subject:
     def fit(self) -> RecordFit:
         """The selected fit."""
         return self.fits[self.verdict.selected]
+
+    @property
+    def visible_modes(self) -> tuple[int, ...]:
+        """Numbers of the selected fit's modes that the record shows."""
+        visible = self.verdict.visible
+        numbers = (mode.number for mode in self.fit.modes)
+        return tuple(number for number in numbers if visible is None or number in visible)
 
     @property
     def name(self) -> str:

@@ -26,11 +26,14 @@ class Number:
         As it is shown, in the unit that the table states.
     strong : bool
         Whether the eye should stop at it.
+    doubtful : bool
+        Whether it is not reported: shown in grey, as the data do not support it.
     """
 
     value: float | None
     text: str
     strong: bool = False
+    doubtful: bool = False
 
 
 Cell = Number | str
@@ -38,7 +41,10 @@ Cell = Number | str
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: heading as people read it, and as programs do (name with unit)."""
+    """A column: heading as people read it, and as programs do (name with unit).
+
+    Without a heading it is in the file only: it tells programs what people see otherwise.
+    """
 
     heading: str
     key: str

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from analysis.report.html.table import Cell, Column, Table, estimate, number
+from analysis.report.html.reported import footnotes, greyed, marked, unreported
+from analysis.report.html.table import Cell, Column, Number, Table, estimate, number
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from analysis.welch_route import FittedModel, WelchAnalysis
 
 _FACTORS = {"zeta": 1e5, "alpha": 1.0, "gamma": 1e2, "lambda": 1.0}
@@ -15,8 +18,15 @@ _HEADINGS = {"zeta": "ζ (1e-5)", "alpha": "α", "gamma": "γ (1e-2)", "lambda":
 _COEFFICIENT = {"zeta": "zeta", "alpha": "zeta", "gamma": "gamma", "lambda": "gamma"}
 
 
-def welch_fits_table(analysis: WelchAnalysis) -> Table:
-    """Parameters and indices of every fit of the paper's route."""
+def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
+    """Parameters and indices of every fit of the paper's route.
+
+    Parameters
+    ----------
+    analysis : WelchAnalysis
+    withheld : collection of str
+        Orders that the whole record does not support: they are marked.
+    """
     return Table(
         "welch_fits",
         "Fits to Welch's estimate, as in the paper",
@@ -32,8 +42,9 @@ def welch_fits_table(analysis: WelchAnalysis) -> Table:
             Column("WMSE", "wmse"),
             Column("MD", "md"),
         ),
-        tuple(_fit_row(model) for model in analysis.models),
+        tuple(_fit_row(model, withheld) for model in analysis.models),
         (
+            *footnotes(withheld),
             "MSE and WMSE in (N·m/rad)², MD in N·m/rad. std is the scatter of the measured "
             "response about the model. The bias of Welch's estimate on a chirp, which the window "
             "smears at the resonances, is not in it and is often larger: the whole-record fits "
@@ -74,17 +85,18 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
     )
 
 
-def _fit_row(model: FittedModel) -> tuple[Cell, ...]:
+def _fit_row(model: FittedModel, withheld: Collection[str]) -> tuple[Cell, ...]:
     fit = model.fit
+    doubtful = unreported(fit.structure, withheld)
     shown: list[Cell] = []
     for name, factor in _FACTORS.items():
+        cells: tuple[Number, ...] = (number(None), number(None))
         if name in fit.structure.free:
             std = None if fit.std is None else fit.std[name]
-            shown += estimate((fit.parameters[name], std), std, factor)
+            cells = estimate((fit.parameters[name], std), std, factor)
         elif _COEFFICIENT[name] in fit.structure.free:
-            shown += [number(fit.parameters[name], "g", factor), number(None)]
-        else:
-            shown += [number(None), number(None)]
+            cells = (number(fit.parameters[name], "g", factor), number(None))
+        shown += (marked(cells[0]), greyed(cells[1])) if name in doubtful else cells
     indices = model.indices
     return (
         fit.structure.name,

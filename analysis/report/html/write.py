@@ -14,8 +14,8 @@ from analysis.report.html.record_tables import (
     modes_table,
     parameters_table,
     sizes_table,
-    structures_table,
 )
+from analysis.report.html.structures_table import structures_table
 from analysis.report.html.table import Table, csv_text
 from analysis.report.html.welch_tables import peaks_table, welch_fits_table
 
@@ -95,7 +95,11 @@ def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Tab
         structures_table(subject),
     )
     welch = subject.welch
-    of_paper = () if welch is None else (welch_fits_table(welch), peaks_table(welch))
+    of_paper = (
+        ()
+        if welch is None
+        else (welch_fits_table(welch, subject.verdict.withheld), peaks_table(welch))
+    )
     return modes_table(subject), tables, of_paper
 
 

@@ -1,0 +1,210 @@
+"""Sessions analysed one by one from the command line: progress, reports, tables, JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from analysis.record import Record
+    from analysis.report.html import Subject
+    from analysis.settings import WelchSettings
+    from analysis.welch_route import WelchAnalysis
+    from analysis.whole_record import Setting
+
+    _Found = tuple[WelchAnalysis, Subject | None]
+
+_FIGURE_STEPS: Final = 4
+"""How many times longer a figure takes than another step, roughly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Routes:
+    """What is done with a record: the paper's route, and the whole record's if it is asked for."""
+
+    settings: WelchSettings
+    whole_record: bool
+    fixed: tuple[Setting, ...]
+
+
+def session_command(
+    files: Sequence[Path],
+    routes: Routes,
+    report: Path | None,
+    json: Path | None,
+    rerun: Path | None,
+) -> int:
+    """Analyse the files one after the other, write a report of each, and print the tables.
+
+    Parameters
+    ----------
+    files : sequence of Path
+    routes : Routes
+    report : Path, optional
+        Folder of the report of one file, or of one folder a file.
+    json : Path, optional
+        New file for all results; ``-`` for standard output, which then holds nothing else.
+    rerun : Path, optional
+        New file with session and fits for Rerun's viewer, of one session.
+
+    Returns
+    -------
+    int
+        Exit code: 1 if a file could not be analysed, 2 if the settings suit none, 0 otherwise.
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+        Something cannot be written.
+    """
+    from rich.console import Console
+
+    from analysis.report.document import document, document_text
+    from analysis.report.folder import report_folders, write_new
+    from analysis.report.record_text import record_text
+    from analysis.report.tables import analysis_tables, summary_table
+
+    folders = report_folders(files, report)
+    found, errors, code = _analyse_all(files, folders, routes, rerun)
+    if not found:
+        return code
+    analyses = [analysis for analysis, _ in found]
+    subjects = [subject for _, subject in found if subject is not None]
+    to_stdout = json is not None and str(json) == "-"
+    console = Console(stderr=to_stdout, highlight=False)
+    if not console.is_terminal:
+        console = Console(stderr=to_stdout, highlight=False, width=120)
+    if len(files) == 1:
+        withheld: frozenset[str] = frozenset()
+        for subject in subjects:
+            console.print(record_text(subject))
+            withheld = subject.verdict.withheld
+        console.print(analysis_tables(analyses[0], withheld))
+    else:
+        console.print(summary_table(analyses))
+    _say(console, "")
+    for file, folder in zip(files, folders, strict=True):
+        if str(file) not in errors:
+            _say(console, f"Report of {file}: {folder}")
+    if rerun is not None:
+        _say(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
+    if json is not None:
+        text = document_text(document(analyses, errors, subjects))
+        if to_stdout:
+            typer.echo(text, nl=False)
+        else:
+            write_new(json, text)
+            _say(console, f"All results as JSON: {json}")
+    return code
+
+
+def _analyse_all(
+    files: Sequence[Path], folders: Sequence[Path], routes: Routes, rerun: Path | None
+) -> tuple[list[_Found], dict[str, str], int]:
+    """Analyse and report every file; return results, message by failed file, and exit code."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from analysis.estimate import EstimateError, SettingsError
+    from analysis.record import RecordError
+    from analysis.report.folder import OutputError
+    from rigd.session import SessionError
+
+    found: list[_Found] = []
+    errors: dict[str, str] = {}
+    code = 0
+    terminal = _standard_error()
+    tell = partial(terminal.print, markup=False, highlight=False, soft_wrap=True)
+    with Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=terminal,
+        transient=True,
+        disable=not terminal.is_terminal,
+    ) as progress:
+        steps = _steps(routes, rerun)
+        task = progress.add_task("", total=len(files) * steps)
+        for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
+
+            def on_step(done: str, name: str = file.name) -> None:
+                weight = _FIGURE_STEPS if done.startswith("figure") else 1
+                progress.update(task, advance=weight, description=f"{name}: {done}")
+
+            try:
+                found.append(_analyse_file(file, folder, routes, rerun, on_step, tell))
+            except (SessionError, RecordError, EstimateError, OutputError) as error:
+                code = max(code, 2 if isinstance(error, SettingsError) else 1)
+                errors[str(file)] = str(error)
+                progress.update(task, completed=number * steps)
+                tell(f"Error: {error}")
+    return found, errors, code
+
+
+def _steps(routes: Routes, rerun: Path | None) -> int:
+    from analysis.report.html.write import FIGURES as OF_RECORD
+    from analysis.report.write import FIGURES, FIGURES_BESIDE_RECORD
+
+    figures = (*FIGURES_BESIDE_RECORD, *OF_RECORD) if routes.whole_record else FIGURES
+    pictures = len(figures) + (rerun is not None)
+    return 2 + routes.whole_record + len(routes.settings.types) + _FIGURE_STEPS * pictures
+
+
+def _analyse_file(
+    file: Path,
+    folder: Path,
+    routes: Routes,
+    rerun: Path | None,
+    on_step: Callable[[str], None],
+    warn: Callable[[str], None],
+) -> _Found:
+    from analysis.record import load_record
+    from analysis.report.folder import new_folder
+    from analysis.report.write import write_report
+    from analysis.welch_route import analyse
+    from analysis.whole_record import MeasurementError
+
+    record = load_record(file)
+    on_step("read")
+    analysis = analyse(record, routes.settings, on_step)
+    subject = None
+    if routes.whole_record:
+        on_step("whole record")
+        try:
+            subject = _whole_record(record, routes, analysis)
+        except MeasurementError as error:
+            warn(f"Warning: {error} Only the paper's route was gone.")
+    with new_folder(folder) as part:
+        write_report(analysis, part, on_step, subject)
+    if rerun is not None:
+        from analysis.report.rerun_file import write_rerun_file
+
+        write_rerun_file(analysis, rerun)
+        on_step("figure for Rerun")
+    return analysis, subject
+
+
+def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis) -> Subject:
+    from analysis.report.html import Subject
+    from analysis.selection import select
+    from analysis.whole_record import BAND_HZ, Measurement
+
+    selection = select(Measurement.of_record(record), fixed=routes.fixed)
+    return Subject.of(record, selection, BAND_HZ, routes.fixed, welch)
+
+
+def _standard_error() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,68 @@
+"""What of a fit's numbers is reported, and what is there only because a fit gives a number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from analysis.report.html.table import Number
+    from analysis.structures import Structure
+
+MARK: Final = "†"
+
+_COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
+_SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
+
+
+def has(structure: Structure, name: str) -> bool:
+    """Whether a parameter means anything in a structure."""
+    if name in ("zeta", "alpha"):
+        return structure.internal
+    if name in ("gamma", "lambda"):
+        return structure.external
+    return True
+
+
+def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str]:
+    """Parameters of a fit whose numbers say nothing of the antenna.
+
+    Parameters
+    ----------
+    structure : Structure
+        Of the fit.
+    withheld : collection of str
+        Orders that the data do not support, "alpha" or "lambda".
+
+    Returns
+    -------
+    frozenset of str
+        Each of these orders that the structure has, and its coefficient: that holds for this
+        order only, as its very unit shows.
+    """
+    return frozenset(
+        name for order in withheld for name in (order, _COEFFICIENTS[order]) if has(structure, name)
+    )
+
+
+def marked(number: Number) -> Number:
+    """Mark a number that is not reported; a dash needs no mark."""
+    return greyed(number if number.value is None else replace(number, text=number.text + MARK))
+
+
+def greyed(number: Number) -> Number:
+    """Show a number in grey, such as what belongs to one that is marked."""
+    return replace(number, doubtful=number.value is not None)
+
+
+def footnotes(withheld: Collection[str]) -> tuple[str, ...]:
+    """Say what the mark means, if it occurs."""
+    if not withheld:
+        return ()
+    orders = " or ".join(_SYMBOLS[order] for order in sorted(withheld))
+    return (
+        f"{MARK} not reported: the data support no order {orders}. The number belongs to its "
+        "curve, not to the antenna.",
+    )

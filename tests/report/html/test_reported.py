@@ -1,0 +1,155 @@
+"""A number that the verdict withholds is nowhere shown as if it were the antenna's."""
+
+import csv
+import re
+from dataclasses import replace
+from datetime import UTC, datetime
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from analysis.report import style
+from analysis.report.document import document
+from analysis.report.html import Verdict
+from analysis.report.html.damping_sentences import damping_sentences
+from analysis.report.html.figures import illustrations
+from analysis.report.html.page import page
+from analysis.report.html.reported import MARK, unreported
+from analysis.report.html.table import Number, csv_text
+from analysis.report.html.write import report_tables
+from analysis.report.record_text import record_text
+from analysis.report.supported_band import excited_band_hz, supported_band_hz
+from analysis.report.write import tables_text
+from analysis.structures import STRUCTURES
+
+ALPHA = frozenset({"alpha"})
+
+
+@pytest.fixture(scope="module")
+def careful(record_subject):
+    """Type VI whose alpha the data do not support, on a record that shows two modes."""
+    order = SimpleNamespace(order="alpha", status="not supported", value=None, interval=(0.9, 1.2))
+    verdict = replace(record_subject.verdict, withheld=ALPHA, orders=(order,), visible=(1, 2))
+    return replace(record_subject, verdict=verdict)
+
+
+def test_an_order_takes_its_coefficient_with_it():
+    assert unreported(STRUCTURES["VI"], ALPHA) == {"alpha", "zeta"}
+    assert unreported(STRUCTURES["III"], {"lambda", "alpha"}) == {
+        "zeta", "alpha", "gamma", "lambda"
+    }  # fmt: skip
+    assert unreported(STRUCTURES["II"], ALPHA) == frozenset()
+    assert unreported(STRUCTURES["VI"], ()) == frozenset()
+
+
+def test_tables_mark_every_such_number_and_no_other(careful):
+    modes, (parameters, _sizes, _correlations, structures), (welch, _peaks) = report_tables(careful)
+    shown = {row[0]: row for row in parameters.rows}
+    for symbol in ("ζ", "α"):
+        assert [cell.value for cell in shown[symbol][3:7]] == [None] * 4
+    assert shown["λ"][3].value == careful.fit.parameters["lambda"]
+    for table, first in ((structures, 1), (welch, 2)):
+        for row in table.rows:
+            doubtful = [cell.doubtful for cell in row if isinstance(cell, Number)]
+            known = [cell.value is not None for cell in row[first : first + 4]]
+            assert doubtful[:4] == known  # of zeta and alpha, value and std
+            assert not any(doubtful[4:])
+        assert any(MARK in note and "α" in note and "λ" not in note for note in table.notes)
+    by_type = {row["type"]: row for row in csv.DictReader(csv_text(structures).splitlines())}
+    assert by_type["VI"]["not_reported"] == "alpha zeta"
+    assert float(by_type["VI"]["alpha"]) == careful.fit.parameters["alpha"]
+    assert [row[0].text for row in modes.rows] == ["1", "2", f"3{MARK}"]
+    assert "does not show" in modes.notes[0]
+
+
+def test_nothing_is_marked_where_all_is_supported(record_subject):
+    modes, tables, of_paper = report_tables(record_subject)
+    for table in (modes, *tables, *of_paper):
+        assert MARK not in csv_text(table) + "".join(table.notes)
+        assert not any(c.doubtful for row in table.rows for c in row if isinstance(c, Number))
+
+
+def test_page_terminal_and_text_tables_show_the_mark(careful):
+    modes, tables, of_paper = report_tables(careful)
+    made_at = datetime(2026, 1, 1, tzinfo=UTC)
+    text = page(careful, ["", ""], modes, tables, of_paper, made_at)
+    alpha = careful.fits["VI"].parameters["alpha"]
+    (cell,) = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
+    assert cell.endswith(MARK)
+    console = Console(width=140)
+    with console.capture() as capture:
+        console.print(record_text(careful))
+    assert f"3{MARK}" in capture.get()
+    (row,) = [line.split() for line in capture.get().splitlines() if line.split()[:1] == ["α"]]
+    assert row[4:8] == ["–"] * 4
+    welch = tables_text(careful.welch, ALPHA)
+    fits, *others = [line for line in welch.splitlines() if re.match(r"VI\s+omega", line)]
+    assert fits.count(MARK) == 2
+    assert MARK not in "".join(others)
+    assert f"{MARK} not reported" in welch
+    assert MARK not in tables_text(careful.welch)
+
+
+def test_the_document_flags_and_keeps_the_numbers(careful):
+    content = document([careful.welch], subjects=[careful])
+    for fit in content["fits"]:
+        expected = [] if fit["type"] in ("II", "V") else ["alpha", "zeta"]
+        assert fit["withheld"] == expected
+        assert fit["parameters"]["alpha"] is not None
+    selected = [fit["type"] for fit in content["fits"] if fit.get("selected")]
+    assert selected == ["VI"]
+    (record,) = content["records"]
+    assert record["orders"] == {
+        "alpha": {"status": "not supported", "value": None, "interval_95": [0.9, 1.2]}
+    }
+    first, last = record["curves"]["loss_factor_supported_hz"]
+    assert (first, last) == (careful.fit.modes[0].frequency_hz, careful.fit.modes[1].frequency_hz)
+    visible = {m["mode"]: m["visible"] for m in content["modes"] if m["estimator"] == "record"}
+    assert visible == {1: True, 2: True, 3: False}
+
+
+def test_of_modes_that_do_not_show_no_damping_is_told(careful):
+    told = " ".join(damping_sentences(careful.fit, ALPHA, (1, 2)))
+    assert "at 2.57 Hz and" in told
+    assert "44.8" not in told
+    assert "damping ratio" not in " ".join(damping_sentences(careful.fit, ALPHA, ()))
+
+
+def loss_axes(subject):
+    with style.styled():
+        (found,) = [each for each in illustrations(subject) if each.name == "loss_factor"]
+    return found.figure.axes[0], found.description
+
+
+def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_subject):
+    axes, description = loss_axes(careful)
+    labels = [line.get_label() for line in axes.get_lines()]
+    assert "total" in labels
+    assert "internal (material)" not in labels
+    (total,) = [line for line in axes.get_lines() if line.get_label() == "total"]
+    modes = careful.fit.modes
+    assert total.get_xdata()[0] == pytest.approx(modes[0].frequency_hz)
+    assert total.get_xdata()[-1] == pytest.approx(modes[1].frequency_hz)
+    assert "do not support" in description
+    axes, description = loss_axes(record_subject)
+    assert {"total", "internal (material)"} <= {line.get_label() for line in axes.get_lines()}
+    assert "do not support" not in description
+
+
+def test_one_mode_has_a_point_and_no_curve(careful):
+    one = replace(careful, verdict=Verdict("VI", (), withheld=ALPHA, visible=(1,)))
+    assert supported_band_hz(one) is None
+    axes, _ = loss_axes(one)
+    (point,) = {float(x) for line in axes.get_lines() for x in line.get_xdata()}
+    assert point == careful.fit.modes[0].frequency_hz
+
+
+def test_the_excited_band_ends_where_the_sweep_does(careful):
+    """Of a chirp of 0.05 to 50 Hz nearly all; of noise alone nothing."""
+    first_hz, last_hz = excited_band_hz(careful.record, careful.analysis)
+    assert first_hz < 2.0
+    assert last_hz > 45.0
+    noise = 5e-3 * np.random.default_rng(1).standard_normal(len(careful.record.torque_nm))
+    assert excited_band_hz(replace(careful.record, torque_nm=noise), careful.analysis) is None
