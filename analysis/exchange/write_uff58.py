@@ -23,6 +23,9 @@ _EVEN_IN_TEXT, _EVEN_IN_BINARY = 1e-2, 1e-6
 """Largest error of an abscissa, in spacings, at which first value and increment stand for all: the
 format has six digits for either. In binary the abscissae themselves are the better choice."""
 
+_SAME_INCREMENT: Final = 1e-10
+"""Relative error of the increment at which, in binary, a short record tells its rate as well."""
+
 _TIME_RESPONSE, _FREQUENCY_RESPONSE, _COHERENCE = 1, 4, 6
 _TIME, _FREQUENCY, _GENERAL, _UNKNOWN = 17, 18, 1, 0
 _REAL_DOUBLE, _COMPLEX_DOUBLE = 4, 6
@@ -60,7 +63,10 @@ def write_uff58(table: Table, stream: BinaryIO, *, binary: bool) -> None:
         If abscissae have to be given one by one and six digits, all that text has, are too few.
     """
     axis = np.asarray(table.axis.values, dtype=np.float64)
-    even = _is_even(axis, _EVEN_IN_BINARY if binary else _EVEN_IN_TEXT)
+    if binary:
+        even = _is_even(axis, _EVEN_IN_BINARY) and _six_digits_make_the_increment(axis)
+    else:
+        even = _is_even(axis, _EVEN_IN_TEXT)
     if not even and not binary and not _six_digits_do(axis):
         raise ExchangeError(
             f"{table.source}: its {table.axis.title.lower()} is not even enough for UFF58 in text, "
@@ -81,6 +87,11 @@ def _is_even(axis: NDArray[np.float64], tolerance: float) -> bool:
     first, increment = _start_and_increment(axis)
     made = float(f"{first:.5e}") + float(f"{increment:.5e}") * np.arange(len(axis))
     return bool(np.abs(made - axis).max() <= tolerance * increment)
+
+
+def _six_digits_make_the_increment(axis: NDArray[np.float64]) -> bool:
+    _, increment = _start_and_increment(axis)
+    return abs(float(f"{increment:.5e}") - increment) <= _SAME_INCREMENT * increment
 
 
 def _six_digits_do(axis: NDArray[np.float64]) -> bool:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -45,10 +45,16 @@ def sessions(draw):
     return {"tick": np.cumsum(steps) - 1, **columns}
 
 
+def regular(length):
+    """Samples without gaps, all 0."""
+    return {"tick": np.arange(length), **{field: np.zeros(length) for field in FIELDS}}
+
+
 # The folder is the same for every example, and every file in it a new one.
 @settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=20
 )
+@example(samples=regular(40), rate_hz=333.3)  # of which six digits of the period tell too little
 @given(samples=sessions(), rate_hz=st.sampled_from([1000.0, 1024.0, 333.3, 5e4]))
 @pytest.mark.parametrize("suffix", [".csv", ".mat", ".uff"])
 def test_what_was_exported_is_imported_as_it_was(make_session, tmp_path, suffix, samples, rate_hz):
