@@ -1,14 +1,15 @@
 """Offline analyser of session files: frequency response and fractional damping models.
 
-For scripts and notebooks, `load`, `frf`, `fit` and `select` of `analysis.api` are here too.
+For scripts and notebooks, `load`, `frf`, `fit`, `select` and `campaign` of `analysis.api` are here
+too.
 """
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from analysis.api import fit, frf, load, select
+    from analysis.api import campaign, fit, frf, load, select
 
-__all__ = ["fit", "frf", "load", "select"]
+__all__ = ["campaign", "fit", "frf", "load", "select"]
 
 
 def __getattr__(name: str) -> object:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.selection import Selection
     from analysis.settings import WelchSettings
+    from analysis.welch_aware import WelchAwareFit
     from analysis.welch_route import WelchAnalysis
     from analysis.whole_record import RecordAnalysis, Setting
     from rigd.spectral import FrequencyResponse
@@ -95,15 +96,27 @@ def fit(
 ) -> WelchAnalysis: ...
 
 
+@overload
 def fit(
     record: Record,
     types: Sequence[str] | None = None,
     *,
-    method: Literal["record", "welch"] = "record",
+    method: Literal["welch-aware"],
     fixed: Iterable[Setting] = (),
     weightings: Sequence[str] | None = None,
     band_hz: tuple[float, float] | None = None,
-) -> RecordAnalysis | WelchAnalysis:
+) -> tuple[WelchAwareFit, ...]: ...
+
+
+def fit(
+    record: Record,
+    types: Sequence[str] | None = None,
+    *,
+    method: Literal["record", "welch", "welch-aware"] = "record",
+    fixed: Iterable[Setting] = (),
+    weightings: Sequence[str] | None = None,
+    band_hz: tuple[float, float] | None = None,
+) -> RecordAnalysis | WelchAnalysis | tuple[WelchAwareFit, ...]:
     """Fit model types to a record.
 
     Parameters
@@ -111,19 +124,21 @@ def fit(
     record : Record
     types : sequence of str, optional
         Of "I" to "VII"; by default all seven, with "welch" the paper's six.
-    method : {"record", "welch"}
-        Output error on the whole record, or the paper's fit to Welch's estimate.
+    method : {"record", "welch", "welch-aware"}
+        Output error on the whole record, the paper's fit to Welch's estimate, or a fit to that
+        estimate with the model put through the same estimator.
     fixed : iterable of str
-        With "record": settings of beam and rig that stay at the file's values, of
+        Not with "welch": settings of beam and rig that stay at the file's values, of
         `analysis.whole_record.SETTINGS`.
     weightings : sequence of str, optional
-        With "welch": "const", "omega", "omega^K"; by default the first two.
+        Not with "record": "const", "omega", "omega^K"; by default the first two, with
+        "welch-aware" the second.
     band_hz : tuple of float, optional
-        First and last frequency; by default 0 to 50 Hz, with "welch" the paper's band.
+        First and last frequency; by default 0 to 50 Hz, else than with "record" the paper's band.
 
     Returns
     -------
-    RecordAnalysis or WelchAnalysis
+    RecordAnalysis, WelchAnalysis or tuple of WelchAwareFit
         By method.
 
     Raises
@@ -159,7 +174,17 @@ def fit(
             weightings=tuple(weightings or PAPER_WEIGHTINGS),
         )
         return analyse(record, settings)
-    raise ValueError(f"There is no method {method!r}; choose 'record' or 'welch'.")
+    if method == "welch-aware":
+        from analysis.settings import PAPER_BAND_HZ, WelchSettings
+        from analysis.welch_aware import fit_record_welch_aware
+
+        settings = WelchSettings(
+            band_hz=band_hz or PAPER_BAND_HZ,
+            types=tuple(types or STRUCTURES),
+            weightings=tuple(weightings or ("omega",)),
+        )
+        return fit_record_welch_aware(record, settings, fixed=fixed)
+    raise ValueError(f"There is no method {method!r}; choose 'record', 'welch' or 'welch-aware'.")
 
 
 def select(

@@ -28,7 +28,7 @@ def record(workspace):
 def test_the_document_s_example_runs_as_written(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     blocks = re.findall(r"^```python\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 7
+    assert len(blocks) == 8
     exec("\n".join(blocks), {"__name__": "__main__"})
     printed = capsys.readouterr().out
     assert "21500 samples at 1000 Hz, outcome complete" in printed
@@ -69,7 +69,9 @@ def test_fit_by_either_method(record):
 def test_wrong_use_is_told(record, workspace):
     with pytest.raises(ValueError, match="no model type 'VIII', 'x'; choose from I, II"):
         api.fit(record, ["III", "VIII", "x"])
-    with pytest.raises(ValueError, match="no method 'bayes'; choose 'record' or 'welch'"):
+    with pytest.raises(
+        ValueError, match="no method 'bayes'; choose 'record', 'welch' or 'welch-aware'"
+    ):
         api.fit(record, method="bayes")
     with pytest.raises(ValueError, match="cannot be fixed"):
         api.fit(record, ["I"], fixed=("alpha",))
@@ -83,7 +85,7 @@ def test_the_names_are_at_the_top_too_and_cost_nothing_until_used():
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         _ = analysis.nothing
     code = (
-        "import sys, analysis.api; from analysis import load, fit; "
+        "import sys, analysis.api; from analysis import campaign, load, fit; "
         "heavy = {'numpy', 'matplotlib', 'rigd.session', 'analysis.campaigns'}; "
         "assert not heavy & set(sys.modules)"
     )
