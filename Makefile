@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Hundreds of processes start in the tests: each would compile every module once more.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test check bench fuzz chaos endurance clean
 

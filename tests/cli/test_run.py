@@ -191,15 +191,20 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
     for _, process in running:  # each in another part of its start
         time.sleep(0.3)
         to_all(process, signal.SIGINT)
+    begun = 0
     for folder, process in running:
         output, errors = process.communicate(timeout=60)
+        assert not list(folder.glob("sessions/*"))
+        if "init_import_site" in errors:  # the interpreter's own start: nothing of ours runs yet
+            continue
+        begun += 1
         assert process.returncode == 130, errors
         assert "Traceback" not in errors
-        assert not list(folder.glob("sessions/*"))
         if output:  # it had come as far as to have something to say
             for session in json.loads(output)["sessions"]:
                 assert session["path"] is None
                 assert session["scheduled"] == 0
+    assert begun > 0
 
 
 def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
