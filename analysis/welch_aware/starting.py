@@ -14,11 +14,13 @@ import numpy as np
 from analysis.levenberg_marquardt import Minimum, NormalEquations, minimise
 from analysis.starts import starts
 from analysis.thinning import thinned
+from analysis.whole_record.resonance_shift import resonance_shift
 from analysis.whole_record.response import ResponseGrid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.whole_record.plant import Plant
     from analysis.whole_record.unknowns import Unknowns
 
 _POINTS: Final = 400
@@ -27,11 +29,6 @@ _MAX_EVALUATIONS: Final = 40
 _MOST: Final = 3
 _SAME_MINIMUM: Final = 0.05
 """Minima that lie closer in every unknown are one; a change of 1 is large."""
-
-_SCANS: Final = {"density_over_stiffness": np.linspace(-0.3, 0.3, 61)}
-_OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)
-_MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
-"""Damping for these scans, as `analysis.starts` gives it."""
 
 
 class PlainResponse:
@@ -57,9 +54,9 @@ class PlainResponse:
         self._measured = measured[index]
         self._grid = ResponseGrid(2j * np.pi * frequency_hz[index])
 
-    def cost(self, unknowns: Unknowns, x: NDArray[np.float64]) -> float:
+    def cost(self, plant: Plant) -> float:
         """Weighted mean square of the deviation, in (N·m/rad)²."""
-        deviation = self._grid.evaluate(unknowns.plant(x))[0] - self._measured
+        deviation = self._grid.evaluate(plant)[0] - self._measured
         return float(self._weights @ (deviation.real**2 + deviation.imag**2))
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
@@ -90,7 +87,7 @@ def starting_points(plain: PlainResponse, unknowns: Unknowns) -> list[NDArray[np
 def _minima(plain: PlainResponse, unknowns: Unknowns) -> list[Minimum]:
     """Different minima, the lowest first."""
     lower, upper = unknowns.bounds
-    shift = _shift_of_resonances(plain, unknowns)
+    shift = resonance_shift(plain.cost, unknowns)
     found = [
         minimise(
             lambda x: plain.normal_equations(unknowns, x),
@@ -102,7 +99,7 @@ def _minima(plain: PlainResponse, unknowns: Unknowns) -> list[Minimum]:
         )
         for sizes in starts(
             unknowns.structure,
-            lambda sizes: plain.cost(unknowns, unknowns.start(sizes) + shift),
+            lambda sizes: plain.cost(unknowns.plant(unknowns.start(sizes) + shift)),
         )
     ]
     kept: list[Minimum] = []
@@ -110,22 +107,3 @@ def _minima(plain: PlainResponse, unknowns: Unknowns) -> list[Minimum]:
         if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM for other in kept):
             kept.append(minimum)
     return kept
-
-
-def _shift_of_resonances(plain: PlainResponse, unknowns: Unknowns) -> NDArray[np.float64]:
-    """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
-
-    With a resonance off by more than it is wide, no descent would find it: all of them by rho/EI,
-    then one by one where modes have offsets of their own.
-    """
-    moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
-    shift = np.zeros(moderate.size)
-    for place, name in enumerate(unknowns.names):
-        if name in _SCANS or name in unknowns.offsets:
-            costs = []
-            steps = _SCANS.get(name, _OFFSET_SCAN)
-            for step in steps:
-                shift[place] = step
-                costs.append(plain.cost(unknowns, moderate + shift))
-            shift[place] = steps[int(np.argmin(costs))]
-    return shift

@@ -16,6 +16,7 @@ import numpy as np
 from analysis.levenberg_marquardt import NormalEquations
 from analysis.thinning import thinned
 from analysis.whole_record.descent import descend
+from analysis.whole_record.resonance_shift import resonance_shift
 from analysis.whole_record.response import ResponseGrid
 from analysis.whole_record.steps import Steps
 
@@ -35,12 +36,7 @@ _TOLERANCE: Final = 1e-2
 _SAME_MINIMUM: Final = 0.05
 """Minima whose plants differ by less than this share of the cost are one."""
 
-_SCANS: Final = {"density_over_stiffness": np.linspace(-0.3, 0.3, 61)}
-_OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)
 _MAX_EVALUATIONS: Final = 60
-_MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
-"""Damping for these scans, as `Unknowns.start` takes it."""
-
 _SIZES: Final = {name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zeta", "gamma")}
 """Relative to stiffness and to inertia at a mode: about twice a damping ratio."""
 
@@ -119,7 +115,7 @@ def rough_starts(rough: RoughResponse, unknowns: Unknowns) -> list[NDArray[np.fl
     The damping that fits best with all orders 1, which most materials and air come close to; then
     the same losses with the orders apart.
     """
-    shift = _shift_of_resonances(rough, unknowns)
+    shift = resonance_shift(rough.cost, unknowns)
     sizes = [_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
     found = [unknowns.start(np.array(point)) + shift for point in itertools.product(*sizes)]
     first = min(found, key=lambda x: rough.cost(unknowns.plant(x)))
@@ -153,22 +149,3 @@ def rough_minima(
         if not any(rough.alike(plant, unknowns.plant(other.x)) for other in kept):
             kept.append(minimum)
     return kept
-
-
-def _shift_of_resonances(rough: RoughResponse, unknowns: Unknowns) -> NDArray[np.float64]:
-    """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
-
-    With a resonance off by more than it is wide, no descent would find it: all of them by rho/EI,
-    then one by one where modes have offsets of their own.
-    """
-    moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
-    shift = np.zeros(moderate.size)
-    for place, name in enumerate(unknowns.names):
-        if name in _SCANS or name in unknowns.offsets:
-            steps = _SCANS.get(name, _OFFSET_SCAN)
-            costs = []
-            for step in steps:
-                shift[place] = step
-                costs.append(rough.cost(unknowns.plant(moderate + shift)))
-            shift[place] = steps[int(np.argmin(costs))]
-    return shift
