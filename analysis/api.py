@@ -147,6 +147,8 @@ def fit(
         No such type, method or setting; among its kinds those of the methods:
         `MeasurementError` and `EstimateError`, if the record cannot be used.
     """
+    if isinstance(types, str) or isinstance(fixed, str) or isinstance(weightings, str):
+        raise ValueError('Give names in a list, if only one: ["VI"] and not "VI".')
     from analysis.structures import STRUCTURES
 
     unknown = [name for name in types or () if name not in STRUCTURES]

@@ -96,7 +96,7 @@ def _record_fit(session: SessionResult, fit: RecordEstimate) -> dict[str, Any]:
         **_name(session, "record", fit.structure),
         "candidate": fit.name,
         "parameters": fit.parameters,
-        "std": _of_free(fit.std, {*fit.determined, *fit.at_bounds}),
+        "std": _of_free(fit.std, fit.free),
         "cost": fit.cost,
         "at_bounds": fit.at_bounds,
         "indices": asdict(fit.indices),

@@ -121,6 +121,11 @@ class RecordEstimate:
         """As tables call it."""
         return structure_name(self.structure, self.uniform)
 
+    @property
+    def free(self) -> frozenset[str]:
+        """Parameters that were sought, found or not."""
+        return frozenset((*self.determined, *self.at_bounds))
+
     @classmethod
     def of(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
         """Keep of a fit what a campaign needs: all but the residual."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -72,7 +73,7 @@ class Experiment:
         """Name the first fact in which another one differs, None if it is the same experiment."""
         for key, mine in self.facts.items():
             theirs = other.facts.get(key, mine)
-            if theirs != mine:
+            if not _same(theirs, mine):
                 return f"{key} is {_told(key, theirs)}, but {_told(key, mine)}"
         return None
 
@@ -83,10 +84,16 @@ def most_common(experiments: Sequence[Experiment]) -> int:
     return agree.index(max(agree))
 
 
+def _same(one: str | float, two: str | float) -> bool:
+    if isinstance(one, str) or isinstance(two, str):
+        return one == two
+    return math.isclose(one, two, rel_tol=1e-9)
+
+
 def _told(key: str, value: str | float) -> str:
     if isinstance(value, str):
         return value
-    return f"{value:g} {_UNITS[key]}"
+    return f"{value:g} {_UNITS.get(key, '')}".rstrip()
 
 
 def _number(text: str) -> str | float:

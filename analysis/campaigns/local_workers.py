@@ -82,6 +82,8 @@ class LocalWorkers:
                     under_way[self._pool.submit(function, *arguments[number])] = number
                 except BrokenExecutor:
                     waiting.append(number)
+                    if not under_way:  # a process that had nothing to do has ended
+                        self._renew(self._jobs)
                     break
             for future in wait(under_way, return_when=FIRST_COMPLETED).done:
                 number = under_way.pop(future)
@@ -94,26 +96,23 @@ class LocalWorkers:
                 suspects += under_way.values()
                 under_way.clear()
                 for number in suspects:
-                    done(number, self._again(function, arguments[number], hopeful=bool(results)))
+                    done(number, self._again(function, arguments[number]))
+                if all(isinstance(result, Lost) for result in results.values()):
+                    raise CampaignError(
+                        "The worker processes ended by themselves, most often for lack of memory: "
+                        "use fewer --jobs. A script that calls campaign() must do so under "
+                        "if __name__ == '__main__':"
+                    )
                 self._renew(self._jobs)
         return [results[number] for number in range(len(arguments))]
 
-    def _again(
-        self, function: Callable[..., Result], arguments: tuple[Any, ...], *, hopeful: bool
-    ) -> Result | Lost:
-        """Try a task alone; where none has ever come back, the fault is not the task's."""
+    def _again(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result | Lost:
+        """Try a task alone."""
         self._renew(1)
         try:
             return self._pool.submit(function, *arguments).result()
-        except BrokenExecutor as error:
-            if hopeful:
-                return Lost("its worker process ended by itself, twice: most often for lack of "
-                            "memory")  # fmt: skip
-            raise CampaignError(
-                "A worker process ended by itself, most often for lack of memory: use fewer "
-                "--jobs. A script that calls campaign() must do so under "
-                "if __name__ == '__main__':"
-            ) from error
+        except BrokenExecutor:
+            return Lost("its worker process ended by itself, twice: most often for lack of memory")
 
     def _renew(self, jobs: int) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)

@@ -102,7 +102,10 @@ def record_rows(campaign: Campaign) -> list[Row]:
             "type": each.structure,
             "uniform": each.uniform,
             **each.parameters,
-            **{f"{name}_std": value for name, value in each.std.items()},
+            **{
+                f"{name}_std": value if name in each.free else None
+                for name, value in each.std.items()
+            },
             "cost": each.cost,
             "degrees_of_freedom": each.degrees_of_freedom,
             "bic": each.bic,

@@ -136,6 +136,9 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
             estimates, verdict = _whole_record(record, task, welch.response)
         except failures as error:
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
+        except (MemoryError, np.linalg.LinAlgError) as error:
+            why = "there is not memory enough" if isinstance(error, MemoryError) else error
+            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {why}")
     return SessionResult(
         path=path,
         experiment=experiment,
@@ -155,7 +158,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
 def _whole_record(
     record: Record, task: SessionTask, measured: FrequencyResponse
 ) -> tuple[tuple[RecordEstimate, ...], Verdict]:
-    """Select a structure on the whole record; of all fits, keep those asked for."""
+    """Select a structure on the whole record; of all fits, keep it and those asked for."""
     from analysis.selection import select
     from analysis.structures import STRUCTURES
     from analysis.whole_record import Measurement
@@ -174,7 +177,10 @@ def _whole_record(
         return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
 
     order = list(STRUCTURES)
-    estimates = [kept(each) for each in selection.candidates]
-    asked = [each for each in estimates if each.structure in task.structures]
+    asked = [
+        kept(each)
+        for each in selection.candidates
+        if each.fit.structure.name in task.structures or each.fit is selection.fit
+    ]
     asked.sort(key=lambda each: (not each.uniform, order.index(each.structure)))
     return tuple(asked), selection.verdict

@@ -110,6 +110,7 @@ def _analyse_all(
     files: Sequence[Path], folders: Sequence[Path], routes: Routes, rerun: Path | None
 ) -> tuple[list[_Found], dict[str, str], int]:
     """Analyse and report every file; return results, message by failed file, and exit code."""
+    from numpy.linalg import LinAlgError
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from analysis.estimate import EstimateError, SettingsError
@@ -140,12 +141,24 @@ def _analyse_all(
 
             try:
                 found.append(_analyse_file(file, folder, routes, rerun, on_step, tell))
-            except (SessionError, RecordError, EstimateError, OutputError) as error:
+            except (
+                SessionError, RecordError, EstimateError, OutputError, MemoryError, LinAlgError
+            ) as error:  # fmt: skip
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)
-                errors[str(file)] = str(error)
+                errors[str(file)] = message = _told(file, error)
                 progress.update(task, completed=number * steps)
-                tell(f"Error: {error}")
+                tell(f"Error: {message}")
     return found, errors, code
+
+
+def _told(file: Path, error: Exception) -> str:
+    from numpy.linalg import LinAlgError
+
+    if isinstance(error, MemoryError):
+        return f"{file}: there is not memory enough to analyse it."
+    if isinstance(error, LinAlgError):
+        return f"{file}: the estimate failed ({error}); is this a record of the rig?"
+    return str(error)
 
 
 def _steps(routes: Routes, rerun: Path | None) -> int:

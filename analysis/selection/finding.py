@@ -15,6 +15,7 @@ Kind = Literal[
     "ringing start",
     "beam data",
     "not uniform",
+    "implausible",
     "unexplained",
 ]
 

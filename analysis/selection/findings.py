@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.selection.finding import Finding
-from analysis.selection.stated_otherwise import of_beam, of_instruments, of_start
+from analysis.selection.stated_otherwise import at_edges, of_beam, of_instruments, of_start
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -14,13 +14,18 @@ if TYPE_CHECKING:
     from analysis.selection.harmonics import Harmonic
     from analysis.selection.nonlinear_search import NonlinearForce
     from analysis.selection.whiteness import InputRelation, Whiteness
+    from analysis.whole_record import ModeEstimate
 
 _NORMAL_95: Final = 1.959963984540054
 _MAINS_WANDER: Final = 0.005
+_MODES_TO_JUDGE: Final = 2
 
 
 def findings(
-    field: Field, forces: tuple[NonlinearForce, ...], multiples: tuple[Harmonic, ...]
+    field: Field,
+    forces: tuple[NonlinearForce, ...],
+    multiples: tuple[Harmonic, ...],
+    visible: tuple[int, ...],
 ) -> tuple[Finding, ...]:
     """Name what is there.
 
@@ -31,15 +36,17 @@ def findings(
         Those the record calls for.
     multiples : tuple of Harmonic
         What the residual holds at multiples of the sweep's frequency.
+    visible : tuple of int
+        Modes that stand out of the noise. With fewer than two, what the file states is not
+        doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
     """
-    return (
-        *_hum(field),
-        *map(_force, forces),
-        *_harmonics(multiples),
-        *of_instruments(field),
-        *of_beam(field),
-        *of_start(field),
-    )
+    found = (*_hum(field), *map(_force, forces), *_harmonics(multiples))
+    edges = tuple(at_edges(field))
+    if edges:
+        return (*found, *edges)
+    if len(visible) < _MODES_TO_JUDGE:
+        return found
+    return (*found, *of_instruments(field), *of_beam(field), *of_start(field))
 
 
 def mains(frequency_hz: float) -> str:
@@ -118,9 +125,12 @@ def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
             )
 
 
-def unexplained(white: Whiteness, related: InputRelation) -> Finding:
+def unexplained(
+    white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
+) -> Finding:
     """Describe what remains and has no name."""
     low, high = white.loudest_hz
+    at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
     if related.related:
         where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
         what = (
@@ -131,6 +141,13 @@ def unexplained(white: Whiteness, related: InputRelation) -> Finding:
             "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "
             "what stays belongs to the rig."
         )
+    elif white.loud and at_mode:
+        what = (
+            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise at mode "
+            f"{at_mode[0]} ({low:.2f} to {high:.2f} Hz): steps of the encoder, which the resonance "
+            "magnifies, or something of that mode that the model lacks."
+        )
+        remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
     else:
         near = mains((low + high) / 2)
         what = (

@@ -95,9 +95,9 @@ def select(
         for order in ("alpha", "lambda")
     )
     close = rivals(field, EVEN)
-    found = findings(field, forces, multiples)
+    found = findings(field, forces, multiples, visible)
     if not explained:
-        found = (*found, unexplained(white, related))
+        found = (*found, unexplained(white, related, fit.modes))
     unsure = {
         o.order for o in (alpha, lambda_) if o.status in ("not identifiable", "not supported")
     }

@@ -18,6 +18,33 @@ _BEAM_OFF: Final = 0.003
 """Deviation of stiffness or density, relative to the file's, worth a word."""
 
 
+def at_edges(field: Field) -> Iterator[Finding]:
+    """Find settings that the search took as far as it goes; no rig is so far from its file."""
+    fit = field.best.fit
+    for name, words, factor, unit in (
+        ("delay_s", "The delay between the channels", 1e3, "ms"),
+        ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)", 1, "s²/m⁴"),
+        ("bending_stiffness_n_m2", "The bending stiffness (EI)", 1, "N·m²"),
+    ):
+        if name in fit.at_bounds:
+            value = fit.parameters[name]
+            yield Finding(
+                kind="implausible",
+                sentence=(
+                    f"{words} would have to be {factor * value:.4g} {unit} or go farther, which is "
+                    "the edge of what is searched: the record and its file do not fit each other. "
+                    "No number here is the antenna's."
+                ),
+                value=value,
+                interval=None,
+                unit=unit if factor == 1 else "s",
+                remedy=(
+                    "Check the signs and the units of angle and torque, and the beam's length, "
+                    "density and stiffness in the file."
+                ),
+            )
+
+
 def of_instruments(field: Field) -> Iterator[Finding]:
     """Find a delay and an inertia that the file does not state."""
     measurement, fit = field.comparison.measurement, field.best.fit

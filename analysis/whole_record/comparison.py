@@ -136,13 +136,19 @@ class Comparison:
         reference_rad = self.measurement.reference_rad
         if reference_rad is None:
             return self.angle_rad
-        followed = following(
-            self.angle_rad,
-            self.decimation.apply(reference_rad - reference_rad[0]),
-            self.decimation.rate_hz,
+        # Later samples fall to 0 with the filter's end, behind everything that is compared.
+        end = self.decimation.inside(self.measurement.angle_rad.size).stop
+        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])
+        followed = self.angle_rad.copy()
+        followed[:end] = following(
+            self.angle_rad[:end], reference_rad[:end], self.decimation.rate_hz
         )
-        apart = np.sum((self.angle_rad - followed) ** 2)
-        return followed if apart < _LARGEST_REST * np.sum(self.angle_rad**2) else self.angle_rad
+        # By its speed: an angle that drifts follows no reference, and disturbs nothing.
+        own, apart = (
+            np.sum(np.diff(angle_rad[self.kept]) ** 2)
+            for angle_rad in (self.angle_rad, self.angle_rad - followed)
+        )
+        return followed if apart < _LARGEST_REST * own else self.angle_rad
 
     def following_reference(self, plant: Plant) -> Comparison:
         """Take for input only what follows the reference, and take out what the rest does.

@@ -27,6 +27,10 @@ _MEMORY_S: Final = 0.4
 remember its reference: 0.4 Hz in frequency. A longer one lets noise pass for response; what a
 shorter one misses of a sharp feature of the loop costs a little precision and nothing else."""
 
+_RETURN_S: Final = 4.0
+"""For which both are taken to return to 0 after the record. A reference that ended elsewhere and
+fell to 0 at once would do so without the lag of the loop."""
+
 _FLOOR: Final = 1e-12
 """Of the reference's largest power: with less there is none at a frequency."""
 
@@ -42,11 +46,15 @@ def following(
     Parameters
     ----------
     angle_rad, reference_rad : ndarray, shape (n,)
-        Both taken as 0 before and after.
+        Both taken as 0 before.
     rate_hz : float
     """
-    length = fast_length(2 * angle_rad.size)
-    angle, reference = np.fft.rfft(angle_rad, length), np.fft.rfft(reference_rad, length)
+    way_back = 0.5 * (1 + np.cos(np.linspace(0, np.pi, round(_RETURN_S * rate_hz) + 1)[1:]))
+    length = fast_length(2 * (angle_rad.size + way_back.size))
+    angle, reference = (
+        np.fft.rfft(np.concatenate([values, values[-1] * way_back]), length)
+        for values in (angle_rad, reference_rad)
+    )
     lag_s = np.fft.fftfreq(length) * (length / rate_hz)
     window = np.exp(-0.5 * (lag_s / _MEMORY_S) ** 2)
     across, own = (

@@ -71,7 +71,18 @@ class Measurement:
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
-        """Take over a record that was read from a session file."""
+        """Take over a record that was read from a session file.
+
+        Raises
+        ------
+        MeasurementError
+            The motor was held.
+        """
+        if record.metadata.get("excitation") == "hold":
+            raise MeasurementError(
+                f"{record.path}: the motor was held, and moved with no more than the noise of its "
+                "sensors; record an excitation, such as rigd run chirp."
+            )
         return cls(
             name=str(record.path),
             angle_rad=record.angle_rad,

@@ -22,7 +22,10 @@ def test_results_come_in_order_and_progress_as_they_are_done(monkeypatch):
 
 
 def test_a_worker_that_dies_is_told():
-    with process_pool(1) as pool, pytest.raises(CampaignError, match="worker process ended") as it:
+    with (
+        process_pool(1) as pool,
+        pytest.raises(CampaignError, match="worker processes ended") as it,
+    ):
         pool.run(os._exit, [(3,)])
     assert "--jobs" in str(it.value)
 
@@ -40,6 +43,22 @@ def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
     (lost,) = (each for each in found if isinstance(each, Lost))
     assert found == [5, 4, 3, lost, 2, 1]
     assert "memory" in lost.reason
+
+
+def test_the_first_task_of_all_may_be_the_one():
+    with process_pool(2) as pool:
+        lost, *others = pool.run(ends_at_zero, [(n,) for n in (0, 1, 2)])
+    assert isinstance(lost, Lost)
+    assert others == [1, 2]
+
+
+def test_a_worker_that_ends_with_nothing_to_do_is_replaced():
+    with process_pool(1) as pool:
+        assert pool.run(abs, [(-1,)]) == [1]
+        (worker,) = multiprocessing.active_children()
+        worker.kill()
+        worker.join()
+        assert pool.run(abs, [(-2,)]) == [2]
 
 
 def interrupt(_number):

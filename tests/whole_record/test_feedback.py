@@ -92,6 +92,22 @@ def test_noise_that_moves_the_motor_is_no_response(sessions, controlled):
     assert abs(np.mean(unbiased)) < 0.1
 
 
+def test_a_reference_may_end_anywhere():
+    n, rng = 20_000, np.random.default_rng(4)
+    reference = 0.1 * rng.normal(size=n) * np.hanning(n) + np.where(np.arange(n) < 15_000, 0.0, 3.0)
+    lag = np.exp(-np.arange(200) / 10.0) / 10.0
+    follows = np.convolve(reference, lag)[:n]
+    found = following(follows, reference, 125.0)
+    assert np.abs(found - follows)[-125:].max() < 0.01 * follows[-1]
+
+
+def test_a_drift_does_not_keep_the_reference_from_being_followed(controlled):
+    measured = controlled("III", 2)
+    drift = np.linspace(0.0, 0.2, measured.angle_rad.size)
+    comparison = Comparison.of(replace(measured, angle_rad=measured.angle_rad + drift), (0.0, 50.0))
+    assert comparison.followed_rad() is not comparison.angle_rad
+
+
 def test_unknown_torques_do_not_count_under_a_controller_either(controlled):
     unknown = np.concatenate([np.arange(20_000, 20_050), np.arange(40_000, 60_000, 100)])
     every = fit(controlled("III", 5), "III")

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.whole_record import Measurement
+from analysis.whole_record import Measurement, MeasurementError
 from rigd.beam import Beam
 
 RECORD = SimpleNamespace(
@@ -20,6 +20,7 @@ RECORD = SimpleNamespace(
     angle_delay_s=2e-4,
     tool_inertia_kg_m2=1e-5,
     reference_rad=np.linspace(0.1, 0.2, 300),
+    metadata={"excitation": "chirp"},
 )
 
 
@@ -33,6 +34,12 @@ def test_a_record_is_taken_over():
     assert measurement.torque_known.all()
     assert measurement.torque_share == 1.0
     assert measurement.angle_from_rest(50.0) == pytest.approx(RECORD.angle_rad - 0.1)
+
+
+def test_a_motor_that_was_held_excites_nothing():
+    held = SimpleNamespace(**vars(RECORD) | {"metadata": {"excitation": "hold"}})
+    with pytest.raises(MeasurementError, match="the motor was held"):
+        Measurement.of_record(held)
 
 
 def test_its_masks_and_its_first_angle():
