@@ -105,16 +105,8 @@ class PageOfFile(_Playback):
     """
 
     def __init__(self, path: Path, scratch: Path) -> None:
-        self._program = RerunProgram(
-            (
-                str(path.absolute()),
-                "--serve-web",
-                *("--port", str(free_port(GRPC_PORT))),
-                *("--web-viewer-port", "0"),
-                *("--server-memory-limit", _MOST_MEMORY),
-            ),
-            {"TMPDIR": str(scratch)},
-        )
+        self._file, self._scratch = path, scratch
+        self._serve(free_port(GRPC_PORT))
         try:
             self._await_server()
             self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
@@ -130,12 +122,28 @@ class PageOfFile(_Playback):
         self._page.close()
         super().close()
 
+    def _serve(self, port: int) -> None:
+        self._program = RerunProgram(
+            (
+                str(self._file.absolute()),
+                "--serve-web",
+                *("--port", str(port)),
+                *("--web-viewer-port", "0"),
+                *("--server-memory-limit", _MOST_MEMORY),
+            ),
+            {"TMPDIR": str(self._scratch)},
+        )
+
     def _await_server(self) -> None:
         deadline = time.monotonic() + _START_S
-        program = self._program
-        while not (program.grpc_port and program.page_port):
-            if not program.running:
-                raise RerunError(f"The Rerun server ended: {program.last_words}.")
+        anywhere = False
+        while not (self._program.grpc_port and self._program.page_port):
+            if not self._program.running:
+                if anywhere or self._program.grpc_port:
+                    raise RerunError(f"The Rerun server ended: {self._program.last_words}.")
+                # Most likely another was quicker to take the port.
+                anywhere = True
+                self._serve(0)
             if time.monotonic() > deadline:
-                raise RerunError(f"The Rerun server does not answer: {program.last_words}.")
+                raise RerunError(f"The Rerun server does not answer: {self._program.last_words}.")
             time.sleep(_LOOK_S)

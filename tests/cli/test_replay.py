@@ -9,6 +9,7 @@ import re
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -569,6 +570,19 @@ def unseen(viewer, colors: dict) -> list:
             image = matplotlib.image.imread(io.BytesIO(shot), "png")
             missing -= {(view.name, c) for c in colors[view.name] if count(image, c) >= 40}
     return sorted(missing)
+
+
+def test_a_port_that_somebody_takes_first_is_not_insisted_on(
+    rerun_program, recording, tmp_path, monkeypatch
+):
+    from rigd.live.playback import PageOfFile
+
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        monkeypatch.setattr("rigd.live.playback.free_port", lambda wanted: taken)
+        with PageOfFile(recording, tmp_path) as page:
+            assert page.program.grpc_port not in (0, taken)
+            assert page.address.grpc_port == page.program.grpc_port
 
 
 @pytest.mark.parametrize("way", ["window", "browser"])
