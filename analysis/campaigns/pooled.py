@@ -61,11 +61,6 @@ class PooledParameter:
     chance: float
     next_interval: tuple[float, float]
 
-    @property
-    def between_share(self) -> float:
-        """Share of the estimates' variance that is between sessions (I²), 0 to 1."""
-        return self.between_std**2 / (self.between_std**2 + self.within_std**2)
-
 
 @dataclass(frozen=True, slots=True)
 class PooledEstimate:

@@ -147,8 +147,8 @@ class Refit:
 
         The deviations count the uncertainty of everything else that was fitted.
         """
-        projected = self.objective.project(self.objective.linearise(self.x), self.noise.weight)
         at = self.objective.linearise(self.x)
+        projected = self.objective.project(at, self.noise.weight)
         white = at.columns * self.noise.weight
         everything = np.concatenate([projected.jacobian, white])
         scale = np.sqrt(np.sum(np.abs(everything) ** 2, axis=1))

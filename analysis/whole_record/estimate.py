@@ -85,18 +85,17 @@ def fit_record(
             for structure in structures
         )
     ]
-    closest = min(searches, key=lambda search: search.minima[0].cost)
-    reference = closest.lowest()
+    closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
+    reference = searches[closest].lowest()
     reference = reference.settled(reference.noise(), _BEFORE_LINES)
     comparison = reference.objective.comparison.following_reference(reference.plant)
     searches = [search.on(comparison) for search in searches]
-    closest = min(searches, key=lambda search: search.minima[0].cost)
-    reference = Descent(closest.objective, reference.x)
+    reference = Descent(searches[closest].objective, reference.x)
     # Lines are looked for once, in what a fit to every bin leaves.
     noise = reference.noise(with_lines=True)
     descents = [
-        search.under(noise, reference if search is closest else None).settled(noise, _TOLERANCE)
-        for search in searches
+        search.under(noise, reference if i == closest else None).settled(noise, _TOLERANCE)
+        for i, search in enumerate(searches)
     ]
     return RecordAnalysis(
         fits=tuple(summary(descent.objective, descent.x, noise) for descent in descents),

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.whole_record.plant import LOGARITHMIC
+from analysis.whole_record.parameter_uncertainty import parameter_uncertainty
 from analysis.whole_record.result import RecordFit
 from analysis.whole_record.uncertainty import (
     covariance_of_unknowns,
-    damping_size,
-    interval,
     interval_from_zero,
     mode_table,
     ringing,
@@ -22,9 +20,6 @@ if TYPE_CHECKING:
 
     from analysis.whole_record.noise import Noise
     from analysis.whole_record.objective import Objective, Projected
-
-_UNDETERMINED: Final = 20.0
-"""Standard deviation of a logarithm that says nothing: a factor of 1e9 either way."""
 
 
 def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> RecordFit:
@@ -49,26 +44,16 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
     held = (x <= lower) | (x >= upper)
     jacobian = _compared_jacobian(objective, x, projected, noise)
     of_unknowns, known = covariance_of_unknowns(jacobian, scatter, held)
-    chain = unknowns.estimates_by_unknowns(x)
-    every_covariance = chain @ of_unknowns @ chain.T
     names, plant = unknowns.names, unknowns.plant(x)
     values = plant.parameters
-    logarithmic = np.array([name in LOGARITHMIC for name in names])
-    known &= ~(logarithmic & (np.diag(every_covariance) > _UNDETERMINED**2))
-    covariance = every_covariance[np.ix_(known, known)]
-
-    determined = tuple(name for name, is_known in zip(names, known, strict=True) if is_known)
-    estimated = dict(zip(determined, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    std: dict[str, float | None] = dict.fromkeys(values, 0.0) | dict.fromkeys(names, None)
-    intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(names, None)
-    for name, spread in estimated.items():
-        std[name] = values[name] * spread if name in LOGARITHMIC else spread
-        intervals[name] = interval(name, values[name], spread)
+    of = parameter_uncertainty(unknowns, x, held, of_unknowns, known)
+    std, intervals = dict(of.std), dict(of.interval)
     tool = "tool_inertia_kg_m2"
     if tool in names and held[names.index(tool)]:
         place = names.index(tool)
         free = held & (np.arange(held.size) != place)
         every, _ = covariance_of_unknowns(jacobian, scatter, free)
+        chain = unknowns.estimates_by_unknowns(x)
         std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
     spread = std.get(tool)
     if tool in names and spread:
@@ -80,11 +65,11 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
         parameters=values,
         std=std,
         interval=intervals,
-        determined=determined,
-        covariance=covariance,
-        at_bounds=tuple(name for name, is_held in zip(names, held, strict=True) if is_held),
-        internal=damping_size("zeta", "alpha", values, determined, covariance),
-        external=damping_size("gamma", "lambda", values, determined, covariance),
+        determined=of.determined,
+        covariance=of.covariance,
+        at_bounds=of.at_bounds,
+        internal=of.internal,
+        external=of.external,
         modes=mode_table(at.poles, of_unknowns),
         ringing=ringing(at.poles, projected, scatter, at.columns * noise.weight, hum),
         cost=projected.cost,
