@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +25,8 @@ from analysis.commands.welch_options import (
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from types import FrameType
+    from typing import NoReturn
 
     from analysis.whole_record import Setting
 
@@ -55,12 +58,25 @@ app.command("import", epilog=IMPORT_EPILOG)(import_command)
 app.add_typer(export_app, name="export")
 
 
+class Interruption(KeyboardInterrupt):
+    """Ctrl-C, by a name of its own.
+
+    Python ends by the signal, whatever exit code it is asked for, once a plain `KeyboardInterrupt`
+    has passed through an `exec` of text, and what defines a named tuple or a dataclass is one.
+    """
+
+
 def main() -> None:
     """Entry point of the command."""
+    signal.signal(signal.SIGINT, _interrupt)
     # Threads gain nothing on matrices as small as a fit's, and cost a tenth of the time.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     app()
+
+
+def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
+    raise Interruption
 
 
 @app.command(DEFAULT, epilog=_EPILOG)
@@ -218,7 +234,3 @@ def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
 
 def _complain(message: str) -> None:
     typer.echo(f"Error: {message}", err=True)
-
-
-if __name__ == "__main__":
-    main()

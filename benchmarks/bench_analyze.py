@@ -20,7 +20,7 @@ from pathlib import Path
 RUNS = 5
 GOAL_S = 6.0
 GOAL_MB = 1000
-ANALYZE = [sys.executable, "-m", "analysis.cli"]
+ANALYZE = [sys.executable, "-m", "analysis"]
 STEPS = """
 import resource, sys, time
 from pathlib import Path

@@ -22,7 +22,7 @@ QUICK = ("--method", "welch", "--types", "I", "--weights", "const")
 
 def run(*arguments, cwd):
     return subprocess.run(
-        [sys.executable, "-m", "analysis.cli", *map(str, arguments)],
+        [sys.executable, "-m", "analysis", *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
 
@@ -245,7 +245,7 @@ def test_a_report_that_cannot_be_written_is_refused(session, tmp_path):
 
 def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
     process = subprocess.Popen(
-        [sys.executable, "-m", "analysis.cli", *([session.name] * 40),
+        [sys.executable, "-m", "analysis", *([session.name] * 40),
          "--each", "--method", "welch", "--report", "out"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -262,6 +262,31 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
     for folder in out.iterdir():
         assert not folder.name.startswith("."), "a half-written report was left"
         assert len(list(folder.iterdir())) == 5
+
+
+def run_as_is(command, cwd):
+    return subprocess.run(command, cwd=cwd, check=False, capture_output=True, text=True, timeout=30)
+
+
+def test_ctrl_c_inside_code_made_from_text_ends_with_130_too(tmp_path):
+    (tmp_path / "stopped.py").write_text(
+        "import analysis.cli\n"
+        "analysis.cli.session_command = lambda *_: exec(\n"
+        "    'import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(10)')\n"
+        "analysis.cli.main()\n"
+    )
+    command = [sys.executable, "-m", "stopped", "session.mcap"]
+    result = run_as_is(command, tmp_path)
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "Stopped.\n")
+
+
+def test_ctrl_c_while_it_is_being_imported_ends_with_130_and_without_traceback(tmp_path):
+    (tmp_path / "typer.py").write_text(
+        "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(10)"
+    )
+    command = [sys.executable, "-m", "analysis", "session.mcap"]
+    result = run_as_is(command, tmp_path)
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
 
 
 def test_help_has_an_example_and_the_choices(tmp_path):
