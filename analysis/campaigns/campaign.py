@@ -9,18 +9,20 @@ import numpy as np
 
 from analysis.campaigns.dask_workers import dask_cluster
 from analysis.campaigns.errors import CampaignError
-from analysis.campaigns.experiment import most_common
+from analysis.campaigns.experiment import most_common, stated_specimens
+from analysis.campaigns.homogeneity import Homogeneity, homogeneity
 from analysis.campaigns.local_workers import process_pool
 from analysis.campaigns.nominal import NominalModel, nominal_models
 from analysis.campaigns.parameter_statistics import ParameterStatistics, parameter_statistics
 from analysis.campaigns.pooled import PooledEstimate, pooled_estimates
+from analysis.campaigns.ranking import RankedStructure, ranked_structures
 from analysis.campaigns.session import (
     SessionFailure,
     SessionResult,
     SessionTask,
     analyse_session,
 )
-from analysis.campaigns.validation import LeftOutError, forecasts, left_out_errors
+from analysis.campaigns.validation import FEWEST, LeftOutError, LostTrial, validate
 from analysis.campaigns.verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns.workers import Lost, available_cores
 from analysis.settings import WelchSettings
@@ -52,6 +54,10 @@ class Campaign:
         Table 3.
     nominal : tuple of NominalModel
         By type, then by weighting: Table 4 and Figures 6 and 7.
+    homogeneity : Homogeneity
+        Whether the sessions are of one specimen.
+    structures : tuple of RankedStructure
+        Every structure fitted to the whole records, those pooled first.
     pooled : tuple of PooledEstimate
         Of the structures that two sessions or more determine, the lowest BIC first; empty without
         whole-record fits.
@@ -59,6 +65,9 @@ class Campaign:
         Which of them the data support, and what else they say; None without any.
     validation : tuple of LeftOutError
         Session by session; empty with fewer than three sessions.
+    lost_trials : tuple of LostTrial
+        Sessions that were to be predicted and were not. With three sessions or more, each has its
+        errors in `validation` or is here.
     """
 
     settings: WelchSettings
@@ -67,9 +76,17 @@ class Campaign:
     failures: tuple[SessionFailure, ...]
     statistics: tuple[ParameterStatistics, ...]
     nominal: tuple[NominalModel, ...]
+    homogeneity: Homogeneity
+    structures: tuple[RankedStructure, ...]
     pooled: tuple[PooledEstimate, ...]
     verdict: CampaignVerdict | None
     validation: tuple[LeftOutError, ...]
+    lost_trials: tuple[LostTrial, ...]
+
+    @property
+    def trials(self) -> int:
+        """Sessions that were to be predicted from the others."""
+        return len(self.sessions) if len(self.sessions) >= FEWEST else 0
 
 
 def campaign(
@@ -154,16 +171,16 @@ def campaign(
                 "No session could be analysed:\n" + "\n".join(f.message for f in failures)
             )
         validation: tuple[LeftOutError, ...] = ()
-        if len(sessions) > 2:
+        lost: tuple[LostTrial, ...] = ()
+        if len(sessions) >= FEWEST:
             total = len(paths) + len(sessions)
-            trials = [
-                (session.path, forecasts(sessions, i), record_band_hz)
-                for i, session in enumerate(sessions)
-            ]
             names = [session.path.name for session in sessions]
-            errors = workers.run(left_out_errors, trials, lambda i: step(names[i]))
-            validation = tuple(e for each in errors if not isinstance(each, Lost) for e in each)
+            validation, lost = validate(workers, sessions, record_band_hz, lambda i: step(names[i]))
     pooled = pooled_estimates(sessions)
+    usable = [(each.path, each.experiment) for each in sessions]
+    left_out = [(each.path, each.experiment) for each in failures]
+    specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
+    alike = homogeneity(sessions, pooled, specimens)
     return Campaign(
         settings=settings,
         record_band_hz=record_band_hz,
@@ -171,9 +188,12 @@ def campaign(
         failures=tuple(failures),
         statistics=parameter_statistics(sessions),
         nominal=nominal_models(sessions),
+        homogeneity=alike,
+        structures=ranked_structures(sessions, pooled),
         pooled=pooled,
-        verdict=campaign_verdict(sessions, pooled, validation),
+        verdict=campaign_verdict(sessions, pooled, alike, validation, lost),
         validation=validation,
+        lost_trials=lost,
     )
 
 
@@ -194,7 +214,9 @@ def _of_one_experiment(
         elif reason is None and isinstance(result, SessionFailure):
             failures.append(result)
         else:
-            failures.append(SessionFailure(result.path, f"{result.path}: {reason}"))
+            failures.append(
+                SessionFailure(result.path, f"{result.path}: {reason}", result.experiment)
+            )
     return sessions, failures
 
 

@@ -57,7 +57,7 @@ def campaign_command(
     Returns
     -------
     int
-        Exit code: 1 if a file could not be used, 0 otherwise.
+        Exit code: 1 if a file could not be used or predicted from the others, 0 otherwise.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def campaign_command(
             write_new(json, text)
             lines.append(f"All results as JSON: {json}")
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    return 1 if found.failures else 0
+    return 1 if found.failures or found.lost_trials else 0
 
 
 def _analysed(
@@ -130,4 +130,9 @@ def _analysed(
             )  # fmt: skip
     for failure in found.failures:
         terminal.print(f"Error: {failure.message}", markup=False, highlight=False, soft_wrap=True)
+    for lost in found.lost_trials:
+        terminal.print(
+            f"Error: {lost.path} is not predicted from the others: {lost.reason}",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
     return found

@@ -132,32 +132,46 @@ class DaskWorkers:
         done: Callable[[int, Result], None],
     ) -> list[int]:
         """Run tasks and tell what they return; return the numbers of those that were given up."""
-        distributed = _distributed()
         # Each call counts, though arguments may be the same.
-        futures = {
-            self._client.submit(function, *each, pure=False): i for i, each in arguments.items()
-        }
+        with self._there():
+            futures = {
+                self._client.submit(function, *each, pure=False): i for i, each in arguments.items()
+            }
         given_up = []
         seen = time.monotonic()
         while futures:
-            try:
-                finished = distributed.wait(
-                    list(futures), _LOOK_S, return_when="FIRST_COMPLETED"
-                ).done
-            except TimeoutError:
-                finished = set()
-            except CancelledError as error:
-                raise CampaignError(self._gone("went away")) from error
-            seen = self._still_there(seen)
+            finished, seen = self._finished(list(futures), seen)
             for future in finished:
                 number = futures.pop(future)
                 try:
-                    result = future.result()
-                except distributed.KilledWorker:
+                    with self._there():
+                        result = future.result()
+                except _distributed().KilledWorker:
                     given_up.append(number)
                 else:
                     done(number, result)
         return given_up
+
+    def _finished(self, futures: Sequence[Any], seen: float) -> tuple[set[Any], float]:
+        """Wait for some, but not for long; return them, and when workers were last seen."""
+        with self._there():
+            try:
+                done = _distributed().wait(futures, _LOOK_S, return_when="FIRST_COMPLETED").done
+            except TimeoutError:
+                done = set()
+            return done, self._still_there(seen)
+
+    @contextmanager
+    def _there(self) -> Iterator[None]:
+        """Tell in a sentence that the scheduler went away, which Dask does in many ways."""
+        try:
+            yield
+        except (CancelledError, _distributed().comm.CommClosedError) as error:
+            raise CampaignError(self._gone("went away")) from error
+        except Exception as error:
+            if self._client.status == "running" or isinstance(error, CampaignError):
+                raise
+            raise CampaignError(self._gone("went away")) from error
 
     def _still_there(self, seen: float) -> float:
         """Return when workers were last seen; raise if that is too long ago."""

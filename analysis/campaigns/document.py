@@ -29,9 +29,12 @@ def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[s
     -------
     dict
         ``verdict`` on all sessions (null without whole-record estimates), ``files`` with each
-        one's own, ``errors`` (files left out, and why), ``fits`` and ``modes`` as of single
-        sessions, and the tables by the names of their CSV files. Finite numbers only.
+        one's own, ``errors`` (files left out, and why), ``one_specimen`` and the ``groups`` in
+        which sessions lie if they are not, ``trials`` of the validation asked, done and lost,
+        ``fits`` and ``modes`` as of single sessions, and the tables by the names of their CSV
+        files. Finite numbers only.
     """
+    leading = campaign.homogeneity.leading
     content: dict[str, Any] = _plain(
         {
             "versions": {
@@ -49,6 +52,15 @@ def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[s
                 }
                 for each in campaign.sessions
             ],
+            "one_specimen": campaign.homogeneity.one_specimen,
+            "groups": leading and {"quantity": leading.quantity, "files": leading.groups},
+            "trials": {
+                "asked": campaign.trials,
+                "done": campaign.trials - len(campaign.lost_trials),
+                "lost": [
+                    {"file": str(each.path), "reason": each.reason} for each in campaign.lost_trials
+                ],
+            },
             "errors": [
                 {"file": str(each.path), "message": each.message} for each in campaign.failures
             ],

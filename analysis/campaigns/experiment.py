@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
 
     from analysis.record import Record
 
 _STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s")
+_OF_SPECIMEN: Final = ("beam_length_m", "beam_density_kg_per_m", "beam_bending_stiffness_n_m2",
+                       "tool_inertia_kg_m2")  # fmt: skip
 _UNITS: Final = {"beam_length_m": "m", "beam_density_kg_per_m": "kg/m",
                  "beam_bending_stiffness_n_m2": "N·m²", "tool_inertia_kg_m2": "kg·m²",
                  "amplitude_rad": "rad", "start_hz": "Hz", "stop_hz": "Hz", "duration_s": "s",
@@ -74,8 +77,72 @@ class Experiment:
         for key, mine in self.facts.items():
             theirs = other.facts.get(key, mine)
             if not _same(theirs, mine):
-                return f"{key} is {_told(key, theirs)}, but {_told(key, mine)}"
+                return f"{key} is {told(key, theirs)}, but {told(key, mine)}"
         return None
+
+    def same_specimen(self, other: Experiment) -> bool:
+        """Whether another one states the same beam and the same inertia of the tool."""
+        return not any(
+            key in self.facts and not _same(other.facts.get(key, self.facts[key]), self.facts[key])
+            for key in _OF_SPECIMEN
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class StatedSpecimen:
+    """One specimen, as files state it.
+
+    Attributes
+    ----------
+    facts : mapping of str to (str or float)
+        Beam and inertia of the tool by the keys of the session files.
+    paths : tuple of Path
+        Files that state it, whether they can be used or not.
+    """
+
+    facts: Mapping[str, str | float]
+    paths: tuple[Path, ...]
+
+
+def stated_specimens(
+    stated: Iterable[tuple[Path, Experiment | None]], of_campaign: Experiment
+) -> tuple[StatedSpecimen, ...]:
+    """Group files by the specimen that they state; first that of the campaign, then as they come.
+
+    Parameters
+    ----------
+    stated : iterable of (Path, Experiment or None)
+        None of a file that could not be read.
+    of_campaign : Experiment
+        Of the sessions that are pooled.
+    """
+    found: list[tuple[Experiment, list[Path]]] = [(of_campaign, [])]
+    for path, experiment in stated:
+        if experiment is None:
+            continue
+        for specimen, paths in found:
+            if specimen.same_specimen(experiment):
+                paths.append(path)
+                break
+        else:
+            found.append((experiment, [path]))
+    return tuple(
+        StatedSpecimen(
+            {key: specimen.facts[key] for key in _OF_SPECIMEN if key in specimen.facts},
+            tuple(paths),
+        )
+        for specimen, paths in found
+    )
+
+
+def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
+    """Keys in which specimens differ."""
+    first = specimens[0].facts
+    return tuple(
+        key
+        for key, value in first.items()
+        if not all(_same(each.facts.get(key, value), value) for each in specimens)
+    )
 
 
 def most_common(experiments: Sequence[Experiment]) -> int:
@@ -90,7 +157,8 @@ def _same(one: str | float, two: str | float) -> bool:
     return math.isclose(one, two, rel_tol=1e-9)
 
 
-def _told(key: str, value: str | float) -> str:
+def told(key: str, value: str | float) -> str:
+    """Write a fact with its unit."""
     if isinstance(value, str):
         return value
     return f"{value:g} {_UNITS.get(key, '')}".rstrip()

@@ -1,4 +1,4 @@
-"""What tables and figures call the parameters of a whole-record estimate."""
+"""What tables and figures call the parameters and modes of a whole-record estimate."""
 
 from __future__ import annotations
 
@@ -16,15 +16,29 @@ _LABELS: Final = {
 }
 
 
-def label(parameter: str) -> tuple[str, float, str]:
-    """Symbol, factor and unit in which a parameter is shown."""
-    if parameter in _LABELS:
-        return _LABELS[parameter]
-    mode = parameter.rsplit("_", 1)[1]
-    return f"stiffness of mode {mode}", 100.0, "% above mode 1"
+_LEAST: Final = 1e-99
+_OF_MODES: Final = {
+    "frequency_hz": ("frequency", 1.0, "Hz"),
+    "damping_ratio": ("damping ratio", 100.0, "%"),
+    "stiffness_offset": ("stiffness", 100.0, "% above mode 1"),
+}
+
+
+def label(quantity: str) -> tuple[str, float, str]:
+    """Symbol, factor and unit in which a parameter or a mode's quantity is shown."""
+    if quantity in _LABELS:
+        return _LABELS[quantity]
+    of_mode, mode = quantity.rsplit("_", 1)
+    what, factor, unit = _OF_MODES[of_mode]
+    return f"{what} of mode {mode}", factor, unit
 
 
 def with_unit(parameter: str) -> str:
     """Symbol with its unit, if it has one."""
     symbol, _, unit = label(parameter)
     return f"{symbol} ({unit})" if unit else symbol
+
+
+def probability(chance: float) -> str:
+    """Write a probability that may be too small for a number, but is not 0."""
+    return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"

@@ -9,8 +9,9 @@ import matplotlib as mpl
 import numpy as np
 
 import rigd
-from analysis.campaigns import page_tables
-from analysis.campaigns.tables import NO_VERDICT, likely_estimates
+from analysis.campaigns import homogeneity_tables, page_tables
+from analysis.campaigns.page_paper_tables import paper_tables
+from analysis.campaigns.tables import likely_estimates, without_verdict
 from analysis.report.html.markup import Markup, element, section, table, void
 from analysis.report.html.page import STYLE
 
@@ -57,7 +58,8 @@ def campaign_page(
     titles = {
         name: title
         for name, title in _CONTENTS
-        if (name != "verdict" or campaign.pooled) and (name != "figures" or shown)
+        if (name != "verdict" or campaign.verdict or without_verdict(campaign))
+        and (name != "figures" or shown)
     }
     links = [element("li", element("a", title, href=f"#{name}")) for name, title in titles.items()]
     title = f"Campaign of {len(campaign.sessions)} sessions"
@@ -85,7 +87,7 @@ def campaign_page(
             section("tables", titles["tables"], *tables),
             section(
                 "paper", titles["paper"], *of_paper,
-                *map(table, page_tables.paper_tables(campaign, with_paper=with_paper)),
+                *map(table, paper_tables(campaign, with_paper=with_paper)),
             ),
             section("how", titles["how"], *_how(campaign, made_at)),
         ),
@@ -96,7 +98,9 @@ def campaign_page(
 def _verdict(campaign: Campaign, title: str) -> Markup:
     verdict = campaign.verdict
     if verdict is None:
-        return section("verdict", title, element("p", NO_VERDICT))
+        return section(
+            "verdict", title, *(element("p", each) for each in without_verdict(campaign))
+        )
     first, *others = verdict.sentences
     said = [element("p", first, class_="damping"), *(element("p", each) for each in others)]
     advice = [element("li", each) for each in verdict.experiments]
@@ -107,6 +111,10 @@ def _verdict(campaign: Campaign, title: str) -> Markup:
 def _warnings(campaign: Campaign) -> Markup:
     items = [element("li", f"Left out: {each.message}") for each in campaign.failures]
     items += [
+        element("li", f"Not predicted from the others: {each.path}: {each.reason}")
+        for each in campaign.lost_trials
+    ]
+    items += [
         element("li", f"{session.path.name}: {warning}")
         for session in campaign.sessions
         for warning in session.warnings
@@ -116,15 +124,22 @@ def _warnings(campaign: Campaign) -> Markup:
 
 def _tables(campaign: Campaign) -> list[Markup]:
     withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    found = campaign.homogeneity
     made = []
+    if len(found.specimens) > 1:
+        made.append(homogeneity_tables.specimens_table(found))
+    if found.mixed:
+        made.append(homogeneity_tables.scatter_table(found))
     for place, each in enumerate(likely_estimates(campaign)):
-        made.append(page_tables.parameters_table(each, withheld, first=place == 0))
+        made.append(page_tables.parameters_table(each, campaign, withheld, first=place == 0))
         if place == 0 and each.modes:
-            made.append(page_tables.modes_table(each))
-    if campaign.pooled:
+            made.append(page_tables.modes_table(each, found))
+    if campaign.structures:
         made.append(page_tables.structures_table(campaign))
     if campaign.validation:
         made.append(page_tables.validation_table(campaign))
+    if found.quantities and not found.mixed:
+        made.append(homogeneity_tables.scatter_table(found))
     return [table(each) for each in (*made, page_tables.sessions_table(campaign))]
 
 

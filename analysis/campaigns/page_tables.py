@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.campaigns import paper
-from analysis.campaigns.labels import label, with_unit
-from analysis.campaigns.nominal import best_models
+from analysis.campaigns import sentences
+from analysis.campaigns.labels import label, probability, with_unit
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
+from analysis.campaigns.tables import NOT_POOLED, used
 from analysis.campaigns.validation import by_model
-from analysis.report.html.reported import footnotes, marked, unreported
+from analysis.report.html.reported import footnotes, greyed, marked, unreported
 from analysis.report.html.table import Column, Table, count, estimate, number
 from analysis.structures import STRUCTURES
 
@@ -19,18 +20,19 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from analysis.campaigns.campaign import Campaign
+    from analysis.campaigns.homogeneity import Homogeneity
     from analysis.campaigns.pooled import PooledEstimate
+    from analysis.campaigns.ranking import RankedStructure
     from analysis.campaigns.session import SessionResult
-    from analysis.report.html.table import Cell
-
-_TABLE_3: Final = {"zeta": ("ζ (10⁻⁴)", 1e4), "alpha": ("α", 1.0), "gamma": ("γ (10⁻¹)", 10.0),
-                   "lambda": ("λ", 1.0)}  # fmt: skip
-_STATISTICS: Final = ("mean", "median", "std", "min", "max")
+    from analysis.report.html.table import Cell, Number
 
 
-def parameters_table(pooled: PooledEstimate, withheld: Collection[str], *, first: bool) -> Table:
+def parameters_table(
+    pooled: PooledEstimate, campaign: Campaign, withheld: Collection[str], *, first: bool
+) -> Table:
     """Pooled estimate of one structure; the first one is the selected."""
     rows: list[tuple[Cell, ...]] = []
+    found = campaign.homogeneity
     doubtful = unreported(STRUCTURES[pooled.structure], withheld)
     for each in pooled.parameters:
         _, factor, _ = label(each.name)
@@ -38,14 +40,14 @@ def parameters_table(pooled: PooledEstimate, withheld: Collection[str], *, first
         value, std, lowest, highest = estimate((each.value, each.std, low, high), each.std, factor)
         rows.append(
             (
-                with_unit(each.name),
-                marked(value) if each.name in doubtful else replace(value, strong=True),
+                _marked(with_unit(each.name), each.name, found),
+                _shown(value, withheld=each.name in doubtful, mixed=found.is_mixed(each.name)),
                 std,
                 lowest,
                 highest,
                 number(each.within_std, ".2g", factor),
                 number(each.between_std, ".2g", factor),
-                number(each.chance, ".2g"),
+                replace(number(each.chance, ".2g"), text=probability(each.chance)),
             )
         )  # fmt: skip
     notes = [
@@ -54,10 +56,14 @@ def parameters_table(pooled: PooledEstimate, withheld: Collection[str], *, first
     ]
     if doubtful:
         notes += footnotes(withheld)
+    if any(found.is_mixed(each.name) for each in pooled.parameters):
+        notes.append(MIXTURE_NOTE)
     what = "selected" if first else "cannot be told from it"
     return Table(
         name=f"pooled_{pooled.name.replace(', ', '_').replace(' ', '_')}",
-        caption=f"Pooled over {pooled.sessions} sessions: type {pooled.name} ({what})",
+        caption=title(
+            f"Pooled over {used(pooled, campaign)}: type {pooled.name} ({what})", found
+        ),
         columns=(
             Column("parameter", "parameter", numeric=False),
             Column("pooled", "value"), Column("std", "std"),
@@ -70,12 +76,29 @@ def parameters_table(pooled: PooledEstimate, withheld: Collection[str], *, first
     )  # fmt: skip
 
 
-def modes_table(pooled: PooledEstimate) -> Table:
+def _shown(value: Number, *, withheld: bool, mixed: bool) -> Number:
+    """Let the eye stop at what can be used only."""
+    if withheld:
+        return marked(value)
+    return greyed(value) if mixed else replace(value, strong=True)
+
+
+def _marked(text: str, quantity: str, found: Homogeneity) -> str:
+    return f"{text} {MIXTURE_MARK}" if found.is_mixed(quantity) else text
+
+
+def modes_table(pooled: PooledEstimate, found: Homogeneity) -> Table:
     """Modes of the selected structure."""
     rows = []
+    mixed = False
     for mode in pooled.modes:
         frequency = estimate((mode.frequency_hz, mode.frequency_std_hz), mode.frequency_std_hz)
         ratio = estimate((mode.damping_ratio, mode.damping_ratio_std), mode.damping_ratio_std, 100)
+        frequency, ratio = (
+            (replace(mean, text=_marked(mean.text, f"{quantity}_{mode.number}", found)), std)
+            for quantity, (mean, std) in (("frequency_hz", frequency), ("damping_ratio", ratio))
+        )
+        mixed = mixed or any(each.text.endswith(MIXTURE_MARK) for each in (frequency[0], ratio[0]))
         rows.append(
             (
                 count(mode.number), *frequency, number(mode.frequency_between_std_hz, ".2g"),
@@ -84,7 +107,9 @@ def modes_table(pooled: PooledEstimate) -> Table:
         )  # fmt: skip
     return Table(
         name="pooled_modes",
-        caption="Modes of the beam on a motor that stands still, mean of the sessions",
+        caption=title(
+            "Modes of the beam on a motor that stands still, mean of the sessions", found
+        ),
         columns=(
             Column("mode", "mode"),
             Column("frequency (Hz)", "frequency_hz"), Column("std", "frequency_std_hz"),
@@ -93,35 +118,41 @@ def modes_table(pooled: PooledEstimate) -> Table:
             Column("between sessions", "damping_ratio_between_std"),
         ),
         rows=tuple(rows),
+        notes=(MIXTURE_NOTE,) if mixed else (),
     )  # fmt: skip
 
 
 def structures_table(campaign: Campaign) -> Table:
-    """All structures, the lowest BIC of all sessions first."""
-    alone = campaign.verdict.alone if campaign.verdict else {}
-    lowest = campaign.pooled[0].bic
+    """All structures fitted, those pooled first, the lowest BIC of all sessions first."""
+
+    def row(each: RankedStructure) -> tuple[Cell, ...]:
+        numbers = (
+            number(each.bic_above_lowest, ".1f"), number(each.misfit, ".4g"), count(each.fitted),
+            count(each.determined), count(each.selected_alone),
+        )  # fmt: skip
+        return (each.name, *(numbers if each.pooled else map(greyed, numbers)))
+
+    every = all(each.pooled for each in campaign.structures)
     return Table(
         name="structures",
-        caption="Structures on the whole records of all sessions together",
+        caption=title(
+            "Structures on the whole records of all sessions together", campaign.homogeneity
+        ),
         columns=(
             Column("type", "type", numeric=False),
             Column("BIC above the lowest", "bic_above_lowest"),
             Column("residual (noise = 1)", "misfit"),
+            Column("sessions fitted", "fitted"),
             Column("sessions that determine it", "sessions"),
             Column("selected alone by", "selected_alone"),
         ),
-        rows=tuple(
-            (
-                each.name, number(each.bic - lowest, ".1f"), number(each.misfit, ".4g"),
-                count(each.sessions), count(alone.get(each.name, 0)),
-            )
-            for each in campaign.pooled
-        ),
+        rows=tuple(map(row, campaign.structures)),
         notes=(
             "Damping and the modes' offsets are the specimen's, one value for all sessions (and "
             "a scatter between them, where they differ); settings of the rig are each session's.",
+            *(() if every else (f"{NOT_POOLED[0].upper()}{NOT_POOLED[1:]}.",)),
         ),
-        selected=0,
+        selected=0 if campaign.pooled else None,
     )  # fmt: skip
 
 
@@ -135,6 +166,7 @@ def validation_table(campaign: Campaign) -> Table:
             (
                 f"type {name}",
                 "whole record" if method == "record" else f"Welch, {weighting}",
+                f"{len(values)} of {campaign.trials}",
                 number(float(np.mean(values)), ".2f", 100), number(max(values), ".2f", 100),
                 number(float(np.mean(own)) if own else None, ".2f", 100),
             )
@@ -144,11 +176,14 @@ def validation_table(campaign: Campaign) -> Table:
         caption="Each session predicted from the others: rms error of the torque",
         columns=(
             Column("model", "type", numeric=False), Column("estimate", "method", numeric=False),
-            Column("mean (%)", "error"), Column("worst (%)", "worst"),
-            Column("session's own fit (%)", "own_error"),
+            Column("sessions", "sessions"), Column("mean (%)", "error"),
+            Column("worst (%)", "worst"), Column("session's own fit (%)", "own_error"),
         ),
         rows=tuple(rows),
-        notes=("The session's own fit has the noise in it, too: nothing predicts better.",),
+        notes=(
+            "The session's own fit has the noise in it, too: nothing predicts better.",
+            *sentences.lost_trials(campaign.lost_trials, campaign.trials),
+        ),
     )  # fmt: skip
 
 
@@ -165,6 +200,9 @@ def sessions_table(campaign: Campaign) -> Table:
             ", ".join(dict.fromkeys(found)) or "–",
         )
 
+    leading = campaign.homogeneity.leading
+    groups = leading.groups if leading else ()
+    group_of = {name: f"{place}" for place, names in enumerate(groups, 1) for name in names}
     left_out = [(each.path.name, "left out", "–", each.message) for each in campaign.failures]
     return Table(
         name="sessions",
@@ -173,96 +211,12 @@ def sessions_table(campaign: Campaign) -> Table:
             Column(heading, key, numeric=False)
             for heading, key in (
                 ("file", "file"), ("selects", "selected"), ("what is left", "left"),
-                ("found beside the beam", "findings"),
+                ("found beside the beam", "findings"), ("group" if groups else "", "group"),
             )
         ),
-        rows=(*map(row, campaign.sessions), *left_out),
-    )  # fmt: skip
-
-
-def paper_tables(campaign: Campaign, *, with_paper: bool) -> tuple[Table, ...]:
-    """Tables 3 to 5; on request with the paper's own numbers in columns of their own."""
-    return (
-        _table_3(campaign, with_paper=with_paper),
-        _table_4(campaign, with_paper=with_paper),
-        _table_5(campaign, with_paper=with_paper),
-    )
-
-
-def _table_3(campaign: Campaign, *, with_paper: bool) -> Table:
-    rows = []
-    for each in campaign.statistics:
-        symbol, factor = _TABLE_3[each.parameter]
-        told = paper.table3().get((each.structure, each.weighting, each.parameter))
-        cells: list[Cell] = [f"{each.structure}, {each.weighting}: {symbol}"]
-        for name in _STATISTICS:
-            cells.append(number(getattr(each, name), ".3f", factor))
-            if with_paper:
-                cells.append(number(None if told is None else getattr(told, name), ".4g", factor))
-        rows.append((*cells, count(each.at_bounds)))
-    columns = [Column("type, weights: parameter", "parameter", numeric=False)]
-    for name in _STATISTICS:
-        columns.append(Column(name, name))
-        if with_paper:
-            columns.append(Column("(paper)", f"paper_{name}"))
-    return Table(
-        name="table3",
-        caption=f"Parameters over {len(campaign.sessions)} sessions by the paper's route (Table 3)",
-        columns=(*columns, Column("at bounds", "at_bounds")),
-        rows=tuple(rows),
-        notes=("At bounds: sessions in which it rests on the edge of the range searched.",),
-    )
-
-
-def _table_4(campaign: Campaign, *, with_paper: bool) -> Table:
-    modes = [each.mode for each in campaign.nominal[0].deviations]
-    parts = [("frequency_rad_s", "ω{} (rad/s)"), ("magnitude_db", "M{} (dB)")]
-    columns = [Column("type, weights", "type", numeric=False)]
-    for quantity, heading in parts:
-        for mode in modes:
-            columns.append(Column(heading.format(mode), f"{quantity}_{mode}"))
-            if with_paper:
-                columns.append(Column("(paper)", f"paper_{quantity}_{mode}"))
-    rows = []
-    for model in campaign.nominal:
-        cells: list[Cell] = [f"{model.structure}, {model.weighting}"]
-        for quantity, _ in parts:
-            for deviation in model.deviations:
-                cells.append(number(getattr(deviation, quantity), ".3f"))
-                if with_paper:
-                    key = (model.structure, model.weighting, quantity, deviation.mode)
-                    cells.append(number(paper.table4().get(key), ".3f"))
-        rows.append(tuple(cells))
-    return Table(
-        name="table4",
-        caption="Mean deviation of the resonant peaks from the nominal model's (MDR, Table 4)",
-        columns=tuple(columns),
-        rows=tuple(rows),
-        notes=("A nominal model has the mean of the sessions' parameters.",),
-    )
-
-
-def _table_5(campaign: Campaign, *, with_paper: bool) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for model in best_models(campaign.nominal):
-        values = model.parameters
-        told = paper.table5_wmse().get((model.structure, model.weighting))
-        rows.append(
-            (
-                f"{model.structure}, {model.weighting}", number(values["alpha"], ".3f"),
-                number(values["zeta"], ".2f", 1e5), number(values["lambda"], ".3f"),
-                number(values["gamma"], ".2f", 1e2), number(model.mean_wmse, ".3f"),
-                *([number(told, ".3f")] if with_paper else []),
-            )
-        )  # fmt: skip
-    return Table(
-        name="table5",
-        caption="The two best nominal models (Table 5; their peaks are in Table 4)",
-        columns=(
-            Column("type, weights", "type", numeric=False), Column("α", "alpha"),
-            Column("ζ (10⁻⁵)", "zeta"), Column("λ", "lambda"), Column("γ (10⁻²)", "gamma"),
-            Column("WMSE ((N·m/rad)²)", "wmse"),
-            *([Column("(paper)", "paper_wmse")] if with_paper else []),
+        rows=tuple(
+            (*cells, group_of.get(str(cells[0]), "–"))
+            for cells in (*map(row, campaign.sessions), *left_out)
         ),
-        rows=tuple(rows),
+        notes=(f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else (),
     )  # fmt: skip

@@ -109,13 +109,24 @@ class PooledEstimate:
 
 def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate, ...]:
     """Pool every structure that all sessions tried and two or more determine; lowest BIC first."""
-    by_name: dict[str, list[RecordEstimate]] = {}
-    for session in sessions:
-        for estimate in session.record_estimates:
-            by_name.setdefault(estimate.name, []).append(estimate)
+    by_name = by_structure(sessions)
     tried = max(map(len, by_name.values()), default=0)
     found = [pooled(estimates) for estimates in by_name.values() if len(estimates) == tried]
     return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
+
+
+def by_structure(sessions: Sequence[SessionResult]) -> dict[str, list[RecordEstimate]]:
+    """Whole-record estimates of all sessions by the name of the structure."""
+    found: dict[str, list[RecordEstimate]] = {}
+    for session in sessions:
+        for estimate in session.record_estimates:
+            found.setdefault(estimate.name, []).append(estimate)
+    return found
+
+
+def determines_damping(estimate: RecordEstimate) -> bool:
+    """Whether a session determines its structure's damping, and the modes' offsets if free."""
+    return set(_of_specimen(estimate)) <= set(estimate.determined)
 
 
 def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
@@ -124,7 +135,7 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     A setting of rig or specimen (the tool's inertia, mostly) that rests on its bound in some
     session has no place in the common covariance; the plant gets its plain mean.
     """
-    used = [each for each in estimates if set(_of_specimen(each)) <= set(each.determined)]
+    used = list(filter(determines_damping, estimates))
     if len(used) < _FEWEST:
         return None
     names = [name for name in used[0].determined if all(name in e.determined for e in used)]

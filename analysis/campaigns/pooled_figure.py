@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.labels import label, with_unit
+from analysis.campaigns.labels import label, probability, with_unit
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, title
+from analysis.campaigns.tables import used
 from analysis.report import style
 from analysis.report.html.reported import MARK, unreported
 from analysis.structures import STRUCTURES
@@ -32,11 +34,16 @@ def pooled_figure(campaign: Campaign) -> Figure:
     withheld = campaign.verdict.withheld if campaign.verdict else ()
     doubtful = unreported(STRUCTURES[estimate.structure], withheld)
     note = f"  ·  {MARK} not reported: the data do not support it" if doubtful else ""
+    if any(campaign.homogeneity.is_mixed(each.name) for each in estimate.parameters):
+        note += f"  ·  {MIXTURE_MARK} mean of a mixture"
     rows = -(-len(estimate.parameters) // _COLUMNS)
     width_in, height_in = 13.0, 2.6 * rows + 1.35
     figure = style.new_figure(
         width_in, height_in,
-        f"{estimate.sessions} sessions — pooled whole-record estimate, type {estimate.name}",
+        title(
+            f"{used(estimate, campaign)} — pooled whole-record estimate, type {estimate.name}",
+            campaign.homogeneity,
+        ),
         f"type of the lowest BIC; its residual is {estimate.misfit:.3g} times the noise  ·  "
         "p: probability of so much scatter if sessions differed by their own uncertainty alone"
         f"{note}",
@@ -86,7 +93,9 @@ def _panel(
     axes.axhline(factor * parameter.value, color=line)
     axes.errorbar(places, values, yerr=spreads, fmt="o", markersize=2.6, color=ink, linewidth=0.8)
     mark = "" if reported else MARK
-    axes.set_title(f"{symbol}{mark}   p = {parameter.chance:.2g}")
+    mark += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
+    chance = f"p = {probability(parameter.chance)}".replace("= <", "<")
+    axes.set_title(f"{symbol}{mark}   {chance}")
     axes.set_ylabel(with_unit(parameter.name))
     axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
     axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))

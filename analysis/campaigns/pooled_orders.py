@@ -14,6 +14,7 @@ from analysis.unknowns import ORDER_RANGE
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from analysis.campaigns.homogeneity import Homogeneity
     from analysis.campaigns.pooled import PooledEstimate, PooledParameter
     from analysis.selection import Verdict
     from analysis.selection.orders import Status
@@ -42,6 +43,9 @@ class PooledOrder:
         In the middle of that interval, whether it may be used or not.
     alone : mapping of str to int
         How many sessions say what by themselves.
+    mixture : bool
+        Whether it is withheld because sessions differ in it in kind, or are of different specimens
+        and do not all determine it (or, with nothing pooled to go by, say the same).
     """
 
     order: Order
@@ -50,10 +54,14 @@ class PooledOrder:
     interval: tuple[float, float] | None
     estimate: float | None
     alone: Mapping[Status, int]
+    mixture: bool = False
 
 
 def pooled_order(
-    order: Order, ranked: Sequence[PooledEstimate], verdicts: Sequence[Verdict]
+    order: Order,
+    ranked: Sequence[PooledEstimate],
+    verdicts: Sequence[Verdict],
+    alike: Homogeneity,
 ) -> PooledOrder:
     """Judge one order by what all sessions share, as one record is judged by what it shows.
 
@@ -64,17 +72,26 @@ def pooled_order(
         The lowest BIC first.
     verdicts : sequence of Verdict
         Of the sessions.
+    alike : Homogeneity
+        Whether they are of one specimen.
     """
     each = [verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts]
     alone = dict(Counter(one.status for one in each).most_common())
-    free = _where_free(order, ranked)
+    shared = _where_free(order, ranked)
+    free = shared.by_name.get(order) if shared else None
     known = free is not None and _wide(free.interval) <= WIDEST_SHARE
     status = _status(order, ranked, free if known else None, verdicts, alone)
     estimate, interval = (free.value, free.interval) if free and known else (None, None)
     if status in ("not identifiable", "absent"):
         estimate = interval = None
+    some = len(alone) > 1 if shared is None else shared.sessions < len(verdicts)
+    mixture = status in ("integer", "fractional", "not supported") and (
+        alike.is_mixed(order) or (alike.mixed and some)
+    )
+    if mixture:
+        status = "not supported"
     value = {"integer": 1.0, "fractional": estimate}.get(status)
-    return PooledOrder(order, status, value, interval, estimate, alone)
+    return PooledOrder(order, status, value, interval, estimate, alone, mixture)
 
 
 def _status(
@@ -112,13 +129,13 @@ def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstim
     return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
 
 
-def _where_free(order: Order, ranked: Sequence[PooledEstimate]) -> PooledParameter | None:
-    """Find the order's estimate: of the best structure, or of the simplest beyond that frees it."""
+def _where_free(order: Order, ranked: Sequence[PooledEstimate]) -> PooledEstimate | None:
+    """Find where the order is estimated: in the best structure, or the simplest beyond it."""
     best = ranked[0]
     wanted = {*STRUCTURES[best.structure].free, order}
     for each in sorted(ranked, key=lambda each: len(STRUCTURES[each.structure].free)):
         if each.uniform == best.uniform and wanted <= set(STRUCTURES[each.structure].free):
-            return each.by_name.get(order)
+            return each
     return None
 
 

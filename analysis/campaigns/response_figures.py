@@ -32,6 +32,7 @@ _ESTIMATES: Final = {
     "h1": "Welch's H1",
     "h2": "Welch's H2",
     "hv": "Welch's Hv",
+    "iv": "Welch's Hiv",
     "fft": "whole-record FFT",
 }
 _MEASURED: Final[dict[str, Any]] = {

@@ -117,29 +117,90 @@ def record_rows(campaign: Campaign) -> list[Row]:
 
 
 def candidate_rows(campaign: Campaign) -> list[Row]:
-    """Structures on all whole records together, the lowest BIC first."""
-    alone = campaign.verdict.alone if campaign.verdict else {}
+    """Structures on all whole records together, those pooled first, the lowest BIC first."""
     return [
         {
             "type": each.structure,
             "uniform": each.uniform,
-            "sessions": each.sessions,
-            "bic_above_lowest": each.bic - campaign.pooled[0].bic,
+            "fitted": each.fitted,
+            "sessions": each.determined,
+            "bic_above_lowest": each.bic_above_lowest,
             "misfit": each.misfit,
-            "selected_alone": alone.get(each.name, 0),
+            "selected_alone": each.selected_alone,
+            "pooled": each.pooled,
         }
-        for each in campaign.pooled
+        for each in campaign.structures
     ]
 
 
 def mode_rows(campaign: Campaign) -> list[Row]:
     """Modes over all sessions, of the structure selected."""
-    return [asdict(mode) for estimate in campaign.pooled[:1] for mode in estimate.modes]
+    mixed = campaign.homogeneity.is_mixed
+    return [
+        asdict(mode)
+        | {
+            "frequency_mixture": mixed(f"frequency_hz_{mode.number}"),
+            "damping_ratio_mixture": mixed(f"damping_ratio_{mode.number}"),
+        }
+        for estimate in campaign.pooled[:1]
+        for mode in estimate.modes
+    ]
+
+
+def homogeneity_rows(campaign: Campaign) -> list[Row]:
+    """Scatter of modes and parameters between sessions."""
+    return [
+        {
+            "quantity": each.quantity,
+            "sessions": len(each.values),
+            "mean": each.mean,
+            "between_std": each.between_std,
+            "between_in_own_std": each.own_stds,
+            "cochran_q": each.cochran_q,
+            "i_squared": each.i_squared,
+            "chance": each.chance,
+            "mixture": each.mixed,
+        }
+        for each in campaign.homogeneity.quantities
+    ]
+
+
+def specimen_rows(campaign: Campaign) -> list[Row]:
+    """Specimens as the files state them, if these are several; that of the campaign first."""
+    specimens = campaign.homogeneity.specimens
+    if len(specimens) == 1:
+        return []
+    return [
+        {
+            **each.facts,
+            "files": len(each.paths),
+            "here": each is specimens[0],
+            "names": " ".join(path.name for path in each.paths),
+        }
+        for each in specimens
+    ]
 
 
 def pooled_rows(campaign: Campaign) -> list[Row]:
-    """Pooled whole-record estimates, the lowest BIC first."""
+    """Pooled whole-record estimates, the lowest BIC first; empty values of what is not pooled."""
+    return _pooled_rows(campaign) + [
+        {
+            "type": each.structure,
+            "uniform": each.uniform,
+            "sessions": each.determined,
+            "misfit": each.misfit,
+            "parameter": parameter,
+            "reported": False,
+        }
+        for each in campaign.structures
+        if not each.pooled
+        for parameter in STRUCTURES[each.structure].free
+    ]
+
+
+def _pooled_rows(campaign: Campaign) -> list[Row]:
     withheld = campaign.verdict.withheld if campaign.verdict else ()
+    mixed = campaign.homogeneity.is_mixed
     return [
         {
             "type": estimate.structure,
@@ -158,6 +219,7 @@ def pooled_rows(campaign: Campaign) -> list[Row]:
             "next_low_95": each.next_interval[0],
             "next_high_95": each.next_interval[1],
             "reported": each.name not in unreported(STRUCTURES[estimate.structure], withheld),
+            "mixture": mixed(each.name),
         }
         for estimate in campaign.pooled
         for each in estimate.parameters
@@ -165,7 +227,7 @@ def pooled_rows(campaign: Campaign) -> list[Row]:
 
 
 def validation_rows(campaign: Campaign) -> list[Row]:
-    """Errors of each session predicted from the others."""
+    """Errors of each session predicted from the others, then the trials that were lost."""
     return [
         {
             "file": str(each.path),
@@ -174,9 +236,10 @@ def validation_rows(campaign: Campaign) -> list[Row]:
             "weighting": each.weighting,
             "error": each.error,
             "own_error": each.own_error,
+            "lost": None,
         }
         for each in campaign.validation
-    ]
+    ] + [{"file": str(each.path), "lost": each.reason} for each in campaign.lost_trials]
 
 
 def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, list[Row]]:
@@ -186,11 +249,17 @@ def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, lis
         "table4": table4_rows,
         "table5": table5_rows,
     }
-    found = {name: make(campaign, with_paper=with_paper) for name, make in with_numbers.items()}
+    mixture = {"mixture": campaign.homogeneity.mixed}
+    found = {
+        name: [row | mixture for row in make(campaign, with_paper=with_paper)]
+        for name, make in with_numbers.items()
+    }
     found |= {
         "sessions_welch": session_rows(campaign),
         "sessions_record": record_rows(campaign),
         "structures": candidate_rows(campaign),
+        "specimens": specimen_rows(campaign),
+        "homogeneity": homogeneity_rows(campaign),
         "pooled": pooled_rows(campaign),
         "pooled_modes": mode_rows(campaign),
         "validation": validation_rows(campaign),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled import PooledEstimate
     from analysis.campaigns.pooled_modes import PooledMode
     from analysis.campaigns.pooled_orders import PooledOrder
-    from analysis.campaigns.validation import LeftOutError
+    from analysis.campaigns.validation import LeftOutError, LostTrial
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _WRONG: Final = 1.5
@@ -96,12 +96,13 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
     )
 
 
-def modes(best: PooledEstimate) -> list[str]:
-    """Say how the modes are damped."""
+def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
+    """Say how the modes are damped; of a mixture, that it is one."""
     if not best.modes:
         return []
     said = "; ".join(map(_mode, best.modes))
-    return [f"Modes: {said} (± 95 % of the mean over the sessions)."]
+    of = "the sessions, which are a mixture" if mixed else "the sessions"
+    return [f"Modes: {said} (± 95 % of the mean over {of})."]
 
 
 def _mode(mode: PooledMode) -> str:
@@ -128,6 +129,12 @@ def order(found: PooledOrder) -> str:
         free = f" ({ends}, if it is left free)" if found.interval else ""
         chance = "" if low <= 1 <= high else ", and differs from 1 by no more than chance may"
         said = f"is 1 as far as all sessions together tell{free}{chance}"
+    elif found.mixture:
+        pooled = f" ({found.estimate:.4f} over all that determine it)" if found.estimate else ""
+        said = (
+            f"stays open: the sessions are not of one specimen and do not all share it{pooled}; "
+            "it is not reported"
+        )
     elif found.status == "fractional":
         said = f"is {found.estimate:.4f} ({ends}); 1 is excluded"
     else:
@@ -167,7 +174,7 @@ def scatter(best: PooledEstimate) -> str:
     )
 
 
-def foresight(best: PooledEstimate, validation: Sequence[LeftOutError]) -> list[str]:
+def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int) -> list[str]:
     """Say how well the sessions predict one that they have not seen."""
     of_best = [each for each in validation if each.method == "record" and each.name == best.name]
     own = [each.own_error for each in of_best if each.own_error is not None]
@@ -179,7 +186,22 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError]) -> list[
         if error <= _AS_GOOD * alone
         else "worse than by a fit to itself: the parameters wander"
     )
+    fewer = f"; mean of {len(own)} of {sessions} sessions" if len(own) < sessions else ""
     return [
         f"From the others, the torque of a session is predicted to {100 * error:.2f} % (its own "
-        f"fit: {100 * alone:.2f} %, noise included), {verdict}."
+        f"fit: {100 * alone:.2f} %, noise included{fewer}), {verdict}."
+    ]
+
+
+def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
+    """Account for the sessions that were to be predicted and were not."""
+    if not lost:
+        return []
+    each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])
+    more = f"; and {len(lost) - _MANY} more" if len(lost) > _MANY else ""
+    return [
+        f"Of {asked} sessions to be predicted from the others, {asked - len(lost)} "
+        f"{'was' if asked - len(lost) == 1 else 'were'} and {len(lost)} "
+        f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Errors of prediction are over "
+        "those that were."
     ]

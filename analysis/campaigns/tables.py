@@ -6,14 +6,14 @@ import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from rich import box
 from rich.console import Console, Group
-from rich.table import Table
 from rich.text import Text
 
-from analysis.campaigns import paper
-from analysis.campaigns.labels import label, with_unit
+from analysis.campaigns import homogeneity_tables, paper, sentences, specimen_sentences
+from analysis.campaigns.labels import label, probability, with_unit
 from analysis.campaigns.nominal import best_models
+from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
+from analysis.campaigns.text_table import text_table
 from analysis.campaigns.validation import by_model
 from analysis.report.html.reported import MARK, footnotes, unreported
 from analysis.report.tables import with_spread
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from rich.console import RenderableType
+    from rich.table import Table
 
     from analysis.campaigns.campaign import Campaign
     from analysis.campaigns.pooled import PooledEstimate
@@ -36,6 +37,9 @@ _ABSENT: Final = "–"
 NO_VERDICT: Final = (
     "No verdict on the whole records: it takes two sessions that determine a structure's damping."
 )
+NOT_POOLED: Final = (
+    "in grey: not pooled, since fewer than two sessions determine its damping, or not all tried it"
+)
 
 
 def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> RenderableType:
@@ -43,12 +47,18 @@ def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> Renderab
     parts: list[RenderableType] = []
     if campaign.verdict is not None:
         parts.extend((verdict_text(campaign.verdict), ""))
-    elif campaign.sessions[0].record_estimates:
-        parts.extend((Text(NO_VERDICT, style="bold"), ""))
+    else:
+        for sentence in without_verdict(campaign):
+            parts.extend((Text(sentence, style="bold"), ""))
+    found = campaign.homogeneity
+    if len(found.specimens) > 1:
+        parts.extend((homogeneity_tables.specimens_text_table(found), ""))
+    if found.mixed:
+        parts.extend((homogeneity_tables.scatter_text_table(found), ""))
     withheld = campaign.verdict.withheld if campaign.verdict else ()
     for estimate in likely_estimates(campaign):
-        parts.extend((pooled_table(estimate, withheld), ""))
-    if campaign.pooled:
+        parts.extend((pooled_table(estimate, campaign, withheld), ""))
+    if campaign.structures:
         parts.extend((candidates_table(campaign), ""))
     if campaign.validation:
         parts.extend((validation_table(campaign), ""))
@@ -67,6 +77,16 @@ def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> Renderab
     return Group(*parts)
 
 
+def without_verdict(campaign: Campaign) -> list[str]:
+    """Say what a verdict would have said first, and why there is none."""
+    asked = any(each.record_estimates for each in campaign.sessions)
+    return [
+        *specimen_sentences.specimens(campaign.homogeneity),
+        *([NO_VERDICT] if asked else []),
+        *sentences.lost_trials(campaign.lost_trials, campaign.trials),
+    ]
+
+
 def tables_text(campaign: Campaign, *, with_paper: bool = False, width: int = 120) -> str:
     """Return the same as plain text, with the files that were left out."""
     console = Console(width=width, color_system=None, force_terminal=False)
@@ -79,7 +99,8 @@ def tables_text(campaign: Campaign, *, with_paper: bool = False, width: int = 12
 
 def statistics_table(campaign: Campaign, *, with_paper: bool) -> Table:
     """Table 3; the paper's numbers follow in parentheses."""
-    table = _table(f"Parameters over {len(campaign.sessions)} sessions (Table 3)")
+    count = len(campaign.sessions)
+    table = text_table(title(f"Parameters over {count} sessions (Table 3)", campaign.homogeneity))
     for heading in ("type", "weights", "parameter", *_STATISTICS):
         table.add_column(heading, justify="right" if heading in _STATISTICS else "left")
     for number, each in enumerate(campaign.statistics):
@@ -106,7 +127,12 @@ def statistics_table(campaign: Campaign, *, with_paper: bool) -> Table:
 
 def peaks_table(campaign: Campaign, *, with_paper: bool) -> Table:
     """Table 4: mean deviation of the resonant peaks from those of the nominal models."""
-    table = _table("Mean deviation of the resonant peaks from the nominal model's (Table 4)")
+    table = text_table(
+        title(
+            "Mean deviation of the resonant peaks from the nominal model's (Table 4)",
+            campaign.homogeneity,
+        )
+    )
     for heading in ("type", "weights"):
         table.add_column(heading)
     modes = len(campaign.nominal[0].deviations)
@@ -131,7 +157,9 @@ def peaks_table(campaign: Campaign, *, with_paper: bool) -> Table:
 
 def best_table(campaign: Campaign, *, with_paper: bool) -> Table:
     """Table 5: parameters and weighted error of the two best nominal models."""
-    table = _table("The two best nominal models (Table 5; peaks in Table 4)")
+    table = text_table(
+        title("The two best nominal models (Table 5; peaks in Table 4)", campaign.homogeneity)
+    )
     for heading in ("type", "weights", "α", "ζ (1e-5)", "λ", "γ (1e-2)", "WMSE ((N·m/rad)²)"):
         table.add_column(heading, justify="left" if heading in ("type", "weights") else "right")
     for model in best_models(campaign.nominal):
@@ -160,20 +188,26 @@ def verdict_text(verdict: CampaignVerdict) -> Text:
 
 
 def candidates_table(campaign: Campaign) -> Table:
-    """All structures, the lowest BIC first."""
-    table = _table("Structures on the whole records of all sessions together")
+    """All structures fitted, those pooled first, the lowest BIC first."""
+    table = text_table(
+        title("Structures on the whole records of all sessions together", campaign.homogeneity)
+    )
     table.add_column("type")
-    for heading in ("sessions", "BIC above the lowest", "residual (noise = 1)", "selected alone"):
+    for heading in ("fitted", "determined", "BIC above the lowest", "residual (noise = 1)",
+                    "selected alone"):  # fmt: skip
         table.add_column(heading, justify="right")
-    alone = campaign.verdict.alone if campaign.verdict else {}
-    for each in campaign.pooled:
+    for each in campaign.structures:
+        bic = each.bic_above_lowest
         table.add_row(
-            each.name, str(each.sessions), f"{each.bic - campaign.pooled[0].bic:.1f}",
-            f"{each.misfit:.4g}", str(alone.get(each.name, 0)),
+            each.name, str(each.fitted), str(each.determined),
+            _ABSENT if bic is None else f"{bic:.1f}", f"{each.misfit:.4g}",
+            str(each.selected_alone), style="" if each.pooled else "dim",
         )  # fmt: skip
     table.caption = (
-        "sessions: that determine its damping; selected alone: sessions whose own BIC is lowest so"
+        "in how many sessions it was fitted, determines its damping, and has the lowest BIC alone"
     )
+    if not all(each.pooled for each in campaign.structures):
+        table.caption += f"; {NOT_POOLED}"
     return table
 
 
@@ -183,11 +217,23 @@ def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
     return [*campaign.pooled[:1], *(each for each in campaign.pooled if each.name in close)]
 
 
-def pooled_table(estimate: PooledEstimate, withheld: Collection[str] = ()) -> Table:
-    """Pooled whole-record estimate of one structure; orders withheld are marked."""
-    table = _table(
-        f"Pooled whole-record estimate, type {estimate.name}, {estimate.sessions} sessions; "
-        f"residual {estimate.misfit:.4g} times the noise"
+def used(estimate: PooledEstimate, campaign: Campaign) -> str:
+    """Say of how many sessions an estimate is, and of how many it is not."""
+    every = len(campaign.sessions)
+    return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
+
+
+def pooled_table(
+    estimate: PooledEstimate, campaign: Campaign, withheld: Collection[str] = ()
+) -> Table:
+    """Pooled whole-record estimate of one structure; orders withheld and mixtures are marked."""
+    found = campaign.homogeneity
+    table = text_table(
+        title(
+            f"Pooled whole-record estimate, type {estimate.name}, {used(estimate, campaign)}; "
+            f"residual {estimate.misfit:.4g} times the noise",
+            found,
+        )
     )
     table.add_column("parameter")
     for heading in ("pooled ±std", "95 % interval", "one session's std", "between sessions", "p"):
@@ -198,38 +244,39 @@ def pooled_table(estimate: PooledEstimate, withheld: Collection[str] = ()) -> Ta
         low, high = (factor * end for end in each.interval)
         digits = max(2 - math.floor(math.log10(max(high - low, 1e-12))), 0)
         marked = each.name in doubtful
+        marks = (MARK if marked else "") + (MIXTURE_MARK if found.is_mixed(each.name) else "")
         table.add_row(
-            with_unit(each.name) + (f" {MARK}" if marked else ""),
+            f"{with_unit(each.name)} {marks}".rstrip(),
             with_spread(factor * each.value, factor * each.std),
             f"{low:.{digits}f} … {high:.{digits}f}",
             f"{factor * each.within_std:.2g}", f"{factor * each.between_std:.2g}",
-            f"{each.chance:.2g}", style="dim" if marked else "",
+            probability(each.chance), style="dim" if marked else "",
         )  # fmt: skip
-    table.caption = " ".join(footnotes(withheld)) if doubtful else None
+    notes = footnotes(withheld) if doubtful else ()
+    if any(found.is_mixed(each.name) for each in estimate.parameters):
+        notes = (*notes, MIXTURE_NOTE)
+    table.caption = " ".join(notes) or None
     return table
 
 
 def validation_table(campaign: Campaign) -> Table:
     """Errors of left-out sessions, the best model first."""
-    table = _table("Each session predicted from the others: rms error of the torque, %")
+    table = text_table("Each session predicted from the others: rms error of the torque, %")
     for heading in ("method", "type", "weights"):
         table.add_column(heading)
-    for heading in ("mean", "worst", "own fit"):
+    for heading in ("sessions", "mean", "worst", "own fit"):
         table.add_column(heading, justify="right")
     for method, structure, weighting, errors in by_model(campaign.validation):
         values = 100 * np.array([each.error for each in errors])
         own = [each.own_error for each in errors if each.own_error is not None]
         table.add_row(
-            method, structure, weighting or "", f"{values.mean():.2f}", f"{values.max():.2f}",
+            method, structure, weighting or "", f"{values.size} of {campaign.trials}",
+            f"{values.mean():.2f}", f"{values.max():.2f}",
             f"{100 * float(np.mean(own)):.2f}" if own else _ABSENT,
         )  # fmt: skip
-    table.caption = "own fit: of the session's own whole-record fit, noise included"
+    notes = [
+        "own fit: of the session's own whole-record fit, noise included",
+        *sentences.lost_trials(campaign.lost_trials, campaign.trials),
+    ]
+    table.caption = ". ".join(notes)
     return table
-
-
-def _table(title: str) -> Table:
-    return Table(
-        min_width=len(title),
-        title=Text(title, style="bold"), title_justify="left", caption_justify="left",
-        box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
-    )  # fmt: skip

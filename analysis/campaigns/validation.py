@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.errors import task_errors
+from analysis.campaigns.errors import CampaignError, task_errors
 from analysis.campaigns.nominal import mean_damping
 from analysis.campaigns.pooled import pooled_estimates
+from analysis.campaigns.workers import Lost
 from analysis.whole_record import Measurement, Plant
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from analysis.campaigns.session import SessionResult
+    from analysis.campaigns.workers import Workers
+
+FEWEST: Final = 3
+"""Sessions from which each can be predicted from the others: two are the fewest to be pooled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,14 @@ class LeftOutError:
 
 
 @dataclass(frozen=True, slots=True)
+class LostTrial:
+    """A session that was to be predicted from the others, and why it was not."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Forecast:
     """What others say of a session: a model's name and its plant, the session's own beside it."""
 
@@ -78,20 +91,49 @@ def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecas
     return tuple(found)
 
 
+def validate(
+    workers: Workers,
+    sessions: Sequence[SessionResult],
+    band_hz: tuple[float, float],
+    on_done: Callable[[int], None],
+) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
+    """Try every session once, and account for each trial: done, or lost and why.
+
+    What was found of the sessions is kept though all workers may go.
+    """
+    trials = [(each.path, forecasts(sessions, i), band_hz) for i, each in enumerate(sessions)]
+    try:
+        results = workers.run(left_out_errors, trials, on_done)
+    except CampaignError as error:
+        return (), tuple(LostTrial(session.path, str(error)) for session in sessions)
+    errors: list[LeftOutError] = []
+    lost: list[LostTrial] = []
+    for session, result in zip(sessions, results, strict=True):
+        if isinstance(result, Lost):
+            lost.append(LostTrial(session.path, result.reason))
+        elif isinstance(result, LostTrial):
+            lost.append(result)
+        else:
+            errors.extend(result)
+    return tuple(errors), tuple(lost)
+
+
 def left_out_errors(
     path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float]
-) -> tuple[LeftOutError, ...]:
+) -> tuple[LeftOutError, ...] | LostTrial:
     """Read a session and compare its torque with what each model predicts from its angle.
 
-    Returns nothing for a session that the whole-record estimator cannot use.
+    A session that the whole-record estimator cannot use is told, not raised: it is one of many.
     """
     from analysis.record import load_record
     from analysis.whole_record.comparison import Comparison
 
     try:
         comparison = Comparison.of(Measurement.of_record(load_record(path)), band_hz)
-    except task_errors():
-        return ()
+    except task_errors() as why:
+        return LostTrial(path, str(why))
+    except MemoryError:
+        return LostTrial(path, "there is not memory enough to predict it; use fewer --jobs")
     measured = comparison.torque_nm[comparison.kept]
     size = np.linalg.norm(comparison.spectrum(measured))
 

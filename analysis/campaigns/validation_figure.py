@@ -27,7 +27,7 @@ def validation_figure(campaign: Campaign) -> Figure:
     colors = {w: look["color"] for w, look in line_styles(weightings).items()}
     width_in, height_in = 9.0, _ROW_IN * len(models) + 1.75
     figure = style.new_figure(
-        width_in, height_in, f"{len(campaign.sessions)} sessions — each predicted from the others",
+        width_in, height_in, f"{_predicted(campaign)} sessions — each predicted from the others",
         "rms of predicted minus measured torque over that of the measured torque, "
         f"{campaign.record_band_hz[0]:g} to {campaign.record_band_hz[1]:g} Hz",
     )  # fmt: skip
@@ -66,6 +66,11 @@ def validation_figure(campaign: Campaign) -> Figure:
         bbox_to_anchor=(0.3 / width_in, 1 - 0.6 / height_in),
     )  # fmt: skip
     return figure
+
+
+def _predicted(campaign: Campaign) -> str:
+    done = campaign.trials - len(campaign.lost_trials)
+    return f"{done} of {campaign.trials}" if campaign.lost_trials else str(done)
 
 
 def _name(_method: str, structure: str, weighting: str | None) -> str:

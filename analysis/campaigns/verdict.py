@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from analysis.campaigns import sentences
+from analysis.campaigns import sentences, specimen_sentences
 from analysis.campaigns.common_findings import CommonFinding, common_findings
 from analysis.campaigns.pooled_orders import PooledOrder, pooled_order, rivals
 from analysis.selection.orders import EVEN, STRONG
@@ -14,9 +14,10 @@ from analysis.selection.orders import EVEN, STRONG
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from analysis.campaigns.homogeneity import Homogeneity
     from analysis.campaigns.pooled import PooledEstimate
     from analysis.campaigns.session import SessionResult
-    from analysis.campaigns.validation import LeftOutError
+    from analysis.campaigns.validation import LeftOutError, LostTrial
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,9 @@ class CampaignVerdict:
 def campaign_verdict(
     sessions: Sequence[SessionResult],
     pooled: Sequence[PooledEstimate],
+    alike: Homogeneity,
     validation: Sequence[LeftOutError],
+    lost: Sequence[LostTrial],
 ) -> CampaignVerdict | None:
     """Judge a campaign; None if fewer than two sessions determine any structure's damping.
 
@@ -97,13 +100,16 @@ def campaign_verdict(
     sessions : sequence of SessionResult
     pooled : sequence of PooledEstimate
         The lowest BIC first.
+    alike : Homogeneity
+        Whether they are of one specimen.
     validation : sequence of LeftOutError
+    lost : sequence of LostTrial
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:
         return None
     best = pooled[0]
-    alpha, lambda_ = (pooled_order(order, pooled, verdicts) for order in ("alpha", "lambda"))
+    alpha, lambda_ = (pooled_order(order, pooled, verdicts, alike) for order in ("alpha", "lambda"))
     found = common_findings(sessions)
     close = rivals(pooled, EVEN)
     alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
@@ -122,15 +128,17 @@ def campaign_verdict(
         findings=found,
         dissent=dissent,
         sentences=(
+            *specimen_sentences.specimens(alike),
             sentences.selected(pooled, close, alone, len(verdicts), _withheld(alpha, lambda_)),
             sentences.left_over(best, adequate, len(verdicts)),
-            *sentences.modes(best),
+            *sentences.modes(best, mixed=alike.mixed),
             sentences.order(alpha),
             sentences.order(lambda_),
             *(finding.sentence for finding in found),
             *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
-            sentences.scatter(best),
-            *sentences.foresight(best, validation),
+            *([] if alike.mixed else [sentences.scatter(best)]),
+            *sentences.foresight(best, validation, len(sessions)),
+            *sentences.lost_trials(lost, len(sessions)),
         ),
         experiments=tuple(
             what for what, count in advice.most_common() if 2 * count > len(verdicts)

@@ -8,12 +8,13 @@ import pytest
 
 from analysis.campaigns import sentences
 from analysis.campaigns.common_findings import common_findings
+from analysis.campaigns.homogeneity import Heterogeneity, Homogeneity
 from analysis.campaigns.pooled import pooled
 from analysis.campaigns.pooled_orders import pooled_order
 from analysis.campaigns.verdict import campaign_verdict
 from analysis.selection import Finding
 
-COVARIANCE = {"zeta": 1e-4, "alpha": 1e-4, "gamma": 1e-4, "lambda": 1e-4}
+ALIKE = Homogeneity((), ())
 
 
 def said(structure="VI", alpha="fractional", adequate=True, modes=(1, 2, 3), findings=()):
@@ -50,7 +51,7 @@ def ranked(*groups):
 
 def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_of):
     order = pooled_order(
-        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0)), [said()] * 4
+        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0)), [said()] * 4, ALIKE
     )
     assert order.status == "fractional"
     assert order.value == pytest.approx(0.8)
@@ -68,21 +69,42 @@ def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_o
 )
 def test_an_order_is_withheld(estimates_of, rival, verdict, status):
     order = pooled_order(
-        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", rival)), [verdict] * 4
+        "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", rival)), [verdict] * 4, ALIKE
     )
     assert order.status == status
     assert order.value is None
 
 
+def mixed_in(quantity):
+    files = (("a.mcap", 0.8, 0.01), ("b.mcap", 1.0, 0.01))
+    return Homogeneity((), (Heterogeneity(quantity, files, 0.9, 0.14, 200.0, 0.0, True, ()),))
+
+
+@pytest.mark.parametrize("alpha", [0.8, 1.0])
+def test_an_order_in_which_sessions_differ_in_kind_is_withheld(estimates_of, alpha):
+    groups = ranked(estimates_of("VI", 100.0, alpha), estimates_of("VII", 150.0))
+    order = pooled_order("alpha", groups, [said()] * 4, mixed_in("alpha"))
+    assert (order.status, order.value, order.mixture) == ("not supported", None, True)
+    assert "not of one specimen and do not all share it" in sentences.order(order)
+
+
+def test_an_order_that_all_beams_of_a_mixture_share_is_reported(estimates_of):
+    """Beams of several lengths of one material; but not if one of them does not determine it."""
+    groups = ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0))
+    mixed = mixed_in("frequency_hz_1")
+    assert pooled_order("alpha", groups, [said()] * 4, mixed).status == "fractional"
+    assert pooled_order("alpha", groups, [said()] * 5, mixed).value is None
+
+
 def test_one_session_in_ten_may_hold_something_else(estimates_of):
     groups = ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0))
     verdicts = [*[said()] * 9, said(adequate=False)]
-    assert pooled_order("alpha", groups, verdicts).status == "fractional"
+    assert pooled_order("alpha", groups, verdicts, ALIKE).status == "fractional"
 
 
 def test_an_order_that_could_be_anything_is_not_identifiable(estimates_of):
     groups = ranked(estimates_of("VI", 100.0, std=0.5), estimates_of("VII", 101.0))
-    order = pooled_order("alpha", groups, [said()] * 4)
+    order = pooled_order("alpha", groups, [said()] * 4, ALIKE)
     assert (order.status, order.value, order.interval) == ("not identifiable", None, None)
     assert "not identifiable" in sentences.order(order)
 
@@ -94,13 +116,13 @@ def test_an_order_of_one_is_told_with_what_it_would_be_if_free(estimates_of, alp
     """1 inside the interval; outside, but dismissed by BIC; outside, and not dismissed."""
     groups = ranked(estimates_of("VI", rival, alpha), estimates_of("VII", 100.0))
     assert groups[0].structure == "VII" or status == "not supported"
-    order = pooled_order("alpha", groups, [said("VII", "integer")] * 4)
+    order = pooled_order("alpha", groups, [said("VII", "integer")] * 4, ALIKE)
     assert order.status == status
     assert order.interval[0] < alpha < order.interval[1]
 
 
 def test_damping_that_no_session_needs_is_absent(estimates_of):
-    order = pooled_order("lambda", ranked(estimates_of("IV", 100.0)), [said("IV")] * 4)
+    order = pooled_order("lambda", ranked(estimates_of("IV", 100.0)), [said("IV")] * 4, ALIKE)
     assert (order.status, order.value) == ("absent", None)
     assert "No external damping shows" in sentences.order(order)
 
@@ -144,7 +166,7 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
     ]
     other = (replace(six[0], bic=180.0), seven[0])
     sessions[2] = make_session("2.mcap", estimates=other, verdict=said("VII"))
-    found = campaign_verdict(sessions, ranked(six, seven), ())
+    found = campaign_verdict(sessions, ranked(six, seven), ALIKE, (), ())
     assert found.structure == "VI"
     assert found.alone == {"VI": 3, "VII": 1}
     ((name, structure, margin),) = [(d.file, d.structure, d.margin) for d in found.dissent]
@@ -152,7 +174,7 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
     (told,) = (s for s in found.sentences if "dismissed" in s)
     assert "2.mcap (type VII)" in told
     assert found.experiments == ("Sweep longer.",)
-    assert campaign_verdict(sessions, (), ()) is None
+    assert campaign_verdict(sessions, (), ALIKE, (), ()) is None
 
 
 def test_words_about_scatter_and_misfit(estimates_of):

@@ -1,0 +1,209 @@
+"""Whether sessions are of one specimen: by what files state, and by what their records show."""
+
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.campaigns import campaign, specimen_sentences
+from analysis.campaigns.document import campaign_document
+from analysis.campaigns.experiment import stated_specimens
+from analysis.campaigns.homogeneity import Homogeneity, groups, homogeneity
+from analysis.campaigns.page import campaign_page
+from analysis.campaigns.pooled_figure import pooled_figure
+from analysis.campaigns.rows import all_tables
+from analysis.campaigns.tables import tables_text
+from rigd.beam import undamped_frequencies_rad_s
+
+STIFFER = 1.03
+
+
+def of_frequencies(make_session, make_estimate, values, std):
+    """Sessions whose first mode has these frequencies in Hz, each of its own std."""
+    sessions = []
+    for number, (value, own) in enumerate(np.broadcast(values, std)):
+        estimate = make_estimate("I", {"zeta": 1e-4}, [[1e-4]], ("zeta",))
+        mode = replace(estimate.modes[0], frequency_hz=value, frequency_std_hz=own)
+        sessions.append(
+            make_session(f"{number}.mcap", estimates=[replace(estimate, modes=(mode,))])
+        )
+    return homogeneity(sessions, (), ())
+
+
+def test_scatter_by_hand(make_session, make_estimate):
+    """Two at -5 and two at 5 standard deviations: Q is 100 of 3, tau² = (100 - 3) / 3."""
+    found = of_frequencies(make_session, make_estimate, [2.45, 2.55, 2.45, 2.55], 0.01)
+    frequency = found.leading
+    assert frequency.quantity == "frequency_hz_1"
+    assert frequency.cochran_q == pytest.approx(100.0)
+    assert frequency.own_stds == pytest.approx(math.sqrt(97 / 3))
+    assert frequency.between_std == pytest.approx(0.01 * math.sqrt(97 / 3))
+    assert frequency.i_squared == pytest.approx(0.97)
+    assert frequency.groups == (("0.mcap", "2.mcap"), ("1.mcap", "3.mcap"))
+    assert found.mixed
+    assert not found.is_mixed("damping_ratio_1")  # the same of all
+    assert not found.of("damping_ratio_1").mixed
+    said, where = specimen_sentences.specimens(found)
+    assert said.startswith("The sessions are not of one specimen in one state: frequency of mode 1")
+    assert "5.69 of its own standard deviations" in said
+    assert "2.450 Hz in 2 files (0.mcap, 2.mcap); 2.550 Hz in 2 files" in where
+
+
+def test_sessions_that_repeat_are_of_one_specimen(make_session, make_estimate):
+    """A thousand campaigns of five: no more false alarms than one in a hundred, and few more."""
+    rng = np.random.default_rng(3)
+    alarms = sum(
+        of_frequencies(make_session, make_estimate, rng.normal(2.5, 0.01, 5), 0.01).mixed
+        for _ in range(1000)
+    )
+    assert alarms <= 15
+
+
+def test_a_scatter_like_their_own_uncertainty_is_no_mixture(make_session, make_estimate):
+    """It is what the random-effects model is for: significant in many, but no other specimen."""
+    rng = np.random.default_rng(4)
+    found = [
+        of_frequencies(make_session, make_estimate, rng.normal(2.5, 0.015, 20), 0.01)
+        for _ in range(50)
+    ]
+    assert sum(each.of("frequency_hz_1").chance < 0.01 for each in found) > 25
+    assert not any(each.mixed for each in found)
+
+
+def test_one_of_twenty_that_is_another_is_named(make_session, make_estimate):
+    """Its share of the variance is small, the gap is not."""
+    values = np.random.default_rng(5).normal(2.5, 0.01, 20)
+    values[7] = 2.62
+    found = of_frequencies(make_session, make_estimate, values, 0.01)
+    assert found.leading.i_squared < 0.9
+    assert found.leading.groups[1] == ("7.mcap",)
+    assert "1 file (7.mcap)" in specimen_sentences.specimens(found)[1]
+
+
+@pytest.mark.parametrize(("apart_hz", "slight"), [(0.002, True), (0.02, False)])
+def test_many_standard_deviations_may_be_a_slight_change(
+    make_session, make_estimate, apart_hz, slight
+):
+    """Both 20 standard deviations apart, but 0.08 % and 0.8 % of the frequency."""
+    values = [2.5, 2.5, 2.5 + apart_hz, 2.5 + apart_hz]
+    found = of_frequencies(make_session, make_estimate, values, apart_hz / 20)
+    assert found.mixed
+    said = " ".join(specimen_sentences.specimens(found))
+    assert ("temperature or clamp changes" in said) == slight
+
+
+@pytest.mark.parametrize(
+    ("values", "parts"),
+    [
+        ([0.0, 50.0], ()),  # which of two is the other one?
+        ([0.0, 1.0, 50.0], ((0, 1), (2,))),
+        ([100.0, 0.0, 50.0, 51.0, 1.0, 101.0], ((1, 4), (2, 3), (0, 5))),
+        ([0.0, 10.0, 20.0, 30.0, 40.0, 50.0], ()),
+    ],
+)
+def test_groups_are_told_only_where_gaps_are_clear(values, parts):
+    assert groups(np.array(values), np.ones(len(values))) == parts
+
+
+def test_files_are_grouped_by_the_specimen_that_they_state(make_experiment):
+    one = make_experiment("a", tool_inertia_kg_m2=0.0)
+    other = make_experiment("b", tool_inertia_kg_m2=1e-5)
+    stated = [(Path("a"), one), (Path("b"), other), (Path("torn"), None), (Path("c"), one)]
+    first, second = stated_specimens(stated, one)
+    assert (first.paths, second.paths) == ((Path("a"), Path("c")), (Path("b"),))
+    (said,) = specimen_sentences.specimens(Homogeneity((first, second), ()))
+    assert "they state 2: tool_inertia_kg_m2 0 kg·m² in 2 files (a, c); tool_inertia_kg_m2 " in said
+    assert "1e-05 kg·m² in 1 file (b)" in said
+
+
+@pytest.fixture(scope="module")
+def mixture(short_sessions, other_beam, make_file, truth, settings, tmp_path_factory):
+    """Two of one beam, two of a stiffer one that states to be the same, one that states another."""
+    folder = tmp_path_factory.mktemp("stiffer")
+    link, damping = truth
+    stiffness = link.bending_stiffness_n_m2
+    stiff = replace(link, bending_stiffness_n_m2=STIFFER * stiffness)
+    others = [
+        make_file(
+            folder / f"stiff{seed}.mcap", seed, stiff, damping,
+            beam_bending_stiffness_n_m2=repr(stiffness),
+        )
+        for seed in (20, 21)
+    ]  # fmt: skip
+    paths = [*short_sessions[:2], *others, other_beam]
+    return campaign(paths, replace(settings, types=("I",)), structures=("III", "IV"), jobs=2)
+
+
+def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
+    stated, differing, where, structure, *_ = mixture.verdict.sentences
+    assert "they state 2: beam_length_m 0.98 m in 4 files (0.mcap, 1.mcap" in stated
+    assert "beam_length_m 1 m in 1 file (longer.mcap)" in stated
+    assert "all that follows is of beam_length_m 0.98 m" in stated
+    assert differing.startswith("The sessions are not of one specimen in one state: frequency of")
+    assert "in 2 files (0.mcap, 1.mcap)" in where
+    assert "in 2 files (stiff20.mcap, stiff21.mcap)" in where
+    assert structure.startswith("Type III")
+    assert not any("they repeat" in each for each in mixture.verdict.sentences)
+    assert tables_text(mixture).startswith("The files are not of one specimen")
+
+
+def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
+    """Frequencies go with the root of the stiffness: the truth, not the estimate, is the peer."""
+    link, _ = truth
+    (first_rad_s,) = undamped_frequencies_rad_s(link, 1)
+    apart_hz = first_rad_s / (2 * np.pi) * (math.sqrt(STIFFER) - 1)
+    frequency = mixture.homogeneity.of("frequency_hz_1")
+    values = {name: value for name, value, _ in frequency.values}
+    soft, stiff = (np.mean([values[name] for name in part]) for part in frequency.groups)
+    assert stiff - soft == pytest.approx(apart_hz, rel=0.05)
+    # Of two equal groups d apart the variance of four is d²/3, nearly all of it between sessions.
+    assert frequency.between_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
+    assert frequency.own_stds > 30
+
+
+def test_what_agrees_is_not_marked_as_a_mixture(mixture):
+    """Both beams are damped alike; their stiffness is not the same."""
+    rows = [row for row in all_tables(mixture)["pooled"] if row["type"] == "III"]
+    mixed = {row["parameter"] for row in rows if row["mixture"]}
+    assert "density_over_stiffness" in mixed
+    assert not mixed & {"zeta", "gamma", "delay_s"}
+    text = tables_text(mixture)
+    assert "ρ/EI (10⁻³ s²/m⁴) ‡" in text
+    assert "ζ (10⁻⁵ s^α) ‡" not in text
+    assert "(Table 3), of a mixture" in text
+    titles = {axes.get_title() for axes in pooled_figure(mixture).axes}
+    assert {title.split(" ")[0] for title in titles} >= {"ρ/EI‡", "ζ", "γ"}
+
+
+def test_page_and_json_tell_it_too(mixture):
+    content = campaign_document(mixture)
+    assert content["one_specimen"] is False
+    assert content["groups"]["files"] == [["0.mcap", "1.mcap"], ["stiff20.mcap", "stiff21.mcap"]]
+    assert [row["files"] for row in content["specimens"]] == [4, 1]
+    assert {row["mixture"] for row in content["table3"]} == {True}
+    page = campaign_page(mixture, {}, datetime.now(UTC), with_paper=False)
+    assert page.index("The files are not of one specimen") < page.index("Type III: damping")
+    for name in ("specimens", "homogeneity"):
+        assert f'id="{name}"' in page
+        assert content[name]
+
+
+def test_a_structure_that_none_selects_nor_determines_has_its_row(mixture):
+    """Type IV has no external damping: the internal one is driven to the edge of its range."""
+    rows = {each.name: each for each in mixture.structures}
+    four = rows["IV"]
+    assert (four.fitted, four.selected_alone, four.pooled) == (4, 0, False)
+    assert four.determined < 2
+    assert four.bic_above_lowest > 1000
+    assert sum(each.selected_alone for each in mixture.structures) == 4
+    tables = all_tables(mixture)
+    (written,) = (row for row in tables["structures"] if row["type"] == "IV")
+    assert (written["fitted"], written["selected_alone"]) == (4, 0)
+    pooled = [row for row in tables["pooled"] if row["type"] == "IV"]
+    assert [row["parameter"] for row in pooled] == ["zeta", "alpha"]
+    assert {(row.get("value"), row["reported"]) for row in pooled} == {(None, False)}
+    (line,) = (each for each in tables_text(mixture).splitlines() if each.startswith("IV "))
+    assert line.split()[1:3] == ["4", str(four.determined)]

@@ -1,0 +1,107 @@
+"""Every trial of the validation is accounted for: done, or lost and why."""
+
+import os
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from analysis.campaigns import CampaignError, campaign
+from analysis.campaigns.command import campaign_command
+from analysis.campaigns.document import campaign_document
+from analysis.campaigns.page import campaign_page
+from analysis.campaigns.tables import tables_text
+from analysis.campaigns.validation import LostTrial, left_out_errors, validate
+from analysis.campaigns.validation_figure import validation_figure
+from analysis.whole_record import BAND_HZ
+
+
+def ends_at_one(path, tried, band_hz):
+    """Predict a session, but end the process that is given 1.mcap, as lack of memory does."""
+    if path.name == "1.mcap":
+        os._exit(9)
+    return left_out_errors(path, tried, band_hz)
+
+
+@pytest.fixture(scope="module")
+def shaken(short_sessions, settings):
+    """A campaign of four whose worker is killed in the middle of the validation."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.campaigns.validation.left_out_errors", ends_at_one)
+        progress = []
+        found = campaign(
+            short_sessions, replace(settings, types=("I",)), structures=("III",), jobs=2,
+            on_progress=lambda *step: progress.append(step),
+        )  # fmt: skip
+    assert progress[-1][:2] == (8, 8)
+    return found
+
+
+def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
+    assert shaken.failures == ()
+    (lost,) = shaken.lost_trials
+    assert (lost.path.name, shaken.trials) == ("1.mcap", 4)
+    assert "worker process ended by itself, twice" in lost.reason
+    assert {each.path.name for each in shaken.validation} == {"0.mcap", "2.mcap", "3.mcap"}
+
+
+def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
+    (foresight,) = (s for s in shaken.verdict.sentences if s.startswith("From the others"))
+    assert "mean of 3 of 4 sessions" in foresight
+    told = shaken.verdict.sentences[-1]
+    assert told.startswith("Of 4 sessions to be predicted from the others, 3 were and 1 was not")
+    assert "(1.mcap: its worker process ended by itself, twice" in told
+
+
+def test_terminal_page_and_files_account_for_it(shaken):
+    lines = tables_text(shaken).splitlines()
+    (row,) = (line for line in lines if line.startswith("record   III "))
+    assert "3 of 4" in row
+    page = campaign_page(shaken, {}, datetime.now(UTC), with_paper=False)
+    assert "3 of 4" in page
+    assert f"Not predicted from the others: {shaken.lost_trials[0].path}: its worker" in page
+    content = campaign_document(shaken)
+    trials = content["trials"]
+    assert trials["asked"] == trials["done"] + len(trials["lost"]) == 4
+    assert trials["lost"][0]["file"].endswith("1.mcap")
+    (lost,) = (row for row in content["validation"] if row["lost"])
+    assert (Path(lost["file"]).name, lost.get("error")) == ("1.mcap", None)
+    texts = [text.get_text() for text in validation_figure(shaken).texts]
+    assert any(text.startswith("3 of 4 sessions") for text in texts)
+
+
+def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
+    # The package's function has its module's name.
+    module = import_module("analysis.campaigns.campaign")
+    monkeypatch.setattr(module, "campaign", lambda *_, **__: shaken)
+    monkeypatch.setattr("analysis.campaigns.write.write_campaign", lambda *_, **__: None)
+    paths = [each.path for each in shaken.sessions]
+    code = campaign_command(paths, shaken.settings, structures=("III",), report=tmp_path / "new")
+    assert code == 1
+    assert "1.mcap is not predicted from the others: its worker" in capsys.readouterr().err
+
+
+def test_a_session_that_cannot_be_read_any_more_is_lost_with_the_reason(tmp_path):
+    gone = left_out_errors(tmp_path / "gone.mcap", (), BAND_HZ)
+    assert isinstance(gone, LostTrial)
+    assert "gone.mcap" in gone.reason
+
+
+def test_what_was_found_is_kept_though_all_workers_go(make_session):
+    class Gone:
+        def run(self, *_):
+            raise CampaignError("The Dask scheduler went away.")
+
+    sessions = [make_session(f"{n}.mcap") for n in range(3)]
+    errors, lost = validate(Gone(), sessions, BAND_HZ, print)
+    assert errors == ()
+    assert [each.path.name for each in lost] == ["0.mcap", "1.mcap", "2.mcap"]
+    assert {each.reason for each in lost} == {"The Dask scheduler went away."}
+
+
+def test_nothing_is_said_where_nothing_was_asked(short_sessions, settings):
+    found = campaign(short_sessions[:2], settings, structures=(), jobs=1)
+    assert (found.trials, found.validation, found.lost_trials) == (0, (), ())
+    assert "predicted" not in tables_text(found)
