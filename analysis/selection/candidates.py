@@ -204,22 +204,26 @@ class Field:
         for _ in range(_CROSS_CHECKS):
             best = field.best
             checked = _ranked(
-                c if c is best else field._from_other(c, best) for c in field.candidates
+                c if c is best else field._from_plant(c, best.fit.plant, best.structure)
+                for c in field.candidates
             )
             field = replace(field, candidates=checked)
             if field.best is best:
                 break
         return field
 
-    def _from_other(self, candidate: Candidate, other: Candidate) -> Candidate:
+    def tried_from(self, plant: Plant, of: Structure) -> Field:
+        """Start each from a plant that a search in structure `of` has found."""
+        tried = _ranked(self._from_plant(c, plant, of) for c in self.candidates)
+        return replace(self, candidates=tried).cross_checked()
+
+    def _from_plant(self, candidate: Candidate, plant: Plant, of: Structure) -> Candidate:
         """Fit a candidate from another's plant, where that has the same kinds of damping."""
         structure = candidate.structure
-        if (other.structure.internal and not structure.internal) or (
-            other.structure.external and not structure.external
-        ):
+        if (of.internal and not structure.internal) or (of.external and not structure.external):
             return candidate
         unknowns = self.unknowns(structure, candidate.uniform)
-        start = adapted(unknowns, other.fit.plant, other.structure)
+        start = adapted(unknowns, plant, of)
         outlook = self.descent(unknowns, start, 1)
         least = candidate.fit.cost * (1 - _MISSED)
         if outlook.promised_cost > least:

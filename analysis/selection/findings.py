@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.selection.finding import Finding
-from analysis.selection.stated_otherwise import at_edges, of_beam, of_instruments, of_start
+from analysis.selection.stated_otherwise import at_edges, of_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,7 +46,7 @@ def findings(
         return (*found, *edges)
     if len(visible) < _MODES_TO_JUDGE:
         return found
-    return (*found, *of_instruments(field), *of_beam(field), *of_start(field))
+    return (*found, *of_settings(field))
 
 
 def mains(frequency_hz: float) -> str:

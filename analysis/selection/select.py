@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from analysis.selection import sentences
 from analysis.selection.candidates import Field
+from analysis.selection.experiments import experiments
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
 from analysis.selection.nonlinear_search import nonlinear_forces
 from analysis.selection.orders import EVEN, order_verdict, rivals
-from analysis.selection.profile import profile
+from analysis.selection.profiles import profiled
 from analysis.selection.verdict import Row, Verdict
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import InputRelation, Whiteness, input_relation, whiteness
@@ -80,6 +81,7 @@ def select(
     field, forces = nonlinear_forces(linear, visible)
     if not field.best.uniform:
         field = field.with_orders_free()
+    field, of_alpha, of_lambda = profiled(field)
     white, related = _tests(field)
     comparison, fit = field.comparison, field.best.fit
     multiples = harmonics(
@@ -91,8 +93,8 @@ def select(
     explained = white.white and not related.related
     adequate = explained and not any(h.present for h in multiples)
     alpha, lambda_ = (
-        order_verdict(field, profile(field, field.best, order), visible, adequate=adequate)
-        for order in ("alpha", "lambda")
+        order_verdict(field, profile, visible, adequate=adequate)
+        for profile in (of_alpha, of_lambda)
     )
     close = rivals(field, EVEN)
     found = findings(field, forces, multiples, visible)
@@ -127,9 +129,7 @@ def select(
             input_relation=related,
             harmonics=multiples,
             sentences=tuple(said),
-            experiments=tuple(
-                sentences.experiments(field, (alpha, lambda_), visible, found, close)
-            ),
+            experiments=tuple(experiments(field, (alpha, lambda_), visible, found, close)),
         ),
     )
 

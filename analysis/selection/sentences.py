@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from analysis.selection.candidate import Candidate
     from analysis.selection.candidates import Field
-    from analysis.selection.finding import Finding
     from analysis.selection.orders import OrderVerdict
 
 _DAMPING: Final = {
@@ -68,6 +67,12 @@ def order(verdict: OrderVerdict, visible: tuple[int, ...], *, adequate: bool) ->
     name, of = verdict.order, _OF[verdict.order]
     if verdict.status == "absent":
         return f"No {of} shows, so its order {name} means nothing here."
+    if verdict.status == "not identifiable" and len(profile.valleys) > 1:
+        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
+        return (
+            f"The order {name} of the {of} is not identifiable: {equal} explain the record equally "
+            f"well, each with a damping of its own ({ends}, with all that lies between)."
+        )
     if verdict.status == "not identifiable":
         span = (
             "any value between 0 and 2 fits"
@@ -100,36 +105,3 @@ def order(verdict: OrderVerdict, visible: tuple[int, ...], *, adequate: bool) ->
         f"The order {name} of the {of} stays open: {profile.estimate:.3f} would fit ({ends}), but "
         f"{but}. It is not reported."
     )
-
-
-def experiments(
-    field: Field,
-    orders: tuple[OrderVerdict, ...],
-    visible: tuple[int, ...],
-    found: tuple[Finding, ...],
-    close: tuple[Candidate, ...],
-) -> list[str]:
-    """Say what would tell more, each piece of advice once."""
-    advice = []
-    modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
-    unknown = [o for o in orders if o.status == "not identifiable"]
-    if unknown:
-        names = " and ".join(o.order for o in unknown)
-        if len(visible) < 2:
-            second = modes.get(2, 6.3 * modes.get(1, 0.0))
-            advice.append(
-                f"To find {names}, excite the second mode as well: sweep up to at least "
-                f"{1.3 * second:.0f} Hz."
-            )
-        else:
-            advice.append(
-                f"To find {names}, measure longer where it counts: narrow, slow sweeps round "
-                "the modes, or a wider sweep that reaches one more mode."
-            )
-    unexplained = any(finding.kind == "unexplained" for finding in found)
-    if close or (not unexplained and any(o.status == "not supported" for o in orders)):
-        advice.append(
-            "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
-        )
-    advice += [finding.remedy for finding in found if finding.remedy]
-    return list(dict.fromkeys(advice))

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.selection.chance import SURE, of_chi_square
 from analysis.selection.finding import Finding
-from analysis.selection.orders import EVEN, rivals
+from analysis.selection.orders import EVEN, STRONG, rivals
+from analysis.selection.restart import vector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.selection.candidates import Field
+    from analysis.whole_record import Setting
+
+_MANY: Final = 40
+"""Evaluations of a descent that is to end."""
 
 _NORMAL_95: Final = 1.959963984540054
 _BEAM_OFF: Final = 0.003
@@ -45,12 +52,20 @@ def at_edges(field: Field) -> Iterator[Finding]:
             )
 
 
-def of_instruments(field: Field) -> Iterator[Finding]:
+def of_settings(field: Field) -> Iterator[Finding]:
+    """Find what of delay, inertia, beam and start is not as the file states it."""
+    differing = {name for name in field.free if _apart(field, name) and not _as_stated(field, name)}
+    yield from _of_instruments(field, differing)
+    yield from _of_beam(field, differing)
+    if _rings(field):
+        yield from _of_start(field)
+
+
+def _of_instruments(field: Field, differing: set[Setting]) -> Iterator[Finding]:
     """Find a delay and an inertia that the file does not state."""
-    measurement, fit = field.comparison.measurement, field.best.fit
-    late = _difference(field, "delay_s", measurement.delay_s)
-    if late is not None:
-        value, low, high = late
+    fit = field.best.fit
+    if "delay_s" in differing:
+        value, low, high = _difference(field, "delay_s")
         yield Finding(
             kind="delay",
             sentence=(
@@ -67,9 +82,8 @@ def of_instruments(field: Field) -> Iterator[Finding]:
                 f"{1e3 * fit.parameters['delay_s']:.3f} ms."
             ),
         )
-    tool = _difference(field, "tool_inertia_kg_m2", measurement.tool_inertia_kg_m2)
-    if tool is not None:
-        value, low, high = tool
+    if "tool_inertia_kg_m2" in differing:
+        value, low, high = _difference(field, "tool_inertia_kg_m2")
         yield Finding(
             kind="tool inertia",
             sentence=(
@@ -83,23 +97,17 @@ def of_instruments(field: Field) -> Iterator[Finding]:
         )
 
 
-def of_beam(field: Field) -> Iterator[Finding]:
+def _of_beam(field: Field, differing: set[Setting]) -> Iterator[Finding]:
     """Find density and stiffness that are not the file's, and modes that lie elsewhere."""
-    measurement, fit = field.comparison.measurement, field.best.fit
-    for name, stated, words in (
-        (
-            "density_over_stiffness",
-            measurement.beam.density_over_stiffness,
-            "Mass per length over bending stiffness (rho/EI)",
-        ),
-        (
-            "bending_stiffness_n_m2",
-            measurement.beam.bending_stiffness_n_m2,
-            "The bending stiffness (EI)",
-        ),
-    ):
-        off = _difference(field, name, stated)
-        if off is None or abs(off[0]) < _BEAM_OFF * stated:
+    fit = field.best.fit
+    beam: tuple[tuple[Setting, str], ...] = (
+        ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
+        ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
+    )
+    for name, words in beam:
+        stated = _stated(field, name)
+        off = _difference(field, name)
+        if name not in differing or abs(off[0]) < _BEAM_OFF * stated:
             continue
         share, low, high = (100 * part / stated for part in off)
         yield Finding(
@@ -133,41 +141,84 @@ def of_beam(field: Field) -> Iterator[Finding]:
         )
 
 
-def of_start(field: Field) -> Iterator[Finding]:
-    """Find that the beam rang when the record began."""
-    ringing = field.best.fit.ringing
-    loudest = max(ringing.amplitude_nm, default=0.0)
+def _of_start(field: Field) -> Iterator[Finding]:
+    """Say that the beam rang when the record began."""
+    loudest = max(field.best.fit.ringing.amplitude_nm)
+    yield Finding(
+        kind="ringing start",
+        sentence=(
+            f"The beam already rang when the record began ({1e3 * loudest:.3g} mN·m); its free "
+            "decay was fitted beside the response and spoils nothing."
+        ),
+        value=loudest,
+        interval=None,
+        unit="N·m",
+        remedy="Wait longer at rest before the sweep.",
+    )
+
+
+def _rings(field: Field) -> bool:
+    """Whether the beam rang at the start, whatever structure it has."""
+    loudest = max(field.best.fit.ringing.amplitude_nm, default=0.0)
     # A hum begins and ends with the record, which looks a little like a decay.
     hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
-    heard = all(
+    return loudest > hum and all(
         of_chi_square(ringing.chi_square, ringing.degrees_of_freedom) > SURE
         for ringing in (c.fit.ringing for c in (field.best, *rivals(field, EVEN)))
         if ringing.degrees_of_freedom
     )
-    if heard and loudest > hum:
-        yield Finding(
-            kind="ringing start",
-            sentence=(
-                f"The beam already rang when the record began ({1e3 * loudest:.3g} mN·m); its free "
-                "decay was fitted beside the response and spoils nothing."
-            ),
-            value=loudest,
-            interval=None,
-            unit="N·m",
-            remedy="Wait longer at rest before the sweep.",
-        )
 
 
-def _difference(field: Field, name: str, stated: float) -> tuple[float, float, float] | None:
-    """By how much a setting differs from what the file states, with ends.
+def _stated(field: Field, name: Setting) -> float:
+    """Give the value of a setting in the file."""
+    measurement = field.comparison.measurement
+    return {
+        "density_over_stiffness": measurement.beam.density_over_stiffness,
+        "bending_stiffness_n_m2": measurement.beam.bending_stiffness_n_m2,
+        "delay_s": measurement.delay_s,
+        "tool_inertia_kg_m2": measurement.tool_inertia_kg_m2,
+    }[name]
 
-    None if that may be chance, or if a structure that the data cannot tell from the best denies it.
+
+def _apart(field: Field, name: Setting) -> bool:
+    """Whether a setting differs from what the file states by more than chance allows.
+
+    So it must in every structure that the data cannot tell from the best.
     """
+    stated = _stated(field, name)
     for candidate in (field.best, *rivals(field, EVEN)):
         fit = candidate.fit
-        std, value = fit.std.get(name), fit.parameters[name] - stated
-        if not std or fit.interval.get(name) is None or abs(value) < SURE * std:
-            return None
-    best = field.best.fit
+        std = fit.std.get(name)
+        if not std or fit.interval.get(name) is None:
+            return False
+        if abs(fit.parameters[name] - stated) < SURE * std:
+            return False
+    return True
+
+
+def _as_stated(field: Field, name: Setting) -> bool:
+    """Whether any structure explains the record about as well with a setting as the file has it.
+
+    A standard deviation tells what is close to the minimum. This tells whether all else, other
+    kinds of damping included, can make up for the setting farther away.
+    """
+    held = replace(field, free=tuple(other for other in field.free if other != name))
+    for candidate in field.candidates:
+        structure, uniform, values = candidate.structure, candidate.uniform, candidate.values
+        unknowns = held.unknowns(structure, uniform)
+        start = vector(unknowns, candidate.fit.plant)
+        saved = field.best.bic + STRONG - (candidate.parameters - 1) * math.log(values)
+        enough = values * math.exp(saved / values)
+        if (
+            held.descent(unknowns, start, 1).promised_cost < enough
+            and held.descent(unknowns, start, _MANY).cost < enough
+        ):
+            return True
+    return False
+
+
+def _difference(field: Field, name: Setting) -> tuple[float, float, float]:
+    """By how much a setting differs from what the file states, with the ends of its interval."""
+    best, stated = field.best.fit, _stated(field, name)
     low, high = best.interval[name] or (stated, stated)
     return best.parameters[name] - stated, low - stated, high - stated

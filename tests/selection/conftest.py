@@ -39,6 +39,21 @@ def link():
 
 
 @cache
+def step(name, amplitude_rad, delay_s=0.0, rest_s=1.0, held_s=10.0):
+    """Step of the motor, held until the record ends."""
+    made = synthesis()
+    t = np.arange(round((rest_s + held_s) * made.RATE_HZ)) / made.RATE_HZ - rest_s
+    asked_rad = np.where(t >= 0, amplitude_rad, 0.0)
+    return made.response(asked_rad, made.PLANTS[name], made.LINK, delay_s, 0.0, ())
+
+
+@pytest.fixture(scope="session")
+def steps():
+    """Make a session with a step: see `step`."""
+    return step
+
+
+@cache
 def extra_torque(name, rise):
     """What mode 1 of plant `name` (damping of order 1) adds when its stiffness rises by `rise`.
 

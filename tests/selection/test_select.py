@@ -8,8 +8,8 @@ import pytest
 from analysis.selection import select
 from analysis.selection.candidates import Field
 from analysis.selection.orders import EVEN
-from analysis.selection.profile import CHI_SQUARE_95
 from analysis.selection.restart import resonances_kept, vector
+from analysis.selection.valleys import CHI_SQUARE_95
 from analysis.structures import STRUCTURES, Structure
 from analysis.whole_record import SETTINGS
 from analysis.whole_record.comparison import Comparison

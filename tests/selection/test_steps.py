@@ -1,0 +1,63 @@
+"""Steps of the motor: what is named is there, and what one mode leaves open is said to be open."""
+
+from dataclasses import replace
+
+import pytest
+
+from analysis.selection.candidates import Field
+from analysis.selection.orders import order_verdict
+from analysis.selection.profile import Profile
+from analysis.selection.sentences import order as order_sentence
+from analysis.selection.stated_otherwise import of_settings
+
+BAND_HZ = (0.0, 50.0)
+
+
+@pytest.fixture(scope="module")
+def without_delay(steps):
+    """Candidates on a step that the beam still rings from, loudly, when the record ends."""
+    return Field.of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8), (), BAND_HZ)
+
+
+def kinds(field):
+    return {found.kind for found in of_settings(field)}
+
+
+def test_a_step_without_a_delay_names_nothing(without_delay):
+    assert kinds(without_delay) == set()
+
+
+def test_a_delay_that_is_there_is_named_in_a_step(steps):
+    field = Field.of(steps("III", 0.3, delay_s=2e-3).measured(noise_nm=0.01, seed=5), (), BAND_HZ)
+    (found,) = of_settings(field)
+    assert found.kind == "delay"
+    assert found.value == pytest.approx(2e-3, abs=3e-4)
+
+
+def test_what_all_else_makes_up_for_is_not_doubted(without_delay):
+    """However sure a fit seems to be of a delay: one that is not there costs next to nothing."""
+    best = without_delay.best
+    sure = replace(best.fit, std={**best.fit.std, "delay_s": 1e-9})
+    field = replace(without_delay, candidates=(replace(best, fit=sure),))
+    assert abs(sure.parameters["delay_s"]) > 5e-9
+    assert kinds(field) == set()
+
+
+def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
+    from analysis.selection.profiles import profiled
+
+    field, alpha, _ = profiled(without_delay)
+    assert len(alpha.valleys) == 1
+    assert alpha.estimate == pytest.approx(field.best.fit.parameters["alpha"], abs=1e-4)
+
+
+def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
+    found = Profile(
+        "lambda", "VII", (0.5, 0.657, 0.9, 1.235, 1.4), (9.0, 0.0, 8.0, 0.8, 9.0), 0.657,
+        (0.657, 1.235), (0.58, 1.3), False, False, 0.0,
+    )  # fmt: skip
+    verdict = order_verdict(without_delay, found, (1,), adequate=True)
+    assert (verdict.status, verdict.value, verdict.interval) == ("not identifiable", None, None)
+    said = order_sentence(verdict, (1,), adequate=True)
+    assert "0.657 and 1.235 explain the record equally well" in said
+    assert "not identifiable" in said

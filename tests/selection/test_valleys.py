@@ -1,0 +1,75 @@
+"""Valleys of a profile: which values the 95 % limit admits, and how many explain it equally."""
+
+import numpy as np
+import pytest
+
+from analysis.selection.profile import Profile
+from analysis.selection.valleys import CHI_SQUARE_95, admitted, crossing, dips, gaps, valleys
+
+VALUES = np.linspace(0.1, 1.9, 361)
+
+
+def double(depth):
+    """Parabolas round 0.6 and 1.3, the second's bottom at `depth`."""
+    first, second = ((VALUES - 0.6) / 0.05) ** 2, ((VALUES - 1.3) / 0.08) ** 2 + depth
+    return np.minimum(first, second)
+
+
+def profile_of(values, deviance):
+    bottoms = valleys(values, deviance)
+    interval, below, above = admitted(values, deviance)
+    return Profile(
+        "lambda", "VII", tuple(values), tuple(deviance), bottoms[0], bottoms, interval, below,
+        above, 0.0,
+    )  # fmt: skip
+
+
+def test_one_valley():
+    found = profile_of(VALUES, double(30.0))
+    half = 0.05 * CHI_SQUARE_95**0.5
+    assert found.valleys == pytest.approx([0.6])
+    assert found.interval == pytest.approx((0.6 - half, 0.6 + half), abs=2e-3)
+    assert found.identifiable
+
+
+def test_a_second_valley_within_the_limit_leaves_the_order_open():
+    found = profile_of(VALUES, double(0.8))
+    assert found.valleys == pytest.approx([0.6, 1.3])  # the lower one first
+    reach = 0.08 * (CHI_SQUARE_95 - 0.8) ** 0.5
+    assert found.interval == pytest.approx((0.6 - 0.05 * CHI_SQUARE_95**0.5, 1.3 + reach), abs=2e-3)
+    assert not found.identifiable
+
+
+def test_narrow_valleys_close_together_are_two_all_the_same():
+    deviance = np.minimum(((VALUES - 0.9) / 0.01) ** 2, ((VALUES - 1.1) / 0.01) ** 2 + 1)
+    found = profile_of(VALUES, deviance)
+    assert found.share < 0.15
+    assert not found.identifiable
+
+
+def test_a_valley_beyond_the_limit_does_not_count():
+    assert valleys(VALUES, double(CHI_SQUARE_95 + 0.1)) == pytest.approx((0.6,))
+
+
+def test_ripples_part_no_valley():
+    ripples = ((VALUES - 0.8) / 0.2) ** 2 + 0.1 * np.sin(VALUES * 200)
+    assert len(valleys(VALUES, ripples - ripples.min())) == 1
+
+
+def test_a_curve_that_never_reaches_the_limit_is_open():
+    interval, below, above = admitted(VALUES, (VALUES - 1) ** 2)
+    assert (interval, below, above) == ((0.1, 1.9), True, True)
+
+
+def test_the_crossing_of_a_parabola_is_exact():
+    assert crossing(1.0, 3.0, 1.0, 9.0) == pytest.approx(CHI_SQUARE_95**0.5)
+
+
+def test_places_to_look_at_lie_outside_of_what_is_known():
+    places = gaps([0.5, 0.9], (0.0, 2.0), 0.2)
+    assert all(place < 0.5 or place > 0.9 for place in places)
+    assert (min(places), max(places)) == pytest.approx((0.1, 1.9))
+
+
+def test_dips_of_a_coarse_curve():
+    assert dips({0.1: 1.0, 0.3: 2.0, 0.5: 1.5, 0.7: 3.0}) == [0.1, 0.5]

@@ -1,0 +1,82 @@
+"""Which modes a record shows: by what a response without their resonance would leave."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from analysis.selection.experiments import experiments
+from analysis.selection.visible import driven, visible_modes
+from analysis.structures import STRUCTURES
+from analysis.whole_record import fit_record
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.noise import Noise
+
+STRONG_NM = 0.05
+
+
+@pytest.fixture(scope="module")
+def seen(sessions):
+    """Find the visible modes of a plant of type III, with its fit, in a noise."""
+
+    def of(noise_nm, band_hz=(0.0, 50.0), torque_of=lambda torque: torque):
+        made = sessions("III")
+        made = type(made)(made.angle_rad, torque_of(made.torque_nm))
+        measured = made.measured(noise_nm=noise_nm, seed=51)
+        analysis = fit_record(measured, [STRUCTURES["III"]], band_hz=band_hz)
+        comparison = analysis.comparison
+        scale = comparison.samples * comparison.decimation.rate_hz / 2
+        noise = Noise(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)
+        return visible_modes(comparison, noise, analysis.fits[0])
+
+    return of
+
+
+def test_a_sharp_mode_shows_in_strong_noise(seen):
+    assert {1, 2} <= set(seen(STRONG_NM))
+
+
+def test_a_mode_drowned_in_noise_does_not_show(seen):
+    assert 2 not in seen(2.0)
+
+
+def test_all_modes_of_the_band_show_in_the_usual_noise(seen):
+    assert seen(0.01) == (1, 2, 3)
+
+
+def test_noise_alone_is_no_mode(seen):
+    assert seen(0.01, torque_of=np.zeros_like) == ()
+
+
+@pytest.mark.parametrize(
+    ("highest_hz", "covered"),
+    [(50.0, True), (10.0, False)],
+)
+def test_whether_a_sweep_reached_the_second_mode(sessions, highest_hz, covered):
+    made = sessions("III")
+    n = made.angle_rad.size
+    t = np.arange(n) / 1000 - 1
+    phase = 2 * np.pi * (0.05 * t + (highest_hz - 0.05) * t**2 / 120)
+    angle = np.where((t >= 0) & (t < 60), 0.025 * np.sin(phase), 0.0)
+    measured = type(made)(angle, made.torque_nm).measured()
+    assert driven(Comparison.of(measured, (0.0, 50.0)), 16.0, 2.55) is covered
+
+
+def test_a_step_is_no_sweep_over_the_second_mode(sessions):
+    made = sessions("III")
+    t = np.arange(made.angle_rad.size) / 1000
+    angle = 0.02 * (1 - np.exp(-80 * np.maximum(t - 1, 0)))
+    measured = type(made)(angle, made.torque_nm).measured()
+    assert not driven(Comparison.of(measured, (0.0, 50.0)), 16.0, 2.55)
+
+
+def test_a_sweep_that_covered_the_mode_is_to_be_louder_not_wider(sessions):
+    measured = sessions("III").measured(noise_nm=1.0, seed=52)
+    analysis = fit_record(measured, [STRUCTURES["III"]])
+    best = SimpleNamespace(fit=analysis.fits[0])
+    field = SimpleNamespace(comparison=analysis.comparison, best=best)
+    unknown = SimpleNamespace(order="alpha", status="not identifiable")
+    (said,) = experiments(field, (unknown,), (1,), (), ())
+    assert "sweep louder" in said
+    assert "not wider" in said
+    assert "sweep up to" not in said

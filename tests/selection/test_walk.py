@@ -1,0 +1,57 @@
+"""Walks along an order: a second valley beyond a high ridge is found."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from analysis.selection.valleys import admitted, valleys
+from analysis.selection.walk import Walk
+
+COUNT = 1000
+BOTTOMS = {0.6: 0.0, 1.4: 1.0}
+WIDTH = 0.05
+
+
+def deviance(order):
+    return min(((order - at) / WIDTH) ** 2 + depth for at, depth in BOTTOMS.items())
+
+
+def cost(order):
+    return COUNT * math.exp(deviance(order) / COUNT)
+
+
+class DoubleWell(Walk):
+    """A walk on a deviance that is known, begun in one of its valleys."""
+
+    def __init__(self, start):
+        self.order, self.structure = "lambda", None
+        self._values, self._place = COUNT, 0
+        self.costs, self._at = {}, {}
+        self._stand_at(self._descend(np.array([start]), 1, hold=False))
+
+    def _descend(self, start, max_evaluations, *, hold):
+        order = float(start[0])
+        if not hold:
+            order = min(BOTTOMS, key=lambda at: ((order - at) / WIDTH) ** 2 + BOTTOMS[at])
+        curvature = SimpleNamespace(hessian=np.array([[1 / WIDTH**2]]))
+        return SimpleNamespace(x=np.array([order]), cost=cost(order), equations=curvature)
+
+    def _tangent(self, value, near):
+        return np.array([value])
+
+
+@pytest.mark.parametrize("start", BOTTOMS)
+def test_both_valleys_are_found_from_either(start):
+    walk = DoubleWell(start)
+    walk.both_ways()
+    assert len(valleys(*walk.curve())) == 1
+    walk.elsewhere()
+    values, found = walk.curve()
+    assert valleys(values, found) == pytest.approx((0.6, 1.4))
+    (low, high), *is_open = admitted(values, found)
+    limit = 3.841458820694124
+    assert low == pytest.approx(0.6 - WIDTH * limit**0.5, abs=3e-3)
+    assert high == pytest.approx(1.4 + WIDTH * (limit - 1) ** 0.5, abs=3e-3)
+    assert is_open == [False, False]
