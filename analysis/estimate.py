@@ -13,6 +13,7 @@ from rigd.spectral import (
     FrequencyResponse,
     SpectralError,
     fft_response,
+    instrumental_response,
     segment_count,
     segment_lengths,
     welch_response,
@@ -20,6 +21,8 @@ from rigd.spectral import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
     from analysis.record import Record
     from analysis.settings import WelchSettings
@@ -64,6 +67,14 @@ def estimate(
         )
         if settings.estimator == "fft":
             response = whole_record
+        elif settings.estimator == "iv":
+            response = instrumental_response(
+                _reference(record)[record.sweep],
+                angle[record.sweep],
+                record.torque_nm[record.sweep],
+                record.rate_hz,
+                **asdict(segmentation),
+            )
         else:
             response = welch_response(
                 angle[record.sweep],
@@ -90,6 +101,17 @@ def estimate(
             "so there is no frequency response there; choose a --band that was excited."
         )
     return response, whole_record
+
+
+def _reference(record: Record) -> NDArray[np.float64]:
+    """Movement asked for, which an imported record may lack."""
+    reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
+    if not reference[record.sweep].any():
+        raise EstimateError(
+            f"{record.path}: the record has no reference that moves, which --frf iv needs; "
+            "choose --frf h1."
+        )
+    return reference
 
 
 def _check_band(record: Record, band_hz: tuple[float, float]) -> None:

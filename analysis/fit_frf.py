@@ -143,6 +143,9 @@ def fit_many(
     )
 
 
+_Linearised = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+
+
 @dataclass(frozen=True, slots=True)
 class _Grid:
     """Points at which model and measurement are compared."""
@@ -152,26 +155,31 @@ class _Grid:
     weights: NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
 class _Problem:
     """Eq. (26) for one structure on one grid, as a function of the unknowns."""
 
-    unknowns: Unknowns
-    grid: _Grid
+    def __init__(self, unknowns: Unknowns, grid: _Grid) -> None:
+        self.unknowns = unknowns
+        self.grid = grid
+        self._newest: tuple[bytes, _Linearised] | None = None
 
     def cost(self, x: NDArray[np.float64]) -> float:
         deviation = self.grid.model.evaluate(self.unknowns.damping(x)) - self.grid.measured
         return float(self.grid.weights @ (deviation.real**2 + deviation.imag**2))
 
-    def deviation_and_jacobian(
-        self, x: NDArray[np.float64]
-    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Model minus measurement, shape (n,), and its derivatives by the unknowns, (k, n)."""
-        model, gradient = self.grid.model.evaluate_with_gradient(
-            self.unknowns.damping(x), self.unknowns.structure.free
-        )
-        jacobian = self.unknowns.derivative_of_parameters(x).T @ gradient
-        return model - self.grid.measured, jacobian
+    def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearised:
+        """Model minus measurement, shape (n,), and its derivatives by the unknowns, (k, n).
+
+        The newest are kept: where a descent ends is where standard deviations are asked for.
+        """
+        place = x.tobytes()
+        if self._newest is None or self._newest[0] != place:
+            model, gradient = self.grid.model.evaluate_with_gradient(
+                self.unknowns.damping(x), self.unknowns.structure.free
+            )
+            jacobian = self.unknowns.derivative_of_parameters(x).T @ gradient
+            self._newest = place, (model - self.grid.measured, jacobian)
+        return self._newest[1]
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         deviation, jacobian = self.deviation_and_jacobian(x)
@@ -191,12 +199,21 @@ def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfF
         minimise(thin.normal_equations, x, lower, upper, relative_tolerance=_THINNED_TOLERANCE)
         for x in starts(structure, thin.cost)
     ]
-    polished = [
-        minimise(
-            full.normal_equations, rough.x, lower, upper, relative_tolerance=_POLISHED_TOLERANCE
-        )
-        for rough in _different(found)[:_POLISHED]
-    ]
+    polished = _different(found)[:_POLISHED]
+    # To the bottom of the few points first, and on with the Hessian learnt there: that leaves one
+    # or two steps on every point.
+    for problem in (thin, full):
+        polished = [
+            minimise(
+                problem.normal_equations,
+                rough.x,
+                lower,
+                upper,
+                relative_tolerance=_POLISHED_TOLERANCE,
+                residual_part=rough.residual_part,
+            )
+            for rough in polished
+        ]
     best = min(polished, key=lambda minimum: minimum.cost)
     parameters = unknowns.parameters(best.x)
     on_edge = (best.x <= lower) | (best.x >= upper)

@@ -4,6 +4,11 @@ For problems of a few unknowns and thousands of residuals, where forming the nor
 cheap and a general solver's overhead (and its import, longer than all the fits of a session) is
 not. Damping after H. B. Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05;
 bounds by projection: an unknown that a step would push through its bound rests there.
+
+Where the model cannot follow the data, what remains is large, and Gauss-Newton's Hessian lacks the
+part that goes with it: near the minimum steps shrink by a constant factor only. That part can be
+learnt from how the gradient changes, by symmetric rank-one updates (J. Nocedal and S. J. Wright,
+"Numerical Optimization", sections 6.2 and 10.3).
 """
 
 from collections.abc import Callable
@@ -34,11 +39,12 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """Where a descent ended."""
+    """Where a descent ended, and what it knows of the Hessian beyond Gauss-Newton's, (k, k)."""
 
     x: NDArray[np.float64]
     cost: float
     evaluations: int
+    residual_part: NDArray[np.float64] | None = None
 
 
 def minimise(
@@ -49,6 +55,7 @@ def minimise(
     *,
     relative_tolerance: float,
     max_evaluations: int = 200,
+    residual_part: NDArray[np.float64] | None = None,
 ) -> Minimum:
     """Descend to a local minimum.
 
@@ -63,8 +70,15 @@ def minimise(
         to be told from rounding.
     max_evaluations : int
         Of `problem`, after which the best point so far is returned.
+    residual_part : ndarray, shape (k, k), optional
+        What the Hessian is thought to have beyond Gauss-Newton's, to be learnt better on the way;
+        zeros if nothing is known. Only for a start close to the minimum: what is learnt from afar
+        misleads. By default Gauss-Newton's Hessian is taken for the whole.
     """
     x = np.clip(start, lower, upper)
+    learns = residual_part is not None
+    if residual_part is None:
+        residual_part = np.zeros((x.size, x.size))
     here = problem(x)
     evaluations = 1
     damping, growth = 1e-3, 2.0
@@ -73,20 +87,27 @@ def minimise(
         free = ~held & (np.diag(here.hessian) > 0)
         if not free.any():
             break
-        hessian = here.hessian[np.ix_(free, free)]
+        full = here.hessian + residual_part
+        if not _is_convex(full[np.ix_(free, free)]):
+            full = here.hessian
+        hessian = full[np.ix_(free, free)]
         # Without the floor an unknown that has next to no effect here would take any step.
-        scale = np.maximum(np.diag(hessian), 1e-14 * np.diag(hessian).max())
+        scale = np.diag(here.hessian)[free]
+        scale = np.maximum(scale, 1e-14 * scale.max())
         step = np.zeros_like(x)
         step[free] = np.linalg.solve(hessian + np.diag(damping * scale), -here.gradient[free])
         trial = np.clip(x + step, lower, upper)
         step = trial - x
-        promised = -float(step @ (2 * here.gradient + here.hessian @ step))
+        promised = -float(step @ (2 * here.gradient + full @ step))
         if float(np.abs(step).max()) < 1e-13 * (1 + float(np.abs(x).max())):
             break
         if 0 <= promised < relative_tolerance * here.cost and damping < 1:
             break
         there = problem(trial)
         evaluations += 1
+        if learns:
+            change = there.gradient - here.gradient - there.hessian @ step
+            residual_part = _learnt(residual_part, step, change)
         gained = here.cost - there.cost
         if gained > 0:
             quality = gained / promised if promised > 0 else 0.0
@@ -98,4 +119,19 @@ def minimise(
             growth *= 2
             if damping > 1e16:
                 break
-    return Minimum(x, here.cost, evaluations)
+    return Minimum(x, here.cost, evaluations, residual_part)
+
+
+def _is_convex(hessian: NDArray[np.float64]) -> bool:
+    return bool(np.linalg.eigvalsh(hessian)[0] > 0)
+
+
+def _learnt(
+    part: NDArray[np.float64], step: NDArray[np.float64], change: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Correct a symmetric matrix by as little as makes it map `step` to `change`."""
+    missing = change - part @ step
+    along = float(missing @ step)
+    if abs(along) <= 1e-8 * float(np.linalg.norm(missing) * np.linalg.norm(step)):
+        return part
+    return part + np.outer(missing, missing) / along

@@ -28,8 +28,9 @@ class WelchSettings:
 
     Attributes
     ----------
-    estimator : {"h1", "h2", "hv", "fft"}
-        "fft" is the ratio of two transforms of the whole record.
+    estimator : {"h1", "h2", "hv", "iv", "fft"}
+        "iv" is Hiv, with the reference as instrument; "fft" is the ratio of two
+        transforms of the whole record.
     segment_length, overlap, nfft : int, optional
         In samples; None takes the paper's durations at the record's rate, or with a segment given
         15 % of it as overlap and a transform no shorter than it.

@@ -61,8 +61,9 @@ def sandwich_covariance(
 
 def _alike(deviation: NDArray[np.complex128]) -> int:
     """Count the neighbouring bins that deviate alike: twice the lag of half the correlation."""
-    n = deviation.size
-    spectrum = np.fft.fft(deviation, 2 * n)
-    correlation = np.fft.ifft(spectrum.real**2 + spectrum.imag**2)[:n].real
-    below_half = np.flatnonzero(correlation < 0.5 * correlation[0])
-    return 1 + 2 * int(below_half[0]) if below_half.size else 1
+    half = 0.5 * np.vdot(deviation, deviation).real
+    # A few lags, so not by transforms: those would cost as much as the model on every point.
+    for lag in range(1, deviation.size):
+        if np.vdot(deviation[:-lag], deviation[lag:]).real < half:
+            return 1 + 2 * lag
+    return 1

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.estimate import SettingsError, estimate, estimate_warnings
+from analysis.estimate import EstimateError, SettingsError, estimate, estimate_warnings
 from analysis.fit_frf import FitError, FrfFit, fit_many
 from analysis.indices import (
     Indices,
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from rigd.spectral import FrequencyResponse, Segmentation
 
 MODES: Final = 3
+LARGEST_SHIFT: Final = 0.1
+"""Of a mode's frequency against the undamped beam's: as much as a damping ratio of 0.4 makes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,9 @@ class FittedModel:
     indices : Indices
     modes : tuple of Mode
         Of the beam alone, from its poles; empty where damping is so strong that one has none.
+    followed : tuple of bool
+        Mode by mode, whether it vibrates, and within `LARGEST_SHIFT` of the undamped beam's
+        frequency. If not, the fit has let go of that resonance: the mode is not the antenna's.
     peaks : tuple of Peak or None
         Resonant peaks of `response`, mode by mode.
     deviations : tuple of PeakDeviation or None
@@ -57,6 +62,7 @@ class FittedModel:
     response: NDArray[np.complex128]
     indices: Indices
     modes: tuple[Mode, ...]
+    followed: tuple[bool, ...]
     peaks: tuple[Peak | None, ...]
     deviations: tuple[PeakDeviation | None, ...]
 
@@ -113,8 +119,9 @@ def analyse(
     SettingsError
         The segments, the band or the weightings make no sense.
     EstimateError
-        The record is too short for the segments, or its angle does not move.
+        Nothing was excited, or the record is too short for the segments.
     """
+    _check_excited(record)
     response, whole_record = estimate(record, settings)
     on_step("frequency response")
     peaks = _peaks(record.beam, response.frequency_hz, response.response)
@@ -149,6 +156,21 @@ def analyse(
     )
 
 
+def _check_excited(record: Record) -> None:
+    """Refuse a record in which the motor did not move, before segments and bands are discussed."""
+    angles = record.angle_rad[record.angle_known]
+    if record.metadata.get("excitation") == "hold":
+        raise EstimateError(
+            f"{record.path}: nothing was excited: the motor was held; record an excitation, such "
+            "as rigd run chirp."
+        )
+    if angles.size == 0 or np.ptp(angles) == 0:
+        raise EstimateError(
+            f"{record.path}: nothing was excited: the angle never changes; check the encoder and "
+            "that the motor moved."
+        )
+
+
 def _judged(
     fit: FrfFit,
     beam: Beam,
@@ -168,11 +190,21 @@ def _judged(
         response=response,
         indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, response),
         modes=found,
+        followed=_followed(found, beam),
         peaks=peaks,
         deviations=tuple(
             None if seen is None or modelled is None else peak_deviation(seen, modelled)
             for seen, modelled in zip(measured_peaks, peaks, strict=True)
         ),
+    )
+
+
+def _followed(found: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
+    """Tell the modes that vibrate about where the undamped beam's do."""
+    undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
+    return tuple(
+        mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_SHIFT
+        for mode, own_hz in zip(found, undamped_hz[: len(found)], strict=True)
     )
 
 

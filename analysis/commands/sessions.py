@@ -86,7 +86,7 @@ def session_command(
         withheld: frozenset[str] = frozenset()
         for subject in subjects:
             console.print(record_text(subject))
-            withheld = subject.verdict.withheld
+            withheld = subject.verdict.unsupported
         console.print(analysis_tables(analyses[0], withheld))
     else:
         console.print(summary_table(analyses))

@@ -21,6 +21,7 @@ class Frf(Enum):
     H1 = "h1"
     H2 = "h2"
     HV = "hv"
+    IV = "iv"
     FFT = "fft"
 
 
@@ -30,7 +31,8 @@ Band = Annotated[
 Estimator = Annotated[
     Frf,
     typer.Option(
-        help="Estimate that is fitted: Welch's H1, H2 or Hv, or one FFT of the whole record."
+        help="Estimate that is fitted: Welch's H1, H2 or Hv, Hiv by way of the reference (noise "
+        "that the controller feeds back is no response then), or one FFT of the whole record."
     ),
 ]
 Segment = Annotated[

@@ -44,7 +44,7 @@ def document(
         lists of flat objects that name their file. Finite numbers only.
     """
     of_records = [_record_entries(subject) for subject in subjects]
-    withheld = {subject.record.path: subject.verdict.withheld for subject in subjects}
+    withheld = {subject.record.path: subject.verdict.unsupported for subject in subjects}
     content: dict[str, Any] = _finite(
         {
             "versions": {

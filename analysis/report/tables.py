@@ -12,20 +12,23 @@ from rich.table import Table
 from rich.text import Text
 
 from analysis.report.html.reported import MARK, footnotes, unreported
+from analysis.welch_route import LARGEST_SHIFT
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     from rich.console import RenderableType
 
     from analysis.indices import Peak
     from analysis.welch_route import FittedModel, WelchAnalysis
+    from rigd.beam import Mode
 
 _COLUMNS: Final = (("zeta", "ζ (1e-5)", 1e5), ("alpha", "α", 1.0), ("gamma", "γ (1e-2)", 1e2),
                    ("lambda", "λ", 1.0))  # fmt: skip
 """Parameter, heading and factor: the powers of ten of the paper's Table 5."""
 _COEFFICIENT: Final = {"zeta": "zeta", "alpha": "zeta", "gamma": "gamma", "lambda": "gamma"}
 _ABSENT: Final = "–"
+_LEFT: Final = "‡"
 
 
 def analysis_tables(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> RenderableType:
@@ -103,15 +106,38 @@ def modes_table(analysis: WelchAnalysis) -> Table:
         for number in range(1, count + 1):
             table.add_column(quantity.format(number), justify="right")
     for model in analysis.models:
-        blank = [_ABSENT] * (0 if model.modes else count)
         table.add_row(
             *_names(model),
-            *(blank or [f"{mode.frequency_hz:.4f}" for mode in model.modes]),
-            *(blank or [f"{100 * mode.damping_ratio:.4g}" for mode in model.modes]),
+            *_of_modes(model, count, lambda mode: f"{mode.frequency_hz:.4f}"),
+            *_of_modes(model, count, lambda mode: f"{100 * mode.damping_ratio:.4g}"),
             end_section=_is_last_of_type(model, analysis.models),
         )
-    table.caption = "from the poles of the fitted model; ξ is the damping ratio"
+    told = ["from the poles of the fitted model; ξ is the damping ratio"]
+    shown = [
+        each for model in analysis.models for each in zip(model.modes, model.followed, strict=True)
+    ]
+    if any(not followed and mode.damping_ratio < 1 for mode, followed in shown):
+        told.append(
+            f"{_LEFT} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the fit does "
+            "not follow this resonance. The number belongs to its curve, not to the antenna."
+        )
+    vibrates = [mode.damping_ratio < 1 for mode, _ in shown]
+    if not all(vibrates) or not all(model.modes for model in analysis.models):
+        told.append(f"{_ABSENT} damped so strongly by this fit that nothing vibrates")
+    table.caption = "\n".join(told)
     return table
+
+
+def _of_modes(model: FittedModel, count: int, text: Callable[[Mode], str]) -> list[str | Text]:
+    """Write something of each mode; what is not the antenna's is marked, or left out."""
+    return [
+        _ABSENT
+        if mode.damping_ratio >= 1
+        else text(mode)
+        if followed
+        else Text(f"{text(mode)}{_LEFT}", style="dim")
+        for mode, followed in zip(model.modes, model.followed, strict=True)
+    ] or [_ABSENT] * count
 
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:

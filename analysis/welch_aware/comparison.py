@@ -83,8 +83,7 @@ class Comparison:
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """H1 of the predicted torque, shape (K,), and its derivatives, shape (k, K)."""
         torque, gradient = self.prediction.torque_between(plant, self.factor, self.places, wrt)
-        found = self.estimator.response(np.vstack((torque, gradient)))
-        return found[0], found[1:]
+        return self.estimator.response(torque), self.estimator.response(gradient)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +97,7 @@ class Measured:
     segmentation: Segmentation
     window: str
     estimated_from: slice
+    reference_rad: NDArray[np.float64] | None = None
 
     def check(self) -> None:
         """Refuse what cannot be used.
@@ -126,6 +126,11 @@ class Measured:
         if not np.isfinite(self.angle_rad).all() or np.ptp(self.angle_rad) == 0:
             raise WelchAwareError(
                 "The angle must be finite at every sample, and move; fill gaps before."
+            )
+        if self.reference_rad is not None and self.reference_rad.shape != self.angle_rad.shape:
+            raise WelchAwareError(
+                "Give one value of the reference for each of the angle; their shapes are "
+                f"{self.reference_rad.shape} and {self.angle_rad.shape}."
             )
         samples = len(range(self.angle_rad.size)[self.estimated_from])
         length, overlap = self.segmentation.segment_length, self.segmentation.overlap
@@ -159,10 +164,16 @@ class Measured:
                 replace(self.segmentation, nfft=self.segmentation.nfft // stride),
                 bins[kept] // stride,
                 self.window,
+                self._instrument,
             ),
             measured=self.response[kept],
             weights=every / every.sum(),
         )
+
+    @property
+    def _instrument(self) -> NDArray[np.float64] | None:
+        """Reference where the response was estimated, if with it."""
+        return None if self.reference_rad is None else self.reference_rad[self.estimated_from]
 
     def _followed_by_rest(self, decimation: Decimation) -> NDArray[np.float64]:
         """Angle at the lower rate with zeros after it, in which the beam's ringing dies.
@@ -179,7 +190,11 @@ class Measured:
         return replace(
             comparison,
             estimator=WelchEstimator(
-                self.angle_rad[self.estimated_from], self.segmentation, bins, self.window
+                self.angle_rad[self.estimated_from],
+                self.segmentation,
+                bins,
+                self.window,
+                self._instrument,
             ),
             measured=self.response,
             weights=weights,

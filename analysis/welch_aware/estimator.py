@@ -1,12 +1,13 @@
-"""Welch's H1 of a fixed input as what it is: a linear map of the output.
+"""Welch's H1 or Hiv of a fixed input as what it is: a linear map of the output.
 
 ::
 
-    H1(f) = sum_k conj(X_k(f)) Y_k(f) / sum_k |X_k(f)|²
+    H(f) = sum_k conj(R_k(f)) Y_k(f) / sum_k conj(R_k(f)) X_k(f)
 
-X_k and Y_k are the transforms of the windowed segments. The input being known, so are its X_k, and
-H1 of any torque costs one transform a segment. That map's transpose tells how much of each sample's
-noise reaches an estimate (`WelchEstimator.transposed`).
+X_k and Y_k are the transforms of the windowed segments, R_k those of the reference for Hiv, and X_k
+itself for H1. Input and reference being known, H of any torque costs one transform a segment. That
+map's transpose tells how much of each sample's noise reaches an estimate
+(`WelchEstimator.transposed`).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class WelchAwareError(ValueError):
 
 
 class WelchEstimator:
-    """H1 from a given angle to any torque, at some bins.
+    """H1 or Hiv from a given angle to any torque, at some bins.
 
     Parameters
     ----------
@@ -43,6 +44,13 @@ class WelchEstimator:
         On the grid ``rate / nfft``; neither 0 nor half the rate.
     window : str
         As `rigd.spectral.welch_response` takes it.
+    reference_rad : ndarray, shape (n,), optional
+        Of an estimate by `rigd.spectral.instrumental_response`, likewise.
+
+    Attributes
+    ----------
+    input_power : ndarray, shape (K,)
+        What the power of white noise, windowed, is divided by on its way to the estimate.
 
     Raises
     ------
@@ -58,6 +66,7 @@ class WelchEstimator:
         segmentation: Segmentation,
         bins: NDArray[np.intp],
         window: str,
+        reference_rad: NDArray[np.float64] | None = None,
     ) -> None:
         length = segmentation.segment_length
         hop = length - segmentation.overlap
@@ -68,16 +77,20 @@ class WelchEstimator:
         self.nfft = segmentation.nfft
         self._segments = [slice(k * hop, k * hop + length) for k in range(count)]
         inputs = np.array([self._spectra(angle_rad, segment) for segment in self._segments])
-        self.input_power = np.sum(inputs.real**2 + inputs.imag**2, axis=0)
-        if not self.input_power.all():
+        instruments = inputs
+        if reference_rad is not None:
+            instruments = np.array([self._spectra(reference_rad, k) for k in self._segments])
+        product = np.sum(instruments.conj() * inputs, axis=0)
+        if not product.all():
             raise WelchAwareError(
                 "The angle has no power at a frequency of the response, so it cannot be the "
                 "response to this angle; give the angle it was estimated from."
             )
-        self._gain = inputs.conj() / self.input_power
+        self._gain = instruments.conj() / product
+        self.input_power = 1 / np.sum(self._gain.real**2 + self._gain.imag**2, axis=0)
 
     def response(self, torque_nm: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """H1 of torques, shape (..., n), in N·m/rad: shape (..., K)."""
+        """H1 or Hiv of torques, shape (..., n), in N·m/rad: shape (..., K)."""
         found = np.zeros((*torque_nm.shape[:-1], self.bins.size), dtype=np.complex128)
         for segment, gain in zip(self._segments, self._gain, strict=True):
             found += gain * self._spectra(torque_nm, segment)

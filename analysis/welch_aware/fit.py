@@ -51,6 +51,7 @@ def fit_welch_aware(
     estimated_from: slice = slice(None),
     window: str = "hamming",
     uniform: bool = True,
+    reference_rad: NDArray[np.float64] | None = None,
 ) -> tuple[WelchAwareFit, ...]:
     """Fit structures to a Welch estimate by putting the model through the same estimator.
 
@@ -70,7 +71,8 @@ def fit_welch_aware(
     frequency_hz : ndarray, shape (K,)
         Increasing, on the estimate's grid; at most 0.4 `rate_hz`.
     measured_response : ndarray of complex, shape (K,)
-        H1 from angle to torque in N·m/rad; a lag of the torque is a negative phase.
+        H1 from angle to torque in N·m/rad, or Hiv with `reference_rad`; a lag of the torque
+        is a negative phase.
     segmentation : Segmentation
         Of the estimate.
     beam : Beam
@@ -92,6 +94,8 @@ def fit_welch_aware(
     uniform : bool
         Whether the beam is taken to be uniform, as Eq. 25 has it; otherwise the stiffness of each
         mode in the band but the first is free as well.
+    reference_rad : ndarray, shape (n,), optional
+        What the motor was asked for, if the estimate is `rigd.spectral.instrumental_response`.
 
     Returns
     -------
@@ -141,7 +145,7 @@ def fit_welch_aware(
     free = tuple(name for name in SETTINGS if name not in fixed)
     measured = Measured(
         np.asarray(angle_rad, dtype=np.float64), rate_hz, frequency_hz, measured_response,
-        segmentation, window, estimated_from,
+        segmentation, window, estimated_from, reference_rad,
     )  # fmt: skip
     measured.check()
     comparison = measured.comparison(weighting)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,6 +15,11 @@ if TYPE_CHECKING:
     from analysis.welch_aware.comparison import Comparison
     from analysis.whole_record.unknowns import Unknowns
 
+    _Linearised = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+
+
+_NONE: Final = np.empty(0, dtype=np.complex128)
+
 
 class Objective:
     """Eq. (26) of one structure and one measured response, as a function of the unknowns.
@@ -24,16 +30,31 @@ class Objective:
     unknowns : Unknowns
     """
 
-    __slots__ = ("comparison", "unknowns")
+    __slots__ = ("_lowest", "comparison", "unknowns")
 
     def __init__(self, comparison: Comparison, unknowns: Unknowns) -> None:
         self.comparison = comparison
         self.unknowns = unknowns
+        self._lowest: tuple[bytes, float, _Linearised] = (b"", math.inf, (_NONE, _NONE))
 
-    def linearise(
-        self, x: NDArray[np.float64]
-    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Model minus measurement, shape (K,), and its derivatives by the unknowns, (k, K)."""
+    def linearise(self, x: NDArray[np.float64]) -> _Linearised:
+        """Model minus measurement, shape (K,), and its derivatives by the unknowns, (k, K).
+
+        Where the cost was lowest they are kept: a descent goes on from there, and the covariance
+        is asked for there. So they are read-only.
+        """
+        place = x.tobytes()
+        if place == self._lowest[0]:
+            return self._lowest[2]
+        found = self._linearise(x)
+        for each in found:
+            each.setflags(write=False)
+        cost = self._cost(found[0])
+        if cost < self._lowest[1]:
+            self._lowest = place, cost, found
+        return found
+
+    def _linearise(self, x: NDArray[np.float64]) -> _Linearised:
         unknowns = self.unknowns
         response, gradient = self.comparison.response(unknowns.plant(x), unknowns.gradient_names)
         return (
@@ -41,13 +62,15 @@ class Objective:
             unknowns.gradient_by_unknowns(x).T @ gradient,
         )
 
+    def _cost(self, deviation: NDArray[np.complex128]) -> float:
+        return float(self.comparison.weights @ (deviation.real**2 + deviation.imag**2))
+
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Cost at `x`, with what a Gauss-Newton step needs."""
         deviation, jacobian = self.linearise(x)
-        weights = self.comparison.weights
-        weighted = jacobian.conj() * weights
+        weighted = jacobian.conj() * self.comparison.weights
         return NormalEquations(
-            cost=float(weights @ (deviation.real**2 + deviation.imag**2)),
+            cost=self._cost(deviation),
             gradient=(weighted @ deviation).real,
             hessian=(weighted @ jacobian.T).real,
         )

@@ -30,7 +30,7 @@ def fit_record_welch_aware(
     ----------
     record : Record
     settings : WelchSettings
-        Of the estimate, with H1; every type with every weighting is fitted.
+        Of the estimate, with H1 or Hiv; every type with every weighting is fitted.
     fixed, uniform
         As `fit_welch_aware` takes them. The delays that the file states are taken out of the
         response: what is found is what they leave.
@@ -43,17 +43,18 @@ def fit_record_welch_aware(
     Raises
     ------
     EstimateError
-        The estimate cannot be made, or is not H1.
+        The estimate cannot be made, or is neither of these.
     WelchAwareError
         It cannot be used.
     """
-    if settings.estimator != "h1":
+    if settings.estimator not in ("h1", "iv"):
         raise SettingsError(
-            f"A Welch-aware fit knows what H1 does to a response, not {settings.estimator!r}; "
-            "choose --frf h1."
+            f"A Welch-aware fit knows what H1 and Hiv do to a response, not "
+            f"{settings.estimator!r}; choose --frf h1 or iv."
         )
     response, _ = estimate(record, settings)
     origin_rad = record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
+    reference = record.reference_rad - record.reference_rad[0]
     fixed = tuple(fixed)
     of_weightings = [
         fit_welch_aware(
@@ -69,6 +70,7 @@ def fit_record_welch_aware(
             tool_inertia_kg_m2=record.tool_inertia_kg_m2,
             estimated_from=record.sweep,
             uniform=uniform,
+            reference_rad=reference if settings.estimator == "iv" else None,
         )
         for weighting in settings.weightings
     ]

@@ -110,8 +110,15 @@ class Prediction:
         """
         growth = np.exp(self._sigma * places / (factor * self.rate_hz))
         spectra = self._response.evaluate(plant, wrt, self._spectrum)
+        # As many short transforms, each of them shifted by a tick, as the factor says: they stay
+        # in the cache, and take less than half the time of a long one.
+        shifts = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
+        shifts[1:] = np.exp(2j * np.pi / (factor * self._length) * np.arange(spectra.shape[1]))
+        np.cumprod(shifts, axis=0, out=shifts)
+        if self._length % 2 == 0:
+            shifts[:, -1] *= 2  # at the longer length this bin and its mirror image are two
         at = np.empty((len(spectra), places.size))
         for row, spectrum in zip(at, spectra, strict=True):
-            row[:] = np.fft.irfft(spectrum, factor * self._length)[places]
-        at *= factor * growth
+            row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[places]
+        at *= growth
         return at[0], at[1:]

@@ -1,9 +1,10 @@
-"""Frequency response estimates from sampled records: Welch (H1, H2, Hv) and whole-record FFT.
+"""Frequency response estimates from sampled records: Welch (H1, H2, Hv, Hiv), whole-record FFT.
 
 Welch's also while the record grows (`rigd.spectral.running`), and a spectrogram that does
 (`rigd.spectral.spectrogram`).
 """
 
+from rigd.spectral.instrumental import instrumental_response
 from rigd.spectral.response import Estimator, FrequencyResponse, SpectralError
 from rigd.spectral.running import RunningEstimate, RunningResponse
 from rigd.spectral.segmentation import (
@@ -37,6 +38,7 @@ __all__ = [
     "Segmentation",
     "SpectralError",
     "fft_response",
+    "instrumental_response",
     "segment_count",
     "segment_lengths",
     "segmentation_of",

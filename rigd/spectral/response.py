@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Estimator = Literal["h1", "h2", "hv", "fft"]
+Estimator = Literal["h1", "h2", "hv", "iv", "fft"]
 
 
 class SpectralError(ValueError):
@@ -28,7 +28,7 @@ class FrequencyResponse:
         Ordinary coherence, 0 to 1; None where fewer than two segments leave it without meaning.
     segments : int
         Number of segments that were averaged.
-    estimator : {"h1", "h2", "hv", "fft"}
+    estimator : {"h1", "h2", "hv", "iv", "fft"}
     """
 
     frequency_hz: NDArray[np.float64]

@@ -106,3 +106,45 @@ def test_never_climbs_and_stops_when_told():
     )
     assert found.evaluations == len(costs) == 7
     assert found.cost == min(costs)
+
+
+misfit = decay_problem(decay([0.3, 2.0])[0] + decay([0.3, 3.0])[0])
+"""One rotation cannot follow two: most of the residual stays."""
+
+
+def test_large_residuals_are_descended_in_fewer_steps_if_the_start_is_near():
+    rough = minimise(misfit, np.array([0.4, 2.3]), *FREE, relative_tolerance=1e-3)
+    plain = minimise(misfit, rough.x, *FREE, relative_tolerance=1e-14)
+    near = minimise(
+        misfit, rough.x, *FREE, relative_tolerance=1e-14, residual_part=np.zeros((2, 2))
+    )
+    assert near.cost > 1.0
+    assert near.cost <= plain.cost * (1 + 1e-13)
+    np.testing.assert_allclose(near.x, plain.x, rtol=1e-6)
+    assert near.evaluations <= plain.evaluations / 2
+    again = minimise(
+        misfit, rough.x, *FREE, relative_tolerance=1e-14, residual_part=near.residual_part
+    )
+    np.testing.assert_allclose(again.x, near.x, rtol=1e-6)
+    assert again.evaluations < near.evaluations
+
+
+def test_the_residual_part_is_what_the_second_derivatives_make_of_the_residual():
+    near = minimise(
+        misfit, np.array([0.3, 2.4]), *FREE, relative_tolerance=1e-16,
+        residual_part=np.zeros((2, 2)),
+    )  # fmt: skip
+    gradients = [
+        (misfit(near.x + h).gradient - misfit(near.x - h).gradient) / 2e-5 for h in 1e-5 * np.eye(2)
+    ]
+    beyond = np.array(gradients) - misfit(near.x).hessian
+    assert np.abs(beyond).max() > 0.05 * np.abs(misfit(near.x).hessian).max()
+    np.testing.assert_allclose(near.residual_part, beyond, atol=0.05 * np.abs(beyond).max())
+
+
+def test_what_was_learnt_wrongly_does_no_harm():
+    found = minimise(
+        rosenbrock, np.array([1.2, 1.3]), *FREE, relative_tolerance=1e-14,
+        residual_part=np.array([[-900.0, 0.0], [0.0, 300.0]]),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-6)

@@ -35,7 +35,7 @@ def test_exact_data_give_exact_damping(session, plants, name, weighting):
     assert fit.cost < 1e-6
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(
     internal_size=st.floats(-2.7, -1.7).map(lambda power: 10**power),
     external_size=st.floats(-2.5, -1.0).map(lambda power: 10**power),

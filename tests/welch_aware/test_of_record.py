@@ -25,6 +25,13 @@ def test_the_rig_s_damping_is_found(record):
     assert six.cost < three.cost / 2
 
 
-def test_only_h1_is_known(record):
-    with pytest.raises(SettingsError, match="'h2'; choose --frf h1"):
+def test_only_h1_and_hiv_are_known(record):
+    with pytest.raises(SettingsError, match="'h2'; choose --frf h1 or iv"):
         fit_record_welch_aware(record, WelchSettings(estimator="h2"))
+
+
+def test_hiv_of_the_rig_s_session_has_the_same_damping(record):
+    settings = WelchSettings(estimator="iv", types=("VI",), weightings=("omega",))
+    (six,) = fit_record_welch_aware(record, settings)
+    for name, value in TRUTH.items():
+        assert abs(six.parameters[name] - value) < 4 * six.std[name], name

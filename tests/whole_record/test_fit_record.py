@@ -276,14 +276,12 @@ def test_a_wrong_structure_takes_few_evaluations(sessions, monkeypatch):
     monkeypatch.setattr(
         Objective, "_linearise", lambda self, x: asked.append(1) or linearise(self, x)
     )
-    for plant in ("VI", "IV"):
+    for plant, wrong in (("VI", ("II", "IV", "V")), ("IV", ("II", "V"))):
         measurement = sessions(plant).measured(noise_nm=1e-2, seed=1)
-        for name in ("II", "IV", "V", "VI"):
+        for name in (plant, *wrong):
             asked.clear()
             fit(measurement, name)
-            assert len(asked) <= 30, (plant, name)
-            if name == plant:
-                assert len(asked) <= 12
+            assert len(asked) <= (12 if name == plant else 30), (plant, name)
 
 
 def test_a_tool_without_inertia(sessions):

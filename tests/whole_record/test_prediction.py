@@ -74,3 +74,20 @@ def test_between_the_samples_it_is_the_same(plant):
     at, gradient_at = prediction.torque_between(plant, 8, np.arange(0, 3200, 8), WRT)
     assert np.abs(at - torque).max() < 1e-3 * torque.std()
     assert (np.abs(gradient_at - gradient).max(axis=1) < 1e-3 * gradient.std(axis=1)).all()
+
+
+@pytest.mark.parametrize("factor", [2, 3, 8])
+def test_between_the_samples_it_is_that_of_more_samples(plant, factor):
+    def angle(rate_hz):
+        time_s = np.arange(round(3.2 * rate_hz)) / rate_hz
+        waves = np.sin(2 * np.pi * 7.3 * time_s) + np.cos(2 * np.pi * 31.0 * time_s)
+        return np.sin(np.pi * time_s / 3.2) ** 8 * waves  # nothing at half the rate
+
+    fine = Prediction(angle(factor * 125.0), factor * 125.0, slice(0, factor * 400))
+    torque, gradient = fine.torque(plant, WRT)
+    places = np.arange(1, torque.size, 5)
+    coarse = Prediction(angle(125.0), 125.0, slice(0, 400))
+    at, gradient_at = coarse.torque_between(plant, factor, places, WRT)
+    assert np.abs(at - torque[places]).max() < 1e-6 * torque.std()
+    apart = np.abs(gradient_at - gradient[:, places]).max(axis=1)
+    assert (apart < 1e-6 * gradient.std(axis=1)).all()

@@ -133,7 +133,12 @@ def _record_fit_facts(subject: Subject) -> list[tuple[str, str]]:
 def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
     settings, used, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
-    estimator = {"h1": "Welch, H1", "h2": "Welch, H2", "hv": "Welch, Hv"}.get(settings.estimator)
+    estimator = {
+        "h1": "Welch, H1",
+        "h2": "Welch, H2",
+        "hv": "Welch, Hv",
+        "iv": "Welch, Hiv by way of the reference",
+    }.get(settings.estimator)
     facts = [
         ("estimator", estimator or "ratio of the transforms of the whole record"),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {len(response.frequency_hz)} bins"),

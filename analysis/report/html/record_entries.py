@@ -60,7 +60,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
                 **name,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
-                "withheld": sorted(unreported(fit.structure, subject.verdict.withheld)),
+                "withheld": sorted(unreported(fit.structure, subject.verdict.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
                     key: None if ends is None else list(ends) for key, ends in fit.interval.items()

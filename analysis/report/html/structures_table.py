@@ -21,7 +21,7 @@ _DAMPING = ("zeta", "alpha", "gamma", "lambda")
 def structures_table(subject: Subject) -> Table:
     """All fits beside each other; orders that the data do not support are marked in each."""
     lowest = min(fit.cost for fit in subject.fits.values())
-    withheld = subject.verdict.withheld
+    withheld = subject.verdict.unsupported
     delta_bic = subject.verdict.delta_bic
     rows: list[tuple[Cell, ...]] = []
     for name, fit in subject.fits.items():

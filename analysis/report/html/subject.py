@@ -44,6 +44,11 @@ class Verdict:
     orders: tuple[OrderVerdict, ...] = ()
     visible: tuple[int, ...] | None = None
 
+    @property
+    def unsupported(self) -> frozenset[str]:
+        """Orders that no fit of this record can tell: those withheld, and of absent damping."""
+        return self.withheld | {each.order for each in self.orders if each.value is None}
+
     @classmethod
     def of(cls, selection: Selection) -> Verdict:
         """Take over what `analysis.selection` says."""

@@ -98,7 +98,7 @@ def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Tab
     of_paper = (
         ()
         if welch is None
-        else (welch_fits_table(welch, subject.verdict.withheld), peaks_table(welch))
+        else (welch_fits_table(welch, subject.verdict.unsupported), peaks_table(welch))
     )
     return modes_table(subject), tables, of_paper
 

@@ -64,6 +64,25 @@ def test_tables_mark_every_such_number_and_no_other(careful):
     assert "does not show" in modes.notes[0]
 
 
+def test_of_absent_damping_no_fit_tells_the_order(record_subject):
+    """Selected is a structure without external damping: types V, VI and VII have a lambda."""
+    absent = SimpleNamespace(order="lambda", status="absent", value=None, interval=None)
+    known = SimpleNamespace(order="alpha", status="fractional", value=0.8, interval=(0.7, 0.9))
+    verdict = replace(record_subject.verdict, orders=(known, absent))
+    subject = replace(record_subject, verdict=verdict)
+    assert not verdict.withheld
+    assert verdict.unsupported == {"lambda"}
+    _modes, (*_others, structures), (welch, _peaks) = report_tables(subject)
+    for table, first, of_type in ((structures, 1, 0), (welch, 2, 0)):
+        assert any(MARK in note and "λ" in note for note in table.notes)
+        for row in table.rows:
+            marks = [MARK in cell.text for cell in row[first : first + 8 : 2]]
+            external = row[of_type] not in ("I", "IV")
+            assert marks == [False, False, external, external]
+    for fit in document([subject.welch], subjects=[subject])["fits"]:
+        assert fit["withheld"] == ([] if fit["type"] in ("I", "IV") else ["gamma", "lambda"])
+
+
 def test_nothing_is_marked_where_all_is_supported(record_subject):
     modes, tables, of_paper = report_tables(record_subject)
     for table in (modes, *tables, *of_paper):

@@ -1,0 +1,165 @@
+"""What a controller that feeds the sensor's noise back does to frequency responses and fits.
+
+The controller feeds the measured torque forward, so the motor moves with the sensor's noise. N
+sessions (``--sessions``) of one plant (``--plant``) are made exactly, with a chirp as the paper's
+or a multisine (``--multisine``); each twice with the same noise, once as the controller lets it
+move the motor and once in the torque alone. For every estimator and parameter are printed
+
+* loop: mean difference of the two, which is what the feedback did, nothing else being different;
+* mean error, of the session under the controller;
+
+both in standard deviations between sessions. Plain fits are those of the paper with 1/omega
+weights, beam and clamp being known; Welch-aware ones have density, stiffness, delay and clamp free.
+The motor (2e-3 kg m², a loop of 80 rad/s, one tick late) is that of tests/whole_record.
+"""
+
+import argparse
+from dataclasses import dataclass, field
+
+import numpy as np
+from bench_welch_aware import PLANTS
+from exact_sessions import BAND_HZ, LINK, RATE_HZ, SWEEP
+from numpy.typing import NDArray
+
+from analysis.fit_frf import fit_frf
+from analysis.structures import STRUCTURES
+from analysis.welch_aware import fit_welch_aware
+from analysis.whole_record import Plant
+from analysis.whole_record.response import ResponseGrid
+from rigd.spectral import FrequencyResponse, Segmentation, instrumental_response, welch_response
+
+SAMPLES = 136_000
+NOISE_NM = 1e-2
+CLAMP_KG_M2 = 1e-5
+DECAY = np.exp(-5.0 * np.arange(SAMPLES) / SAMPLES)
+S = 5.0 * RATE_HZ / SAMPLES + 2j * np.pi * np.fft.rfftfreq(4 * SAMPLES, 1 / RATE_HZ)
+Real = NDArray[np.float64]
+
+
+def reference_rad(*, multisine: bool) -> Real:
+    """Return the paper's chirp, or 12 periods of 10 s with lines from 0.5 to 50 Hz."""
+    t = np.arange(SAMPLES) / RATE_HZ - 1
+    during = (t >= 0) & (t < 120)
+    if not multisine:
+        return np.where(during, 0.025 * np.sin(2 * np.pi * (0.05 * t + 49.95 * t**2 / 240)), 0.0)
+    line_hz = np.arange(5, 501) / 10
+    phases = np.random.default_rng(3).uniform(0, 2 * np.pi, line_hz.size)
+    period = np.cos(2 * np.pi * line_hz * t[during][:10_000, None] + phases).sum(axis=1)
+    reference = np.zeros(SAMPLES)
+    reference[during] = np.tile(0.01 / np.abs(period).max() * period, 12)
+    return reference
+
+
+def answer(spectrum: NDArray[np.complex128]) -> Real:
+    """Back to samples."""
+    samples: Real = np.fft.irfft(spectrum, 4 * SAMPLES)[:SAMPLES] / DECAY
+    return samples
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """What one session's instruments give."""
+
+    reference_rad: Real
+    angle_rad: Real
+    torque_nm: Real
+
+    def response(self, estimator: str) -> FrequencyResponse:
+        """Take one of Welch's estimates, in the paper's band."""
+        angle, torque = self.angle_rad[SWEEP], self.torque_nm[SWEEP]
+        if estimator == "iv":
+            found = instrumental_response(self.reference_rad[SWEEP], angle, torque, RATE_HZ)
+        else:
+            found = welch_response(angle, torque, RATE_HZ, estimator=estimator)
+        return found.band(*BAND_HZ)
+
+
+class Rig:
+    """One plant under one excitation."""
+
+    def __init__(self, name: str, *, multisine: bool) -> None:
+        self.plant = Plant(LINK, PLANTS[name], 0.0, CLAMP_KG_M2)
+        self.reference = reference_rad(multisine=multisine)
+        loop = 2 * np.pi * 20
+        moved = np.fft.rfft(self.reference * DECAY, 4 * SAMPLES)
+        moved = moved / (1 + 1.4 * S / loop + (S / loop) ** 2)
+        self.grid = ResponseGrid(S)
+        self.angle = answer(moved)
+        self.torque = answer(self.grid.evaluate(self.plant, angle=moved)[0])
+        self.turned = 500 * S * (S + 310) / (S + 80) ** 4 * np.exp(-S / RATE_HZ)
+        self.answered = self.grid.evaluate(self.plant, angle=self.turned)[0]
+
+    def session(self, seed: int, *, fed_back: bool) -> Records:
+        """Measure with noise that does or does not move the motor."""
+        noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=SAMPLES)
+        angle, torque = self.angle, self.torque + noise
+        if fed_back:
+            spectrum = np.fft.rfft(noise * DECAY, 4 * SAMPLES)
+            angle = angle + answer(spectrum * self.turned)
+            torque = torque + answer(spectrum * self.answered)
+        return Records(self.reference, angle, torque)
+
+
+@dataclass(slots=True)
+class Found:
+    """Values by estimator and parameter: one for every session."""
+
+    values: dict[tuple[str, str], list[float]] = field(default_factory=dict)
+
+    def add(self, estimator: str, parameters: dict[str, float], names: tuple[str, ...]) -> None:
+        """Keep one session's."""
+        for name in names:
+            self.values.setdefault((estimator, name), []).append(parameters[name])
+
+
+def fit_all(records: Records, name: str, found: Found, only: str | None) -> None:
+    """Fit one session every way, or in one kind of ways only."""
+    structure = STRUCTURES[name]
+    for estimator in () if only == "aware" else ("h1", "h2", "hv", "iv"):
+        frf = records.response(estimator)
+        fit = fit_frf(
+            frf.frequency_hz, frf.response, LINK, structure, "omega",
+            tool_inertia_kg_m2=CLAMP_KG_M2,
+        )  # fmt: skip
+        found.add(estimator, dict(fit.parameters), structure.free)
+    for estimator in () if only == "plain" else ("h1", "iv"):
+        frf = records.response(estimator)
+        (fit,) = fit_welch_aware(
+            records.angle_rad, RATE_HZ, frf.frequency_hz, frf.response, Segmentation(), LINK,
+            [structure], tool_inertia_kg_m2=CLAMP_KG_M2, estimated_from=SWEEP,
+            reference_rad=records.reference_rad if estimator == "iv" else None,
+        )  # fmt: skip
+        found.add(f"aware {estimator}", dict(fit.parameters), tuple(fit.std))
+
+
+def main() -> None:
+    """Print the errors of one plant."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sessions", type=int, default=40)
+    parser.add_argument("--plant", choices=PLANTS, default="VI")
+    parser.add_argument("--multisine", action="store_true", help="in place of the chirp")
+    parser.add_argument("--only", choices=("plain", "aware"), help="one kind of fits")
+    given = parser.parse_args()
+    rig = Rig(given.plant, multisine=given.multisine)
+    fed, apart = Found(), Found()
+    for seed in range(given.sessions):
+        fit_all(rig.session(seed, fed_back=True), given.plant, fed, given.only)
+        fit_all(rig.session(seed, fed_back=False), given.plant, apart, given.only)
+    print(f"Type {given.plant}, {'multisine' if given.multisine else 'chirp'}, ", end="")
+    print(f"{given.sessions} sessions; in standard deviations between sessions:")
+    for (estimator, name), values in fed.values.items():
+        under, alone = np.array(values), np.array(apart.values[estimator, name])
+        std = float(alone.std(ddof=1))
+        if std == 0:
+            continue
+        loop = (under - alone) / std
+        uncertain = loop.std(ddof=1) / np.sqrt(loop.size)
+        error = float(under.mean() - rig.plant.parameters[name]) / std
+        print(
+            f"  {estimator:9} {name:24} loop {loop.mean():+8.2f} ± {uncertain:.2f}   "
+            f"mean error {error:+9.2f}   one std {std:.3g}"
+        )
+
+
+if __name__ == "__main__":
+    main()
