@@ -25,9 +25,10 @@ check: $(VENV)/ready
 bench: $(VENV)/ready
 	for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
 
-# The long run of what the tests do briefly: a million frames at each parser, and 1200 damaged
-# session files; some minutes.
+# The long run of what the tests do briefly: other examples of each property, a million frames at
+# each parser, and 1200 damaged session files; some minutes.
 fuzz: $(VENV)/ready
+	$(BIN)/python -m pytest -n auto --dist worksteal -m hypothesis --hypothesis-profile=others
 	$(BIN)/python tests/devices/cia402/fuzz_cia402.py 1000000
 	$(BIN)/python tests/devices/ati/fuzz_ati.py 1000000
 	$(BIN)/python tests/sim/wire/drive/fuzz_drive_node.py 1000000

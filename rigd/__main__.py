@@ -10,7 +10,21 @@ def main() -> None:
     _fill_standard_descriptors()
     from rigd.cli.app import main as run
 
-    run()
+    try:
+        run()
+    finally:
+        _be_past_stopping()
+
+
+def _be_past_stopping() -> None:
+    """Let signals pass from now on: an operator may press once more, and has been heard.
+
+    Python gives each signal that is handled its default action back before it has cleaned up, and
+    would end by it.
+    """
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _fill_standard_descriptors() -> None:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 pytest_plugins = ["standstill"]
 
@@ -28,6 +29,12 @@ os.environ.update(
 _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
+
+# The same examples each time, and however long they take: what fails is a change's fault. Others
+# are searched for by `make fuzz`.
+settings.register_profile("same", settings.get_profile("ci"))
+settings.register_profile("others", settings.get_profile("ci"), derandomize=False)
+settings.load_profile("same")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

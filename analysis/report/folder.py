@@ -72,14 +72,14 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """
     part = folder.with_name(f".{folder.name}.part-{os.getpid()}")
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        part.mkdir()
-    except OSError as error:
-        raise OutputError(
-            f"The report {folder} cannot be written: {error.strerror or error}. "
-            "Choose a folder with --report."
-        ) from error
-    try:
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            part.mkdir()
+        except OSError as error:
+            raise OutputError(
+                f"The report {folder} cannot be written: {error.strerror or error}. "
+                "Choose a folder with --report."
+            ) from error
         yield part
         try:
             part.rename(folder)

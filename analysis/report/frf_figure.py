@@ -33,6 +33,7 @@ _ESTIMATORS: Final = {
     "h1": "Welch, H1",
     "h2": "Welch, H2",
     "hv": "Welch, Hv",
+    "iv": "Welch, Hiv",
     "fft": "whole-record FFT",
 }
 

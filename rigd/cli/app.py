@@ -10,7 +10,7 @@ import typer
 from rigd.cli.bench import bench
 from rigd.cli.check import check, reset
 from rigd.cli.daemon import status, stop, tare, zero
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
+from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, interrupt
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
 from rigd.cli.live import live
@@ -50,7 +50,7 @@ app.command()(inject)
 
 def main() -> None:
     """Entry point of ``rigd``."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, interrupt)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that does not know "·" or "²" gets a "?" instead of an error.
         if isinstance(stream, io.TextIOWrapper):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.exits import EXIT_FAILED, fail
+from rigd.cli.exits import EXIT_FAILED, fail, interrupt
 from rigd.cli.options import AsJson, ProfileName, profile_named
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def bench(
     Example: rigd bench --seconds 10
     """
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
     from rigd.engine.process import SINGLE_THREADED
 
     os.environ.update(SINGLE_THREADED)

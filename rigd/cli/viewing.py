@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.cli.exits import EXIT_FAILED, fail
+from rigd.cli.exits import EXIT_FAILED, fail, interrupt
 
 if TYPE_CHECKING:
     from rigd.live.address import LiveAddress
@@ -47,7 +47,7 @@ def scratch_folder() -> Iterator[Path]:
 def ended_gently() -> Iterator[None]:
     """Have every way of being asked to end mean Ctrl-C, so that temporary files go too."""
     asked = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, signal.default_int_handler) for number in asked]
+    before = [signal.signal(number, interrupt) for number in asked]
     try:
         yield
     finally:

@@ -8,6 +8,7 @@ from rigd.engine.channels import Channels
 from rigd.engine.clocks import Clock
 from rigd.engine.cycle import Cycle
 from rigd.engine.metronome import Metronome
+from rigd.engine.processes import Pulse
 from rigd.engine.ring import Ring
 from rigd.engine.topics import CONTROL
 from rigd.session.format import (
@@ -167,7 +168,10 @@ class SampleLog:
         ring.publish()
 
     def _wait_for_room(self) -> int:
-        deadline = time.monotonic() + _ROOM_PATIENCE_S
-        while (offset := self._ring.slot()) < 0 and time.monotonic() < deadline:
+        """Wait for the recorder, unless it has not read for long while the computer ran."""
+        ring, recorder = self._ring, Pulse()
+        while (offset := ring.slot()) < 0:
+            if recorder.look(ring.read, time.monotonic()) > _ROOM_PATIENCE_S:
+                break
             time.sleep(_ROOM_POLL_S)
         return offset

@@ -105,11 +105,15 @@ class PageServer:
     ) -> None:
         self._server = _Server(port, address, upstream)
         self.port = self._server.server_port
-        threading.Thread(target=self._server.serve_forever, args=(_LOOK_S,), daemon=True).start()
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(_LOOK_S,), daemon=True
+        )
+        self._thread.start()
 
     def close(self) -> None:
         """Take no more connections."""
         self._server.shutdown()
+        self._thread.join()
         self._server.server_close()
 
 

@@ -33,6 +33,8 @@ _QUIET: Mapping[str, str] = {
 }
 _LISTENING = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
 _SERVING_PAGE = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
+_MOMENT_S: Final = 0.5
+_MOST_READING_S: Final = 10.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -107,7 +109,8 @@ class RerunProgram:
     @property
     def last_words(self) -> str:
         """The last lines of its log."""
-        self._reader.join(timeout=0.5)
+        # To its end, if it has one: what a program says last is read when it has long ended.
+        self._reader.join(timeout=_MOMENT_S if self.running else _MOST_READING_S)
         return " ".join(self._last_lines) or "it said nothing"
 
     def kill(self) -> None:

@@ -27,6 +27,8 @@ _POLL_S = 0.05
 _PATIENCE_S = 5.0
 _SLOW_PATIENCE_S = 30.0
 """For enabling a drive and for switching it off, which may take its time."""
+_START_PATIENCE_S = 30.0
+"""For a recorder that is only starting, on a computer that is busy; nothing moves yet."""
 _MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
@@ -205,7 +207,7 @@ class Session:
             job = RecorderJob(self._order.path, crew.channels.specs)
             crew.fresh(RECORDER).start(job)
             try:
-                self._ask_recorder("opened")
+                self._ask_recorder("opened", _START_PATIENCE_S)
             except _NameTakenError as error:
                 taken = error
                 self._order = replace(self._order, path=another_path(self._order.path))

@@ -62,6 +62,7 @@ KEPT_S = 0.3
 """No sample older than this at the moment of the kill may be lost."""
 _TRANSPORT_S = 5e-3
 """A torque stands in the drive's log a tick after its sample, on a grid half a tick off."""
+_STARTED_S = 60.0
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
 
@@ -206,7 +207,7 @@ class Scene:
         where = ["--profile", profile, "--output", self.sessions, *(["--live"] if live else [])]
         if daemon:
             self.supervisor = self._start("serve", *where)
-            wait_for(lambda: self.state == "ready", 30.0, "daemon that is ready")
+            wait_for(lambda: self.state == "ready", _STARTED_S, "daemon that is ready")
             self.session = self._start("start", "chirp", *options)
         else:
             self.session = self.supervisor = self._start("run", "chirp", *where, *options)
@@ -236,7 +237,7 @@ class Scene:
     def _await_simulator(self) -> float:
         """Wait until it can be found; return its time at the zero of the monotonic clock."""
         with _environ(XDG_RUNTIME_DIR=str(self._runtime)):
-            wait_for(lambda: find_simulator("antenna_can"), 20.0, "simulator")
+            wait_for(lambda: find_simulator("antenna_can"), _STARTED_S, "simulator")
             address = find_simulator("antenna_can")
         assert address is not None
         origins = []
@@ -308,7 +309,7 @@ class Scene:
 
     def end_simulator(self) -> None:
         self.simulator.send_signal(signal.SIGTERM)
-        self.simulator.wait(10.0)
+        self.simulator.wait(_ENDED_S)
         self.log.look()
 
     def close(self) -> None:
@@ -341,7 +342,7 @@ def play(case: Case, folder: Path) -> Verdict:
 def _play(case: Case, scene: Scene) -> Verdict:
     verdict = Verdict(case)
     if not case.anywhere:
-        wait_for(scene.recording, 30.0, "record")
+        wait_for(scene.recording, _STARTED_S, "record")
     time.sleep(case.moment_s)
     wait_for(lambda: scene.find(case.victim) or _ended(scene), 10.0, case.victim)
     if _ended(scene):

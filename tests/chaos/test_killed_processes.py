@@ -28,8 +28,8 @@ def rig():
         ("all", signal.SIGKILL, 0.6, {"analysed": True}),
         # The others have to go on by themselves, for the drive's sake and for the file's.
         ("all", signal.SIGSTOP, 0.4, {"afterwards": signal.SIGKILL}),
-        ("recorder", signal.SIGSTOP, 0.3, {"sweep_s": 0.5}),
-        ("publisher", signal.SIGKILL, 0.3, {"sweep_s": 1.0}),
+        ("recorder", signal.SIGSTOP, 0.3, {"sweep_s": 1.5}),
+        ("publisher", signal.SIGKILL, 0.3, {"sweep_s": 1.5}),
         ("supervisor", signal.SIGSTOP, 0.3, {}),
     ],
 )

@@ -1,7 +1,6 @@
 """``rigd live``: which view it finds, what it says where there is none, how it opens a window."""
 
 import json
-import threading
 import time
 from dataclasses import replace
 
@@ -102,12 +101,10 @@ def test_of_several_views_one_has_to_be_named(rigd_here, view, write_profile):
     assert rigd_here("live", "--web", "--profile", file).stdout == "http://127.0.0.1:1234\n"
 
 
-def test_it_waits_if_it_is_to(rigd_here, nobody_else):
+def test_it_waits_if_it_is_to(rigd_here, nobody_else, monkeypatch):
     address = LiveAddress.of_this_process("sim", grpc_port=9876, page_port=9090, server=1)
-    later = threading.Timer(0.2, announce, [address])
-    later.start()
+    monkeypatch.setattr("time.sleep", lambda _: announce(address))  # while it waits
     done = rigd_here("live", "--web", "--wait")
-    later.join()
     assert (done.returncode, done.stdout) == (0, "http://127.0.0.1:9090\n")
     assert "Waiting for a live view to begin; Ctrl-C ends." in done.stderr
 

@@ -98,7 +98,7 @@ def test_beam_and_delay_follow_the_computed_loop(loop_model):
     )
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     actuation=st.integers(0, 20),
     angle=st.integers(0, 18),

@@ -138,7 +138,7 @@ def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
             assert margins.modulus <= 1.001 * np.min(distance)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(
     pole_rad_s=st.floats(50.0, 110.0),
     feedforward=st.floats(0.85, 1.1),

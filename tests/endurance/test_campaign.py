@@ -1,5 +1,6 @@
 """A short campaign of ``run_campaign.py``'s kind, and that it would notice what grows."""
 
+import gc
 import importlib.util
 import os
 import random
@@ -37,6 +38,7 @@ def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
     control = crew[CONTROL].pid
     rig = Rig(profile, fast=True, crew=crew)
     looks = []
+    gc.collect()  # of other tests in this process: it would free what counts here
     try:
         rig.connect()
         for number in range(6):
@@ -47,8 +49,8 @@ def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
     finally:
         rig.disconnect()
     for warm, last in zip(looks[1], looks[-1], strict=True):
-        assert last.descriptors == warm.descriptors
-        assert last.shared_kb == warm.shared_kb
+        assert last.descriptors <= warm.descriptors
+        assert last.shared_kb <= warm.shared_kb
         assert last.private_kb - warm.private_kb < COARSE_KB
     assert not list(tmp_path.glob("*.part"))
 

@@ -69,16 +69,17 @@ def test_due_times_go_on_evenly_through_a_restart():
 
 def test_real_deadlines_do_not_drift_with_the_work():
     metronome = Metronome(RealClock(), 500.0)
-    first = time.monotonic_ns()
-    missed = 0
+    start_ns = metronome.start_ns
+    missed, behind_ns = 0, []
     for _ in range(50):
         missed += metronome.wait()
+        behind_ns.append(time.monotonic_ns() - start_ns - 2_000_000 * metronome.tick)
         time.sleep(0.0005)
-    elapsed_s = (time.monotonic_ns() - first) * 1e-9
-    # A loop that slept "period minus nothing" after its work would need a quarter more.
     assert metronome.tick == 50 + missed
-    assert elapsed_s < (metronome.tick + 3) / 500.0 + metronome.lateness_ns * 1e-9
-    assert elapsed_s > (metronome.tick - 1) / 500.0
+    assert min(behind_ns) >= 0
+    # A loop that slept a whole period after its work would be twenty milliseconds behind by now.
+    # This one may lose the processor, but hardly each time between waking and looking at the clock.
+    assert min(behind_ns[-10:]) < 2_000_000
 
 
 def test_spinning_ends_the_wait_at_the_deadline_and_not_before():

@@ -1,7 +1,9 @@
 """A session from rest to rest, and every way out of it: the torque is off, the books balance."""
 
+import itertools
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -360,6 +362,38 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
     assert session.drive.torques[-1] != 0.0
     assert samples["status"][-1] & Status.AFTER_LOST
     assert samples["status"][-1] & Status.TORQUE_OFF
+
+
+def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, monkeypatch):
+    """Under the virtual clock it is waited for; here it reads once the ring has been full."""
+    profile = make_session().profile
+    session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
+    now_s, taken = [0.0], []
+
+    def stand_still(_):
+        now_s[0] += 5.0
+        if len(taken) < 2:  # the first time the recorder stands still as well
+            taken.append(b"" if not taken else session.channels.samples.take(8000))
+
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=stand_still)
+    monkeypatch.setattr("rigd.engine.sample_log.time", clock)
+    session.run()
+    assert session.finished["finished"] == "complete", session.finished["reason"]
+    samples = np.concatenate([decode_samples(taken[1]), session.samples])
+    assert samples["tick"].tolist() == list(range(session.finished["counts"]["scheduled"]))
+
+
+def test_a_recorder_that_does_not_read_is_not_waited_for_for_ever(make_session, monkeypatch):
+    profile = make_session().profile
+    session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
+    seconds = itertools.count(step=0.1)
+    clock = SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None)
+    monkeypatch.setattr("rigd.engine.sample_log.time", clock)
+    session.run()
+    session.assert_safe()
+    assert session.finished["finished"] == "fault"
+    assert session.finished["counts"]["lost"] == 2  # and the one that has the torque off
+    assert_books_balance(session, session.samples)
 
 
 def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):

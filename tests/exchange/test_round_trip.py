@@ -52,7 +52,8 @@ def regular(length):
 
 # The folder is the same for every example, and every file in it a new one.
 @settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=20
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    max_examples=20,
 )
 @example(samples=regular(40), rate_hz=333.3)  # of which six digits of the period tell too little
 @given(samples=sessions(), rate_hz=st.sampled_from([1000.0, 1024.0, 333.3, 5e4]))

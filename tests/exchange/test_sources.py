@@ -96,7 +96,7 @@ def test_another_encoding_is_refused(text):
     assert "UTF-8" in refused(text("Zeit,Ausschlag°\n1,2\n", encoding="latin-1"), "Zeit")
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(columns=NUMBERS)
 def test_csv_keeps_every_digit(folder, columns):
     path = folder / "digits.csv"
@@ -104,7 +104,7 @@ def test_csv_keeps_every_digit(folder, columns):
     np.testing.assert_array_equal(values(path, "a"), columns)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(numbers=NUMBERS, as_row=st.booleans(), compressed=st.booleans())
 def test_matlab_variables_fields_and_columns(folder, numbers, as_row, compressed):
     path = folder / "log.mat"
@@ -204,7 +204,7 @@ def tdms():
     return pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(numbers=NUMBERS, whole=arrays(np.int32, 7))
 def test_tdms_channels(folder, numbers, whole):
     tdms = pytest.importorskip("nptdms", reason="TDMS needs npTDMS")
@@ -270,7 +270,7 @@ def uff_of(path, *functions):
 # pyuff leaves files open when it writes binary data.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     numbers=arrays(np.float64, st.integers(2, 40), elements=st.floats(-1e9, 1e9)),
     binary=st.booleans(),

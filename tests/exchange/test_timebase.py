@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.exchange.errors import ExchangeError
@@ -17,7 +17,6 @@ def found(time_s):
     return from_time_stamps(PATH, "t", np.asarray(time_s, dtype=float))
 
 
-@settings(deadline=None)
 @given(
     rate_hz=st.floats(1.0, 1e5),
     start_s=st.floats(-1e3, 1e3),

@@ -46,7 +46,7 @@ def read_back(pyuff, path, data):
 
 @pytest.mark.parametrize("binary", [False, True])
 @pytest.mark.parametrize("even", [False, True])
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(real=NUMBERS, imaginary=NUMBERS)
 def test_every_length_is_read_back(pyuff, path, binary, even, real, imaginary):
     length = min(len(real), len(imaginary))

@@ -65,15 +65,15 @@ class Motor:
 class ScaledDrive:
     """A drive whose torque constant is not what it says."""
 
+    angle_stale = False
+
     def __init__(self, drive, scale):
-        self._drive = drive
+        self.latch, self.read_angle = drive.latch, drive.read_angle
+        self._command = drive.command
         self._scale = scale
 
-    def __getattr__(self, name):
-        return getattr(self._drive, name)
-
     def command(self, torque_nm):
-        self._drive.command(self._scale * torque_nm)
+        self._command(self._scale * torque_nm)
         return torque_nm
 
 

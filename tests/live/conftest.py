@@ -1,5 +1,6 @@
 """A fake control loop that fills a real ring, and the publisher as a real child process."""
 
+import contextlib
 import importlib.util
 import json
 import math
@@ -27,6 +28,7 @@ from rigd.session.format import pack_sample_into, pack_timing_into
 from rigd.view.subject import Subject
 
 RATE_HZ = 1000.0
+LISTENING = "0A"  # as /proc/net/tcp writes it
 BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
 
 
@@ -155,8 +157,9 @@ class Publisher:
         return LiveAddress(**self.answer["address"])
 
     def next_address(self) -> LiveAddress:
-        """Wait for word of another server."""
-        return LiveAddress(**self._hear("address")["address"])
+        """Wait for word of another server, which is that of :attr:`address` from now on."""
+        self.answer = self._hear("address")
+        return self.address
 
     @property
     def ports(self) -> set[int]:
@@ -172,9 +175,9 @@ class Publisher:
 
     @property
     def server_pid(self) -> int:
-        """Of the server, or 0 while there is none."""
-        pids = children(self.process.pid)
-        return pids[0] if pids else 0
+        """Of the server; there must be one."""
+        (pid,) = children(self.process.pid)
+        return pid
 
     def end(self) -> tuple[int, str, str]:
         """Close its input; return its exit code and what else it wrote."""
@@ -211,6 +214,14 @@ def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+def state_of(task: Path) -> str:
+    """Return the state of a process or a thread, X if there is none any more."""
+    try:
+        return (task / "stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return "X"
+
+
 @pytest.fixture(scope="session", autouse=True)
 def rerun_runs():
     try:
@@ -234,7 +245,8 @@ def rerun_program(rerun_runs):
 class Columns:
     """What Rerun received of a recording: by entity and component, times in ns and values."""
 
-    def __init__(self, chunks) -> None:
+    def __init__(self, application_id: str, chunks) -> None:
+        self.application_id = application_id
         self._batches: dict[str, list] = {}
         for chunk in chunks:
             if "session_time" in chunk.timeline_names:
@@ -248,12 +260,13 @@ class Columns:
 
 
 class Saver:
-    """Rerun itself, saving what a server sends."""
+    """Rerun itself, saving what the server of a live view sends."""
 
-    def __init__(self, program: Path, proxy_url: str, path: Path) -> None:
+    def __init__(self, program: Path, view: LiveAddress, path: Path) -> None:
         self._path = path
+        self._publisher = view.pid
         self._process = subprocess.Popen(
-            [program, proxy_url, "--save", path, "--bind", "127.0.0.1", "--port", "0"],
+            [program, view.proxy_url, "--save", path, "--bind", "127.0.0.1", "--port", "0"],
             env={**os.environ, "CI": "1"},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -267,22 +280,34 @@ class Saver:
         """Whether nothing more comes: what is on its way when the server goes is lost."""
         if not self.has_begun():
             return False
-        sizes = []
+        size = self._path.stat().st_size
         for _ in range(15):  # looked at often, as a sleep may be one of the machine
-            sizes.append(self._path.stat().st_size)
             time.sleep(0.1)
-        return len(set(sizes)) == 1
+            if self._path.stat().st_size != size or self._anybody_at_work():
+                return False
+        return True
 
-    def recordings(self) -> list:
-        """Return (recording, columns) of each recording, once the server has gone away."""
+    def _anybody_at_work(self) -> bool:
+        """Whether some of those through whom it comes runs, or would if there were a processor."""
+        pids = (self._publisher, *children(self._publisher), self._process.pid)
+        tasks = [task for pid in pids for task in Path(f"/proc/{pid}/task").iterdir()]
+        return any(state_of(task) == "R" for task in tasks)
+
+    def recordings(self) -> dict[str, Columns]:
+        """Return each recording by its id, once the server has gone away.
+
+        In which order they come is Rerun's affair.
+        """
         from rerun.chunk import RrdReader
 
         assert self._process.wait(60.0) == 0
         reader = RrdReader(self._path)
-        return [
-            (recording, Columns(reader.stream(store=recording)))
+        return {
+            recording.recording_id: Columns(
+                recording.application_id, reader.stream(store=recording)
+            )
             for recording in reader.recordings()
-        ]
+        }
 
     def close(self) -> None:
         self._process.kill()
@@ -293,8 +318,8 @@ class Saver:
 def save(rerun_program, tmp_path):
     savers = []
 
-    def start(proxy_url: str) -> Saver:
-        savers.append(Saver(rerun_program, proxy_url, tmp_path / f"{len(savers)}.rrd"))
+    def start(view: LiveAddress) -> Saver:
+        savers.append(Saver(rerun_program, view, tmp_path / f"{len(savers)}.rrd"))
         return savers[-1]
 
     yield start
@@ -306,12 +331,11 @@ def save(rerun_program, tmp_path):
 def receive(save, eventually):
     """Have what a publisher shows from now on saved.
 
-    What that returns ends the session and the publisher, and gives (recording, columns) of each
-    recording.
+    What that returns ends the session and the publisher, and gives each recording by its id.
     """
 
     def begin(publisher):
-        saver = save(publisher.proxy_url)
+        saver = save(publisher.address)
 
         def end():
             assert eventually(saver.has_begun)
@@ -334,21 +358,43 @@ def sockets():
 
 def sockets_of(pid: int) -> list[tuple[str, str, str]]:
     """Return (local, remote, state) of each TCP socket that a process has open."""
+    inodes = inodes_of(pid)
+    return [socket for inode, socket in all_sockets().items() if inode in inodes]
+
+
+def inodes_of(pid: int) -> set[str]:
+    """Return by which number the system knows each socket that a process has open."""
     inodes = set()
     for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-        try:
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
             target = str(descriptor.readlink())
-        except FileNotFoundError:
-            continue
-        if target.startswith("socket:["):
-            inodes.add(target[8:-1])
-    found = []
-    for table in ("tcp", "tcp6"):
-        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
-            words = line.split()
-            if words[9] in inodes:
-                found.append((words[1], words[2], words[3]))
-    return found
+            if target.startswith("socket:["):
+                inodes.add(target[8:-1])
+    return inodes
+
+
+def all_sockets() -> dict[str, tuple[str, str, str]]:
+    """Return (local, remote, state) of every TCP socket of this computer, by its number."""
+    lines = [
+        line.split()
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+    ]
+    return {words[9]: (words[1], words[2], words[3]) for words in lines}
+
+
+@pytest.fixture
+def listeners():
+    """The sockets on which somebody listens, or a process does: no two ever have one number.
+
+    The number of a port that was given back may be another test's by now.
+    """
+
+    def ask(pid: int | None = None) -> set[str]:
+        listening = {inode for inode, (*_, state) in all_sockets().items() if state == LISTENING}
+        return listening if pid is None else listening & inodes_of(pid)
+
+    return ask
 
 
 @pytest.fixture
@@ -360,10 +406,10 @@ def send():
 def eventually():
     """Whether a condition comes true; the limit only ends a test that fails."""
 
-    def wait(condition, within_s: float = 60.0) -> bool:
+    def wait(condition, within_s: float = 60.0, every_s: float = 0.02) -> bool:
         deadline = time.monotonic() + within_s
         while not (met := condition()) and time.monotonic() < deadline:
-            time.sleep(0.02)
+            time.sleep(every_s)
         return met
 
     return wait
@@ -373,14 +419,7 @@ def eventually():
 def gone():
     """Whether a process has ended, reaped or not."""
 
-    def ask(pid: int) -> bool:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except FileNotFoundError:
-            return True
-        return state in "ZX"
-
-    return ask
+    return lambda pid: state_of(Path(f"/proc/{pid}")) in "ZX"
 
 
 @pytest.fixture
@@ -417,5 +456,23 @@ def start_publisher(producer):
 
 
 @pytest.fixture
+def own_port():
+    """What has a publisher prefer a port that no other test's wants, and that nobody is given.
+
+    When its server is replaced, Rerun's own may have gone to a publisher of another test.
+    """
+    return f"from rigd.live import outlet; outlet.GRPC_PORT = {20_000 + os.getpid() % 10_000}"
+
+
+@pytest.fixture
 def publisher(start_publisher):
     return start_publisher()
+
+
+@pytest.fixture
+def unhurried(start_producer, start_publisher):
+    """A publisher that leaves nothing out, although the machine may stand still for a minute."""
+    return start_publisher(
+        start_producer(capacity=64_000),
+        first="from rigd.live import publisher; publisher._WAITING_S = 60.0",
+    )

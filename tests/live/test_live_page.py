@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import os
 import re
 import socket
 import threading
@@ -102,8 +103,9 @@ def test_a_connection_does_not_last_for_ever(monkeypatch, page):
         assert connection.recv(1) == b""
 
 
-def test_a_page_that_is_closed_leaves_no_thread_at_work(page):
+def test_a_page_that_is_closed_leaves_no_socket_and_no_thread_at_work(page, sockets):
+    place = f"0100007F:{page.port:04X}"  # as /proc/net/tcp writes it
+    assert place in {local for local, *_ in sockets(os.getpid())}
     page.close()
-    with pytest.raises(OSError):
-        socket.create_connection(("127.0.0.1", page.port), 1.0)
+    assert place not in {local for local, *_ in sockets(os.getpid())}
     assert not [t for t in threading.enumerate() if "serve_forever" in t.name]

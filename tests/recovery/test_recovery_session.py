@@ -36,23 +36,24 @@ def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
     assert len(samples) > 20_000
 
 
-def test_a_folder_that_is_removed_ends_the_session(tmp_path):
+def test_a_folder_that_is_removed_ends_the_session(write_profile, tmp_path):
     folder = tmp_path / "sessions"
+    where = ("--profile", write_profile("sim", patient=True), "--output", folder)
     process = subprocess.Popen(
-        [RIGD, "run", "hold", "--duration", "60", "--rest", "0", "--output", folder],
+        [RIGD, "run", "hold", "--duration", "60", "--rest", "0", *where],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ,
     )
     try:
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + 60.0
         while not any(p.stat().st_size > 60_000 for p in folder.glob("*.part")):
             assert time.monotonic() < deadline
             assert process.poll() is None
             time.sleep(0.05)
         shutil.rmtree(folder)
-        output, errors = process.communicate(timeout=30)
+        output, errors = process.communicate(timeout=60)
     finally:
         process.kill()
         process.communicate()

@@ -214,7 +214,8 @@ def test_a_session_without_samples_is_refused(tmp_path, write_session, short_sig
 
 
 @settings(
-    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=20,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(missing=st.sets(st.integers(1, 3998), max_size=30))
 def test_what_was_recorded_is_kept_whatever_is_missing(

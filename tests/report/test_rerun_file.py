@@ -1,6 +1,5 @@
 """`analyze --rerun`: the session as `rigd replay` shows it, and the fits on charts."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -200,8 +199,8 @@ def test_weightings_of_ones_own_and_an_estimate_without_coherence(paper_file, tm
 
 
 @pytest.fixture
-def session(paper_file, tmp_path):
-    return shutil.copy(paper_file, tmp_path / "session.mcap")
+def session(write_session, short_signals, tmp_path):
+    return write_session(tmp_path / "session.mcap", short_signals)
 
 
 def test_a_file_that_cannot_be_written_is_told(paper_analysis):
@@ -217,7 +216,7 @@ def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeyp
     # The figures take longer than all the rest, and are tested elsewhere.
     monkeypatch.setattr("analysis.report.write.write_report", lambda *_: None)
     out = tmp_path / "new" / "fits.rrd"
-    quick = ("--types", "I", "--weights", "const")
+    quick = ("--types", "I", "--weights", "const", "--method", "welch", "--segment", "1000")
     done = run(app, session, *quick, "--rerun", out)
     assert done.exit_code == 0, done.output
     said = " ".join(done.stdout.split())

@@ -4,8 +4,12 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
+from analysis.record import load_record
 from analysis.report.tables import summary_table, with_spread
 from analysis.report.write import tables_text
+from analysis.settings import WelchSettings
+from analysis.welch_route import analyse
+from rigd.beam import modes
 
 
 @pytest.mark.parametrize(
@@ -78,3 +82,42 @@ def test_the_summary_is_mean_and_standard_deviation(paper_analysis):
     assert "over 3 files" in capture.get()
     (row,) = rows(capture.get(), "I", "const")
     assert row[2:5] == ["23", "±15", "1"]
+
+
+def modes_rows(analysis):
+    text = tables_text(analysis)
+    return text, [row[2:] for row in (rows(text, "I", "const")[2], rows(text, "VI", "omega")[2])]
+
+
+def test_modes_that_do_not_vibrate_are_left_out(write_session, short_signals, tmp_path):
+    """One segment of a short sweep, to which type II answers with a damping ratio of 8."""
+    record = load_record(write_session(tmp_path / "a.mcap", short_signals))
+    settings = WelchSettings(segment_length=4000, types=("II",), weightings=("const",))
+    (model,) = analyse(record, settings).models
+    damping = replace(model.fit.damping, gamma=14.0)
+    found = modes(record.beam, damping, 3)
+    assert found[0].damping_ratio > 1 > found[2].damping_ratio
+    strong = replace(model, modes=found, followed=(False, False, True))
+    text = tables_text(replace(analyse(record, settings), models=(strong,)))
+    shown = rows(text, "II", "const")[2][2:]
+    assert shown[:2] == shown[3:5] == ["–", "–"]
+    assert shown[2] == f"{found[2].frequency_hz:.4f}"
+    assert "nothing vibrates" in text
+    none = replace(strong, modes=(), followed=())
+    assert "nothing vibrates" in tables_text(
+        replace(analyse(record, settings), models=(model, none))
+    )
+
+
+def test_modes_that_left_their_resonance_are_marked(paper_analysis):
+    text, (first, last) = modes_rows(paper_analysis)
+    assert "‡" not in text
+    assert [float(hz) for hz in last[:3]] == sorted(float(hz) for hz in last[:3])
+    *others, model = paper_analysis.models
+    slow = replace(model.modes[2], frequency_hz=8.5)
+    left = replace(model, modes=(*model.modes[:2], slow), followed=(True, True, False))
+    text, (unmarked, marked) = modes_rows(replace(paper_analysis, models=(*others, left)))
+    assert unmarked == first
+    assert marked[2] == "8.5000‡"
+    assert marked[5] == f"{last[5]}‡"
+    assert "‡ more than 10 % off" in " ".join(text.split())

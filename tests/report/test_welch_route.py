@@ -117,7 +117,7 @@ def test_one_percent_of_missing_ticks_does_little(write_session, paper_signals, 
     assert model.fit.parameters["alpha"] == pytest.approx(whole.fit.parameters["alpha"], abs=0.005)
 
 
-@pytest.mark.parametrize("estimator", ["h2", "hv", "fft"])
+@pytest.mark.parametrize("estimator", ["h2", "hv", "iv", "fft"])
 def test_the_other_estimators_follow_the_plant(paper_file, estimator, plant):
     record = load_record(paper_file)
     found = analyse(record, WelchSettings(estimator=estimator, types=("III",)))
@@ -196,3 +196,25 @@ def test_a_file_with_only_what_is_required(write_session, paper_signals, paper_a
     assert found.warnings == ()
     zeta = found.models[0].fit.parameters["zeta"]
     assert zeta == pytest.approx(paper_analysis.models[-1].fit.parameters["zeta"], rel=0.3)
+
+
+def test_it_is_told_which_modes_a_fit_follows(paper_analysis, paper_file):
+    assert all(model.followed == (True, True, True) for model in paper_analysis.models)
+    # One segment of 20 s of the sweep, whose resonances the window fades out.
+    record = load_record(paper_file)
+    short = replace(record, sweep=slice(record.sweep.start, record.sweep.start + 20_000))
+    found = analyse(short, WelchSettings(types=("II", "IV", "VI")))
+    assert any(not all(model.followed) for model in found.models)
+    for model in found.models:
+        assert len(model.followed) == len(model.modes)
+        followed = [mode for mode, is_so in zip(model.modes, model.followed, strict=True) if is_so]
+        frequencies_hz = [mode.frequency_hz for mode in followed]
+        assert frequencies_hz == sorted(frequencies_hz)
+        assert all(0 < mode.damping_ratio < 1 for mode in followed)
+
+
+def test_hiv_without_a_reference_is_refused_kindly(paper_file):
+    record = load_record(paper_file)
+    still = replace(record, reference_rad=np.full_like(record.reference_rad, 0.3))
+    with pytest.raises(EstimateError, match=r"no reference that moves.*--frf h1"):
+        analyse(still, WelchSettings(estimator="iv", types=("I",)))

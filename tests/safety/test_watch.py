@@ -55,7 +55,7 @@ def test_a_slip_in_motion_is_found_where_no_limit_of_speed_would(watch):
     assert violation.channel == "encoder's jump"
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.floats(0.0, 1.3),
     st.floats(0.05, 20.0),

@@ -38,7 +38,7 @@ class Link:
 
     async def next(self):
         """The next line, or None at the end."""
-        line = await asyncio.wait_for(self.reader.readline(), 20.0)
+        line = await asyncio.wait_for(self.reader.readline(), 60.0)
         return json.loads(line) if line else None
 
     async def ask(self, document):

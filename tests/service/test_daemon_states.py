@@ -183,7 +183,6 @@ def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(ope
         settings=settings(
             max_examples=25,
             stateful_step_count=12,
-            deadline=None,
             suppress_health_check=list(HealthCheck),
         ),
     )

@@ -14,8 +14,10 @@ print("through")
 """
 A_FEW = """
 import logging
+from rigd.service import log
 from rigd.service.log import NAME, Log
 
+log._FLUSH_S = 60.0  # the machine may stand still for longer than a daemon would wait
 with Log():
     for number in range(5):
         logging.getLogger(NAME).warning("line %d", number)

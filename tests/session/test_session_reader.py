@@ -86,7 +86,10 @@ def test_any_container_is_read(kit, tmp_path, compression, extra, options):
     assert len(read_controls(path)) == 0
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=30,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 @given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 3000), st.booleans())
 def test_fixed_and_other_encodings_mix_in_any_order(kit, tmp_path, kinds, chunk_size, extra):
     samples = kit.make_samples(len(kinds))

@@ -1,5 +1,6 @@
 """A rig in its own processes, without the command line: connected once, and then used."""
 
+import gc
 import os
 import signal
 import time
@@ -54,6 +55,7 @@ def descriptors() -> int:
 
 
 def test_nothing_is_left_of_a_rig(profile, run):
+    gc.collect()  # of other tests: it would close what counts here
     before = children(), descriptors()
     rig = Rig(profile, fast=True)
     assert rig.status() is None
@@ -63,7 +65,8 @@ def test_nothing_is_left_of_a_rig(profile, run):
     rig.disconnect()
     rig.disconnect()
     assert rig.status() is None
-    assert (children(), descriptors()) == before
+    assert children() <= before[0]
+    assert descriptors() <= before[1]
 
 
 def test_status_tells_of_every_process_and_topic(rig, run):

@@ -25,7 +25,8 @@ class DriveLog:
 
     @classmethod
     def read(cls, path: Path) -> "DriveLog":
-        return cls([json.loads(line) for line in path.read_text("utf-8").splitlines()])
+        whole, _, _ = path.read_text("utf-8").rpartition("\n")  # it may be writing the next line
+        return cls([json.loads(line) for line in whole.splitlines()])
 
     def of(self, what: str, device: str = "drive") -> list[dict]:
         return [e for e in self.entries if e["device"] == device and e["what"] == what]

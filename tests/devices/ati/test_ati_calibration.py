@@ -109,7 +109,7 @@ entries = st.floats(-1e4, 1e4, width=32)
 gauges = st.integers(-32768, 32767)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     matrix=st.lists(st.lists(entries, min_size=6, max_size=6), min_size=6, max_size=6),
     counts=st.tuples(st.integers(1, 2**31 - 1), st.integers(1, 2**31 - 1)),
@@ -144,7 +144,7 @@ def test_text():
     assert text_of(b"A\xb0B") == "41 b0 42"
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.binary(max_size=32))
 def test_text_is_always_printable(raw):
     assert text_of(raw).isprintable()
@@ -175,7 +175,7 @@ def test_an_empty_calibration_block_is_refused(fill):
         parse_block([fill] * 133)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(st.integers(0, 0xFFFF), min_size=133, max_size=133), st.booleans())
 def test_any_calibration_block_is_read_or_refused_in_words(registers, sound_units):
     if sound_units:

@@ -45,7 +45,7 @@ def test_registers_are_read_high_byte_first(fakes):
     assert modbus.registers_of(modbus.content_of(request, reply)) == (0x1234, 0xFFFE)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(data=st.binary(max_size=80))
 def test_the_checksum_is_that_of_modbus(fakes, data):
     assert modbus.crc16(data).to_bytes(2, "little") == fakes.crc_bitwise(data)
@@ -103,7 +103,7 @@ def test_silence_is_a_bad_reply():
         modbus.content_of(modbus.UNLOCK, b"")
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     at=st.integers(0, 6),
     mask=st.integers(1, 255),

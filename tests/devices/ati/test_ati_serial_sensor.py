@@ -1,9 +1,9 @@
 """The Digital F/T sensor, against one at a pseudo-terminal, by struct from devices.md 2.1."""
 
+import gc
 import json
 import os
 import random
-import threading
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from rigd.devices.ati.serial_line import SerialLine
 from rigd.devices.ati.serial_sensor import AtiSerialSensor
 from rigd.devices.contracts import DeviceError
 from rigd.devices.simulator import SimulatorAddress
@@ -35,14 +36,6 @@ def open_sensor(serial_rig, digital_ft):
     yield make
     for sensor in made:
         sensor.close()
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """No long waits for replies that never come."""
-    monkeypatch.setattr("rigd.devices.ati.serial_setup._REPLY_TIMEOUT_S", 0.02)
-    monkeypatch.setattr("rigd.devices.ati.serial_sensor._FIRST_RECORDS_TIMEOUT_S", 0.05)
-    monkeypatch.setattr("rigd.devices.ati.serial_setup._DRAIN_LIMIT_S", 0.1)
 
 
 @pytest.fixture
@@ -362,7 +355,8 @@ def test_measuring(open_sensor, digital_ft, fakes):
     assert sensor.measure(0.02)["checksum_errors"] == 1
 
 
-def test_a_silent_sensor(open_sensor, digital_ft, quick):
+def test_a_silent_sensor(open_sensor, digital_ft, monkeypatch):
+    monkeypatch.setattr("rigd.devices.ati.serial_setup._REPLY_TIMEOUT_S", 0.02)
     digital_ft.silent = True
     message = refusal(open_sensor())
     assert "no usable reply in 3 tries: no reply came" in message
@@ -370,13 +364,13 @@ def test_a_silent_sensor(open_sensor, digital_ft, quick):
     assert "ati_serial.baud" in message
 
 
-def test_a_disturbed_reply_is_asked_for_again(open_sensor, digital_ft, quick):
+def test_a_disturbed_reply_is_asked_for_again(open_sensor, digital_ft):
     digital_ft.damage_next = 2
     open_sensor().connect()
     assert digital_ft.log.count("0a 03 00 1d 00 01 15 77") == 4
 
 
-def test_replies_that_stay_disturbed(open_sensor, digital_ft, quick):
+def test_replies_that_stay_disturbed(open_sensor, digital_ft):
     digital_ft.damage_next = 9
     assert "checksum of the reply is wrong" in refusal(open_sensor())
 
@@ -435,30 +429,27 @@ def test_a_declined_start(open_sensor, digital_ft):
 
 
 @pytest.mark.parametrize("first", [[], [b"\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a\x0b\x0c\x00"]])
-def test_a_start_without_sound_records(open_sensor, digital_ft, quick, first):
+def test_a_start_without_sound_records(open_sensor, digital_ft, monkeypatch, first):
+    monkeypatch.setattr("rigd.devices.ati.serial_sensor._FIRST_RECORDS_TIMEOUT_S", 0.2)
     digital_ft.first_records = first * 30
     message = refusal(open_sensor())
     assert f"of the {390 if first else 0} bytes" in message
     assert "only 0 were sound records" in message
 
 
-def test_a_sensor_that_does_not_stop_streaming(open_sensor, digital_ft, quick, fakes):
+def test_a_sensor_that_does_not_stop_streaming(open_sensor, digital_ft, monkeypatch, fakes):
+    monkeypatch.setattr("rigd.devices.ati.serial_setup._DRAIN_LIMIT_S", 0.1)
     digital_ft.streaming = digital_ft.deaf_to_jam = True
-    sensor = open_sensor()
-    noise = fakes.record_of(fakes.GAUGES)
-    stop = threading.Event()
+    wait = SerialLine.wait
 
-    def babble():
-        while not stop.wait(0.01):
-            os.write(digital_ft.master, noise)
+    def babble(line, timeout_s):
+        """However slow the machine is, nothing is ever quiet."""
+        digital_ft.emit(fakes.record_of(fakes.GAUGES))
+        wait(line, timeout_s)
 
-    babbler = threading.Thread(target=babble)
-    babbler.start()
-    try:
-        assert "goes on sending" in refusal(sensor)
-    finally:
-        stop.set()
-        babbler.join()
+    monkeypatch.setattr(SerialLine, "wait", babble)
+    assert "goes on sending" in refusal(open_sensor())
+    monkeypatch.undo()
     digital_ft.deaf_to_jam = False
 
 
@@ -550,10 +541,11 @@ def test_a_profile_without_the_section(serial_rig, section):
 
 
 def test_no_descriptor_is_left_open(open_sensor, digital_ft):
+    gc.collect()  # of other tests: it would close what counts here
     before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
     sensor = open_sensor()
     sensor.connect()
     sensor.close()
     digital_ft.status = 2
     refusal(sensor)
-    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208
+    assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208

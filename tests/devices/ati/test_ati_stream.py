@@ -46,7 +46,7 @@ def test_a_record_by_hand(fakes):
     assert aligned_stream().feed(record * SYNC_RECORDS) == record * SYNC_RECORDS
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(st.lists(st.lists(int16, min_size=6, max_size=6), min_size=6, max_size=60), sizes)
 def test_every_record_of_a_sound_stream_comes_out_once(fakes, gauges, sizes):
     records = [fakes.record_of(each) for each in gauges]
@@ -56,7 +56,7 @@ def test_every_record_of_a_sound_stream_comes_out_once(fakes, gauges, sizes):
     assert stream.checksum_errors == stream.dropped_bytes == stream.pending == 0
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(seeds, st.binary(max_size=40), sizes)
 def test_the_beginning_is_found_behind_rubbish(fuzz, seed, rubbish, sizes):
     records = fuzz.noisy_records(random.Random(seed), 60)
@@ -67,7 +67,7 @@ def test_the_beginning_is_found_behind_rubbish(fuzz, seed, rubbish, sizes):
     assert len(found) >= 50
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(
     seed=seeds,
     kind=st.sampled_from(["flip", "drop", "insert"]),
@@ -105,7 +105,7 @@ def test_after_a_disturbance_exactly_what_was_sent_comes_out(
     assert stream.dropped_bytes == len(data) - 13 * len(found)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(seeds, st.integers(0, 39), st.integers(0, 12), st.integers(1, 127), sizes)
 def test_one_damaged_record_costs_no_other(fuzz, seed, which, byte, mask, sizes):
     records = fuzz.noisy_records(random.Random(seed), 60)

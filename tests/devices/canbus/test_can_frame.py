@@ -5,7 +5,7 @@ import sys
 import pytest
 from can import Message
 from can.interfaces.socketcan.socketcan import build_can_frame, dissect_can_frame
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.devices.canbus import FRAME_SIZE, pack_frame, unpack_frame
@@ -29,7 +29,6 @@ def test_bytes_of_a_frame(can_id, data, raw):
 
 
 @given(identifiers, payloads)
-@settings(deadline=None)
 def test_frames_are_those_of_python_can(can_id, data):
     raw = pack_frame(can_id, data)
     assert len(raw) == FRAME_SIZE
@@ -42,7 +41,6 @@ def test_frames_are_those_of_python_can(can_id, data):
 
 
 @given(st.binary(min_size=16, max_size=16))
-@settings(deadline=None)
 def test_any_sixteen_bytes_can_be_taken_apart(raw):
     can_id, data = unpack_frame(raw)
     assert can_id == int.from_bytes(raw[:4], sys.byteorder)

@@ -37,7 +37,7 @@ def _binary(value, width):
     return [value >> shift & 1 for shift in reversed(range(width))]
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.integers(0, 0x7FF), st.binary(max_size=8))
 def test_every_frame_lies_between_plain_and_worst(can_id, data):
     bits = bits_on_the_wire(can_id, data)

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.devices.canbus.identifiers import check_identifiers
@@ -71,7 +71,6 @@ def test_two_heartbeats_of_one_node():
     assert "host_node_id" in found
 
 
-@settings(deadline=None)
 @given(st.integers(0, 0x7F), st.integers(1, 127), st.integers(1, 127))
 def test_a_collision_is_found_exactly_where_there_is_one(base, node, host):
     used = {0x000, 0x080, 0x100, 0x7E4, 0x7E5, 0x700 + host}

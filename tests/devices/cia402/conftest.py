@@ -129,14 +129,18 @@ class ScriptedDrive(threading.Thread):
 
     def has_got(self, can_id, data):
         """Wait until a frame has come, and say whether it has."""
-        deadline = time.monotonic() + 5
-        while (can_id, data) not in self.seen and time.monotonic() < deadline:
+        return self.comes_to(lambda it: (can_id, data) in it.seen)
+
+    def comes_to(self, condition):
+        """Wait until something is true of it, and say whether it is."""
+        deadline = time.monotonic() + 30
+        while not condition(self) and time.monotonic() < deadline:
             time.sleep(0.001)
-        return (can_id, data) in self.seen
+        return condition(self)
 
     def stop(self):
         self._wake.send(b".")
-        self.join(5)
+        self.join(30)
         assert not self.is_alive()
         for end in (self._listener, self._link, self._wake, self._woken):
             if end is not None:

@@ -74,7 +74,6 @@ def test_tpdo(data, told):
     assert unpack_tpdo(bytes.fromhex(data)) == told
 
 
-@settings(deadline=None)
 @given(
     word=st.integers(0, 0xFFFF),
     position=st.integers(-(2**31), 2**31 - 1),
@@ -223,7 +222,7 @@ def test_the_mapping_of_the_pdos():
     assert objects.RPDO_ENTRIES == (0x60400010, 0x60710010)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.binary(max_size=8), st.sampled_from(["tpdo", "emergency", "heartbeat", "reply"]))
 def test_handlers_take_anything(data, kind):
     inbox = Inbox("Drive")

@@ -305,9 +305,9 @@ class TestByTheClock:
         drive.command(0.1)
         drive.latch(60_000_000)
         drive.read_angle()
-        assert scripted.torque == 200
+        assert scripted.comes_to(lambda it: it.torque == 200)  # its reply may come too late
         drive.disable()
-        assert scripted.state == "switch-on disabled"
+        assert scripted.comes_to(lambda it: it.state == "switch-on disabled")
         drive.close()
 
     def test_stuck(self, drive, scripted):
@@ -315,7 +315,7 @@ class TestByTheClock:
         scripted.stays_in = "ready"
         with pytest.raises(DeviceError, match='stays in "ready to switch on"'):
             drive.enable()
-        assert scripted.state == "switch-on disabled"
+        assert scripted.comes_to(lambda it: it.state == "switch-on disabled")
 
     def test_a_reply_that_takes_longer_than_a_period_is_refused(self, drive, scripted):
         scripted.reply_delay_s = 0.02

@@ -59,7 +59,7 @@ def test_rounding_stays_below_half_the_resolution_and_so_does_one_count():
 
 
 @given(within_range)
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_a_wrench_comes_back_from_its_gauges(wrench):
     gauges = GAUGES.read([wrench])[0].astype(float) - UNLOADED
     back = GAUGES.matrix.astype(float) @ gauges / 1e6

@@ -25,9 +25,8 @@ READ_DIAGNOSTICS = bytes.fromhex("0A 04 00 27 00 06 C1 78")
 READ_CALIBRATION = bytes.fromhex("0A 03 00 E3 00 40 B4 B7")
 
 fixtures_are_reset_by_the_test = settings(
-    deadline=None,
     max_examples=60,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
 

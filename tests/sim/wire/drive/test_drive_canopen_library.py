@@ -188,9 +188,10 @@ def test_nmt_heartbeat_and_boot_up(node):
         assert node.nmt.wait_for_heartbeat(30) == state
     waiting = threading.Thread(target=node.nmt.wait_for_bootup, args=(30,))
     waiting.start()
-    time.sleep(0.05)
-    node.nmt.state = "RESET"
-    waiting.join(30)
+    end = time.monotonic() + 25
+    while waiting.is_alive() and time.monotonic() < end:
+        node.nmt.state = "RESET"  # again, where the library did not wait yet
+        waiting.join(0.2)
     assert not waiting.is_alive()
 
 

@@ -33,7 +33,8 @@ RECEIVABLE = [
     (0x60E1, 0, "H"),
 ]
 MODEST = settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rigd.sim.wire.canopen_objects import Abort, AbortCode, Entry, ObjectDictionary
 from rigd.sim.wire.canopen_sdo import SdoServer
 
-MODEST = settings(deadline=None, max_examples=150)
+MODEST = settings(max_examples=150)
 LETTERS = "bBhHiI"
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from rigd.sim.wire.clock import LockStep, WallClock
 
 T = 1_000_000
-quiet = settings(deadline=None, max_examples=60)
+quiet = settings(max_examples=60)
 
 
 def test_a_regular_sync_moves_the_world_by_one_period():
@@ -56,7 +56,7 @@ def test_the_world_is_where_the_syncs_say_however_many_are_missing(events):
         assert clock.tick == tick
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(drift=st.floats(-3e-4, 3e-4), noise=st.lists(st.floats(-0.3, 0.3), min_size=16, max_size=16))
 def test_a_host_whose_clock_runs_otherwise_is_followed(drift, noise):
     clock = WallClock(T, 0)

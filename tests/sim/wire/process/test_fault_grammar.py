@@ -42,7 +42,7 @@ def test_every_kind_is_tried_here():
     assert OPTIONAL.keys() == KINDS.keys()
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(asked, st.randoms())
 def test_what_is_written_is_understood_and_written_back(question, random):
     kind, values, after_s = question
@@ -60,7 +60,7 @@ def test_what_is_written_is_understood_and_written_back(question, random):
     assert (again.kind, dict(again.values), again.after_s) == (kind, dict(fault.values), after_s)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.text(max_size=40) | st.text(alphabet="dropfmes=,@0x1.-", max_size=20))
 def test_anything_else_is_refused_with_a_sentence(text):
     try:

@@ -36,11 +36,11 @@ class Line:
         self.pty.look()
 
     def turn(self):
-        for descriptor in select.select(self.handlers, (), (), 0.5 if self.handlers else 0)[0]:
+        for descriptor in select.select(self.handlers, (), (), 30.0 if self.handlers else 0)[0]:
             self.handlers[descriptor]()
 
     def read(self):
-        select.select([self.port], (), (), 1.0)
+        select.select([self.port], (), (), 30.0)
         return os.read(self.port, 65536)
 
     def close(self):

@@ -63,7 +63,8 @@ class Simulator:
         return self.process.returncode, out, err
 
     def events(self, device=None, what=None):
-        entries = [json.loads(line) for line in self.log.read_text().splitlines()]
+        whole, _, _ = self.log.read_text().rpartition("\n")  # it may be writing the next line
+        entries = [json.loads(line) for line in whole.splitlines()]
         return [
             entry
             for entry in entries
@@ -292,16 +293,16 @@ def test_time_passes_by_the_wall_clock(simulate, connect):
     assert ended["t_s"] >= 0.3
 
 
-def test_faults_are_injected_while_it_runs(simulate, connect):
+def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
     simulator = simulate("antenna_can", "--lock-step", "--fault", "drop,from=drive,frames=2@0")
     host = connect(simulator)
     done = rigd("inject", "--profile", "antenna_can", "jump,counts=-500", "drop,from=host,id=0x77f")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == "jump,counts=-500\ndrop,from=host,id=0x77f,frames=1\n"
-    wrong = rigd("inject", "--profile", "antenna_can", "dorp")
+    wrong = rigd_here("inject", "--profile", "antenna_can", "dorp")
     assert wrong.returncode == 2
     assert "'dorp' is no fault; choose drop" in wrong.stderr
-    standing = rigd("inject", "--profile", "antenna_can")
+    standing = rigd_here("inject", "--profile", "antenna_can")
     assert "clients: 1\n" in standing.stdout
     assert "disturbed: ['host']\n" in standing.stdout
     host.set_up()
@@ -320,10 +321,10 @@ def test_faults_are_injected_while_it_runs(simulate, connect):
     ]
 
 
-def test_a_cut_bus_stays_cut(simulate, connect):
+def test_a_cut_bus_stays_cut(simulate, connect, rigd_here):
     simulator = simulate()
     host = connect(simulator)
-    assert rigd("inject", "--profile", "antenna_can", "cut").returncode == 0
+    assert rigd_here("inject", "--profile", "antenna_can", "cut").returncode == 0
     with pytest.raises(ConnectionError):
         host.receive(0x181)
     with pytest.raises(OSError, match=r"No such file|refused"):
@@ -331,7 +332,7 @@ def test_a_cut_bus_stays_cut(simulate, connect):
     assert find_simulator("antenna_can") is not None
 
 
-def test_the_serial_sensor_streams_with_the_periods(simulate, connect):
+def test_the_serial_sensor_streams_with_the_periods(simulate, connect, rigd_here):
     simulator = simulate("antenna_serial", "--lock-step")
     host = connect(simulator)
     with serial.Serial(simulator.address.serial_port, 1_250_000, parity="E", timeout=30.0) as line:
@@ -348,7 +349,8 @@ def test_the_serial_sensor_streams_with_the_periods(simulate, connect):
         for at in range(0, len(stream), 13):
             record = stream[at : at + 13]
             assert record[12] == sum(record[:12]) & 0x7F
-        assert rigd("inject", "--profile", "antenna_serial", "cut,device=sensor").returncode == 0
+        cut = rigd_here("inject", "--profile", "antenna_serial", "cut,device=sensor")
+        assert cut.returncode == 0
         with pytest.raises(serial.SerialException):
             line.read(1)
     simulator.end()
@@ -382,8 +384,8 @@ def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_pat
         (("inject", "--profile", "antenna_can", "cut"), 1, "start it with: rigd simulate"),
     ],
 )
-def test_wrong_use_is_told_in_a_sentence(runtime, arguments, code, said):
-    done = rigd(*arguments)
+def test_wrong_use_is_told_in_a_sentence(runtime, rigd_here, arguments, code, said):
+    done = rigd_here(*arguments)
     assert done.returncode == code
     assert done.stderr.startswith("Error: ")
     assert said in done.stderr
@@ -391,8 +393,8 @@ def test_wrong_use_is_told_in_a_sentence(runtime, arguments, code, said):
     assert find_simulator("antenna_can") is None
 
 
-def test_the_help_names_every_fault():
+def test_the_help_names_every_fault(rigd_here):
     from rigd.sim.wire.faults import KINDS
 
-    shown = rigd("inject", "--help").stdout
+    shown = rigd_here("inject", "--help").stdout
     assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in KINDS)
