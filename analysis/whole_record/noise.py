@@ -76,8 +76,9 @@ def noise_of(
     share : float
         Share of the samples at which the residual is known; it is nought at the others.
     near_mode : ndarray of bool, shape (K,), optional
-        Bins that are compared whatever stands out there; without it no line is looked for. A
-        resonance that is left out is not fitted, and what is not fitted there stands out for ever.
+        Bins that are compared whatever stands out there, skirts of a line beside them included;
+        without it no line is looked for. A resonance that is left out is not fitted, and what is
+        not fitted there stands out for ever.
     """
     power = smooth_power(residual) / share
     counts = np.ones(power.size, dtype=bool)
@@ -85,10 +86,10 @@ def noise_of(
     if near_mode is None:
         return Noise(power, counts, ())
     for part in _standing_out(residual, power):
-        if near_mode[part].any() or not _steady(residual, part):
-            continue
-        counts[part] = False
         own = np.abs(residual[part]) ** 2
+        if near_mode[part][np.argmax(own)] or not _steady(residual, part):
+            continue
+        counts[part] &= near_mode[part]
         lines.append(
             Line(
                 frequency_hz=float(own @ frequency_hz[part] / own.sum()),

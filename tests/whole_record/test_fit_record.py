@@ -189,6 +189,22 @@ def test_a_hum_is_no_ringing(sessions, name, hz, amplitude_nm):
             assert max(ringing.amplitude_nm) < 3e-3 < amplitude_nm
 
 
+@pytest.mark.parametrize("seed", [4, 7, 9])
+def test_a_railway_s_hum_beside_the_second_mode(sessions, seed):
+    """Its skirts reach over the resonance, which lies at 16.03 Hz and is compared all the same."""
+    session = sessions("IV")
+    t = np.arange(session.torque_nm.size) / 1000
+    hum = 0.02 * np.sin(2 * np.pi * 16.7 * t + 0.4)
+    noisy = type(session)(session.angle_rad, session.torque_nm + hum)
+    analysis = fit_record(noisy.measured(noise_nm=1e-2, seed=seed), [STRUCTURES["IV"]])
+    quiet = fit(session.measured(noise_nm=1e-2, seed=seed), "IV")
+    (found,), (line,) = analysis.fits, analysis.lines
+    assert line.frequency_hz == pytest.approx(16.7, abs=0.01)
+    assert found.cost / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
+    for name in quiet.determined:
+        assert abs(found.parameters[name] - quiet.parameters[name]) < 2 * quiet.std[name]
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_no_hum_is_found_where_there_is_none(sessions, seed):
     """What a rough start leaves at a sharp mode once passed for one, and stayed unfitted."""
