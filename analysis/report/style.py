@@ -81,14 +81,20 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> Figure:
-    """Figure on the Agg canvas with a bold title and a grey line under it."""
+    """Figure on the Agg canvas with a bold title and a grey line under it, small enough to fit."""
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
     # A file name may hold dollar signs, which are not mathematics.
     common: dict[str, Any] = {"va": "top", "parse_math": False}
-    figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **common)
-    figure.text(left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **common)
+    for text in (
+        figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **common),
+        figure.text(
+            left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **common
+        ),
+    ):
+        share = text.get_window_extent().width / (DPI * width_in)
+        text.set_fontsize(text.get_fontsize() * (1 - 2 * left) / max(share, 1 - 2 * left))
     return figure
 
 

@@ -115,6 +115,13 @@ def test_a_file_name_is_shown_as_it_is(write_session, short_signals, tmp_path):
         assert figure.texts[0].get_text().startswith(path.name)
 
 
+def test_a_long_name_and_many_words_fit(tmp_path):
+    with style.styled():
+        image = pixels(style.new_figure(10, 3, "name" * 60, "many words " * 30), tmp_path / "a.png")
+    assert image[:, :20].min() == image[:, -20:].min() == 255
+    assert (image[:100, 20:-20].min(axis=(0, 2)) < 200).mean() > 0.6
+
+
 def test_an_envelope_keeps_extremes_and_bounds_the_points():
     x = np.linspace(0.0, 10.0, 100_001)
     y = np.sin(2 * np.pi * 50 * x)
