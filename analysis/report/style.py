@@ -94,7 +94,7 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> 
         ),
     ):
         share = text.get_window_extent().width / (DPI * width_in)
-        text.set_fontsize(text.get_fontsize() * (1 - 2 * left) / max(share, 1 - 2 * left))
+        text.set_fontsize(float(text.get_fontsize()) * (1 - 2 * left) / max(share, 1 - 2 * left))
     return figure
 
 
