@@ -69,7 +69,7 @@ def estimate(
             response = whole_record
         elif settings.estimator == "iv":
             response = instrumental_response(
-                _reference(record)[record.sweep],
+                moving_reference_rad(record)[record.sweep],
                 angle[record.sweep],
                 record.torque_nm[record.sweep],
                 record.rate_hz,
@@ -103,8 +103,11 @@ def estimate(
     return response, whole_record
 
 
-def _reference(record: Record) -> NDArray[np.float64]:
-    """Movement asked for, which an imported record may lack."""
+def moving_reference_rad(record: Record) -> NDArray[np.float64]:
+    """Movement asked for, from where it began, shape (n,); `EstimateError` if there is none.
+
+    An imported record may lack it.
+    """
     reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
     if not reference[record.sweep].any():
         raise EstimateError(

@@ -77,8 +77,7 @@ def minimise(
     """
     x = np.clip(start, lower, upper)
     learns = residual_part is not None
-    if residual_part is None:
-        residual_part = np.zeros((x.size, x.size))
+    part = np.zeros((x.size, x.size)) if residual_part is None else residual_part
     here = problem(x)
     evaluations = 1
     damping, growth = 1e-3, 2.0
@@ -87,9 +86,9 @@ def minimise(
         free = ~held & (np.diag(here.hessian) > 0)
         if not free.any():
             break
-        full = here.hessian + residual_part
-        if not _is_convex(full[np.ix_(free, free)]):
-            full = here.hessian
+        full = here.hessian
+        if learns and _is_convex((full + part)[np.ix_(free, free)]):
+            full = full + part
         hessian = full[np.ix_(free, free)]
         # Without the floor an unknown that has next to no effect here would take any step.
         scale = np.diag(here.hessian)[free]
@@ -107,7 +106,7 @@ def minimise(
         evaluations += 1
         if learns:
             change = there.gradient - here.gradient - there.hessian @ step
-            residual_part = _learnt(residual_part, step, change)
+            part = _learnt(part, step, change)
         gained = here.cost - there.cost
         if gained > 0:
             quality = gained / promised if promised > 0 else 0.0
@@ -119,7 +118,7 @@ def minimise(
             growth *= 2
             if damping > 1e16:
                 break
-    return Minimum(x, here.cost, evaluations, residual_part)
+    return Minimum(x, here.cost, evaluations, part)
 
 
 def _is_convex(hessian: NDArray[np.float64]) -> bool:

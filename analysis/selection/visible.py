@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.selection.chance import SURE, of_chi_square
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -69,11 +67,8 @@ def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple
         left = _chi_square_of_smooth(
             torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
         )
-        if (
-            left - freedom > _EVIDENCE
-            and left > _OVER_NOISE * freedom
-            and of_chi_square(left, freedom) > SURE
-        ):
+        # Chance does neither: together they are nearly eight standard deviations, or more.
+        if left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom:
             found.append(mode.number)
     return tuple(found)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from analysis.estimate import SettingsError, estimate
+from analysis.estimate import SettingsError, estimate, moving_reference_rad
 from analysis.structures import STRUCTURES
 from analysis.welch_aware.fit import fit_welch_aware
 
@@ -54,7 +54,7 @@ def fit_record_welch_aware(
         )
     response, _ = estimate(record, settings)
     origin_rad = record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
-    reference = record.reference_rad - record.reference_rad[0]
+    reference = moving_reference_rad(record) if settings.estimator == "iv" else None
     fixed = tuple(fixed)
     of_weightings = [
         fit_welch_aware(
@@ -70,7 +70,7 @@ def fit_record_welch_aware(
             tool_inertia_kg_m2=record.tool_inertia_kg_m2,
             estimated_from=record.sweep,
             uniform=uniform,
-            reference_rad=reference if settings.estimator == "iv" else None,
+            reference_rad=reference,
         )
         for weighting in settings.weightings
     ]
