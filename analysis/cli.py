@@ -23,16 +23,14 @@ from analysis.commands.welch_options import (
     Segment,
     welch_settings,
 )
+from rigd.interruption import raise_on
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from types import FrameType
-    from typing import NoReturn
 
     from analysis.whole_record import Setting
 
 _EXIT_INTERRUPTED: Final = 130
-_REPEAT_S: Final = 0.01
 
 _EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
@@ -62,20 +60,9 @@ app.command("import", epilog=IMPORT_EPILOG)(import_command)
 app.add_typer(export_app, name="export")
 
 
-class Interruption(KeyboardInterrupt):
-    """Ctrl-C, by a name of its own.
-
-    Python ends by the signal, whatever exit code it is asked for, once a plain `KeyboardInterrupt`
-    has passed through an `exec` of text, and what defines a named tuple or a dataclass is one.
-    """
-
-
 def main() -> None:
     """Entry point of the command."""
-    signal.signal(signal.SIGINT, _interrupt)
-    if hasattr(signal, "SIGALRM"):  # not on Windows
-        signal.signal(signal.SIGALRM, _interrupt)
-        sys.unraisablehook = _unraisable
+    raise_on(signal.SIGINT)
     # Threads gain nothing on matrices as small as a fit's, and cost a tenth of the time.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -83,21 +70,6 @@ def main() -> None:
         app()
     except KeyboardInterrupt:
         sys.exit(_EXIT_INTERRUPTED)
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:
-    raise Interruption
-
-
-def _unraisable(lost: sys.UnraisableHookArgs) -> None:
-    """Repeat a Ctrl-C that came where Python drops exceptions, as at the end of an object's life.
-
-    A little later, that is: an exception that is raised in here would be dropped as well.
-    """
-    if isinstance(lost.exc_value, Interruption):
-        signal.setitimer(signal.ITIMER_REAL, _REPEAT_S)
-    else:
-        sys.__unraisablehook__(lost)
 
 
 @app.command(DEFAULT, epilog=_EPILOG)

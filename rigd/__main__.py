@@ -9,22 +9,12 @@ def main() -> None:
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
     _fill_standard_descriptors()
     from rigd.cli.app import main as run
+    from rigd.interruption import let_pass
 
     try:
         run()
     finally:
-        _be_past_stopping()
-
-
-def _be_past_stopping() -> None:
-    """Let signals pass from now on: an operator may press once more, and has been heard.
-
-    Python gives each signal that is handled its default action back before it has cleaned up, and
-    would end by it.
-    """
-    for number in signal.valid_signals():
-        if callable(signal.getsignal(number)):
-            signal.signal(number, signal.SIG_IGN)
+        let_pass()
 
 
 def _fill_standard_descriptors() -> None:

@@ -10,7 +10,7 @@ import typer
 from rigd.cli.bench import bench
 from rigd.cli.check import check, reset
 from rigd.cli.daemon import status, stop, tare, zero
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, interrupt
+from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
 from rigd.cli.live import live
@@ -19,6 +19,7 @@ from rigd.cli.replay import replay
 from rigd.cli.run import run_app, start_app
 from rigd.cli.serve import serve
 from rigd.cli.simulate import inject, simulate
+from rigd.interruption import raise_on
 
 app = typer.Typer(
     help="Run the rig: excite the antenna, record every sample, watch it live.\n\n"
@@ -50,7 +51,7 @@ app.command()(inject)
 
 def main() -> None:
     """Entry point of ``rigd``."""
-    signal.signal(signal.SIGINT, interrupt)
+    raise_on(signal.SIGINT)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that does not know "·" or "²" gets a "?" instead of an error.
         if isinstance(stream, io.TextIOWrapper):

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.exits import EXIT_FAILED, fail, interrupt
+from rigd.cli.exits import EXIT_FAILED, fail
 from rigd.cli.options import AsJson, ProfileName, profile_named
+from rigd.interruption import raise_on
 
 if TYPE_CHECKING:
     from rigd.bench import Results
@@ -41,8 +42,7 @@ def bench(
 
     Example: rigd bench --seconds 10
     """
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, interrupt)
+    raise_on(signal.SIGTERM, signal.SIGHUP)
     from rigd.engine.process import SINGLE_THREADED
 
     os.environ.update(SINGLE_THREADED)

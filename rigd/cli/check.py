@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rigd.cli.daemon import reset_by_daemon
-from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail, interrupt
+from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
 from rigd.cli.options import AsJson, ProfileName, profile_named
+from rigd.interruption import raise_on
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -85,5 +86,4 @@ def _openable_profile(name: str) -> "Profile":
 
 def _end_as_by_ctrl_c() -> None:
     """Let go of the devices when asked to end by whatever means."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, interrupt)
+    raise_on(signal.SIGTERM, signal.SIGHUP)

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.cli.exits import EXIT_FAILED, fail, interrupt
+from rigd.cli.exits import EXIT_FAILED, fail
+from rigd.interruption import raise_on
 
 if TYPE_CHECKING:
     from rigd.live.address import LiveAddress
@@ -47,7 +48,8 @@ def scratch_folder() -> Iterator[Path]:
 def ended_gently() -> Iterator[None]:
     """Have every way of being asked to end mean Ctrl-C, so that temporary files go too."""
     asked = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, interrupt) for number in asked]
+    before = [signal.getsignal(number) for number in asked]
+    raise_on(*asked)
     try:
         yield
     finally:

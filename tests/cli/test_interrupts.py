@@ -12,15 +12,28 @@ DURING = {
         "rigd.cli.replay.has_screen = lambda: exec(\n"
         "    'import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(10)')\n"
     ),
+    # What is raised there is dropped, and objects end anywhere.
+    "an object that ends": (
+        "import os, signal, time, weakref\n"
+        "import rigd.cli.replay\n"
+        "class Ending: pass\n"
+        "def ended(_): os.kill(os.getpid(), signal.SIGINT); time.sleep(0)\n"
+        "def has_screen():\n"
+        "    ending = Ending()\n"
+        "    observed = weakref.ref(ending, ended)\n"
+        "    del ending\n"
+        "    time.sleep(10)\n"
+        "rigd.cli.replay.has_screen = has_screen\n"
+    ),
     "the clean-up after its end": (
         "import os, signal, sys\n"
         "import rigd.cli.replay\n"
-        "from rigd.cli.exits import interrupt\n"
+        "from rigd.interruption import interrupt\n"
         "class Late:\n"
         "    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.SIGINT):\n"
         "        kill(pid, number)\n"
         "sys.late = Late()\n"
-        "rigd.cli.replay.has_screen = lambda: interrupt(0, None)\n"
+        "rigd.cli.replay.has_screen = lambda: interrupt(signal.SIGINT, None)\n"
     ),
     "imports": (
         "import sys\n"
