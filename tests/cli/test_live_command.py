@@ -1,10 +1,10 @@
 """``rigd live``: which view it finds, what it says where there is none, how it opens a window."""
 
 import json
-import time
 from dataclasses import replace
 
 import pytest
+from processes import eventually
 
 from rigd.cli.live import _follow
 from rigd.live.address import LiveAddress, announce
@@ -45,19 +45,6 @@ def fake_viewer(tmp_path, monkeypatch):
     monkeypatch.setenv("SEEN", str(tmp_path / "seen"))
     monkeypatch.setenv("CODE", "0")
     return lambda what: (tmp_path / f"seen.{what}").read_text()
-
-
-@pytest.fixture
-def eventually():
-    """Whether a condition comes true; the limit only ends a test that fails."""
-
-    def wait(condition, within_s: float = 60.0) -> bool:
-        deadline = time.monotonic() + within_s
-        while not (met := condition()) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        return met
-
-    return wait
 
 
 def test_without_a_view_it_says_how_to_get_one(rigd_here):
@@ -164,7 +151,7 @@ def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkey
 
 
 def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read(
-    rigd, rigd_here, start_rigd, runtime_folder, eventually
+    rigd, rigd_here, start_rigd, runtime_folder
 ):
     serve = start_rigd("serve", "--profile", "sim", "--live", "--fast")
     file = runtime_folder / "rigd" / "live-sim.json"
@@ -193,7 +180,7 @@ def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
     assert "rigd live --wait" in done.stderr
 
 
-def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd, eventually):
+def test_a_daemon_that_was_started_without_a_view_is_named(rigd_here, start_rigd):
     serve = start_rigd("serve", "--profile", "sim", "--fast")
     assert eventually(lambda: rigd_here("status").returncode == 0)
     done = rigd_here("live")

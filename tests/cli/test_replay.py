@@ -1,6 +1,5 @@
 """`rigd replay`: what is shown of a file is what was seen live, and what the file holds."""
 
-import contextlib
 import importlib.util
 import io
 import json
@@ -12,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +18,7 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from processes import children, eventually, has_ended, listeners
 
 from analysis.estimate import estimate
 from analysis.record import load_record
@@ -39,7 +38,6 @@ NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vu
 RIGD = Path(sys.executable).parent / "rigd"
 QUICK = ("--duration", "4", "--rest", "0.5", "--ring-down", "0.5", "--stop-hz", "10", "--fast")
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
-LISTENING = "0A"
 
 
 def run(*arguments, **options):
@@ -467,35 +465,6 @@ def rerun_program():
     return path
 
 
-def eventually(condition, within_s: float = 60.0):
-    """Whether a condition comes true; the limit only ends a test that fails."""
-    deadline = time.monotonic() + within_s
-    while not (met := condition()) and time.monotonic() < deadline:
-        time.sleep(0.1)  # for each answer a viewer draws everything
-    return met
-
-
-def children(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def listening(pid: int) -> set[str]:
-    """Return the addresses at which a process listens, as /proc/net/tcp writes them."""
-    inodes = set()
-    with contextlib.suppress(FileNotFoundError):  # it has ended
-        for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-                target = str(descriptor.readlink())
-                if target.startswith("socket:["):
-                    inodes.add(target[8:-1])
-    lines = [
-        line.split()
-        for table in ("tcp", "tcp6")
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
-    ]
-    return {line[1] for line in lines if line[9] in inodes and line[3] == LISTENING}
-
-
 @pytest.fixture
 def served(rerun_program, short, tmp_path):
     """`rigd replay --web` of the short session, from when it has told its address."""
@@ -521,8 +490,8 @@ def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
         assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
     assert "rerun" in page.lower()
     (server,) = children(process.pid)
-    ends = listening(process.pid) | listening(server)
-    assert {end.split(":")[0] for end in ends} == {LOOPBACK}
+    ends = listeners(process.pid) | listeners(server)
+    assert {end.addresses[0] for end in ends} == {LOOPBACK}
     (folder,) = tmp_path.iterdir()
     assert [path.suffix for path in folder.iterdir()] == [".rrd"]
     said = process.stderr.readline()
@@ -531,7 +500,7 @@ def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
     process.communicate(timeout=60.0)
     assert process.returncode == 130
     assert list(tmp_path.iterdir()) == []
-    assert eventually(lambda: not Path(f"/proc/{server}").exists())
+    assert eventually(lambda: has_ended(server))
 
 
 def test_a_server_that_dies_is_told(served, tmp_path):
@@ -623,11 +592,12 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
                 ends = [line.end for r in state.recordings for line in r.timelines if line.end]
                 return bool(ends) and not state.loading and max(ends) >= 4_999_000_000
 
-            assert eventually(loaded)
+            assert eventually(loaded, every_s=0.1)  # for each answer it draws everything
             viewer.set_time("session_time", duration=4.4, play_state="paused")
-            assert eventually(lambda: not unseen(viewer, COLORS)), unseen(viewer, COLORS)
+            seen = eventually(lambda: not unseen(viewer, COLORS), every_s=0.1)
+            assert seen, unseen(viewer, COLORS)
             if page is None:
-                ends = {end.split(":")[0] for end in listening(program.pid)}
+                ends = {end.addresses[0] for end in listeners(program.pid)}
                 assert ends == {LOOPBACK}
     finally:
         program.kill()
@@ -656,15 +626,15 @@ def test_a_window_is_closed_with_the_command(rerun_program, short, tmp_path):
         said = process.stderr.readline()
         assert said == f"{short.name} is shown; close the window, or press Ctrl-C, to end.\n"
         (viewer,) = children(process.pid)
-        assert eventually(lambda: process.poll() is not None or listening(viewer))
+        assert eventually(lambda: process.poll() is not None or listeners(viewer))
         if process.poll() is not None:
             pytest.skip(f"{NO_GRAPHICS}: {process.stderr.read()}")
-        assert {end.split(":")[0] for end in listening(viewer)} == {LOOPBACK}
+        assert {end.addresses[0] for end in listeners(viewer)} == {LOOPBACK}
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60.0)
         assert process.returncode == 130
         assert list(tmp_path.iterdir()) == []
-        assert eventually(lambda: not Path(f"/proc/{viewer}").exists())
+        assert eventually(lambda: has_ended(viewer))
     finally:
         screen.kill()
         screen.communicate()

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import child_running, eventually, has_ended, ignored, ignores
 
 from rigd.session import Status, read_controls, read_session
 
@@ -138,11 +138,13 @@ def recorded(folder, size=50_000, timeout_s=60.0):
     def grown():
         for part in folder.glob("sessions/*.part"):
             with contextlib.suppress(FileNotFoundError):
-                if part.stat().st_size > size:
+                if part.stat().st_size >= size:
                     return part
         return None
 
-    return wait_for(grown, timeout_s)
+    part = eventually(grown, timeout_s)
+    assert part, "no session is being recorded"
+    return part
 
 
 @pytest.mark.parametrize("send", [to_all, to_one])
@@ -190,7 +192,7 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
             process = start_rigd("run", "chirp", "--json", "--profile", profile, folder=folder)
         running.append((folder, process))
     for number, (_, process) in enumerate(running):  # each in another part of its start
-        wait_for(lambda process=process: not ignores(process.pid, signal.SIGINT))
+        assert eventually(lambda process=process: not ignores(process.pid, signal.SIGINT))
         time.sleep(0.3 * number)
         to_all(process, signal.SIGINT)
     for folder, process in running:
@@ -206,7 +208,7 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
 
 def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--fast", "--repeat", "50", *SHORT)
-    wait_for(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
+    assert eventually(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
     to_all(process, signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
@@ -222,7 +224,7 @@ def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
 def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
-    os.kill(child_of(process.pid, "rigd.engine.control"), signal.SIGSTOP)
+    os.kill(child_running(process.pid, "rigd.engine.control"), signal.SIGSTOP)
     to_one(process, signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 1, errors  # a fault is one, whatever was asked for
@@ -235,7 +237,7 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
 
 def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
     process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
-    part = wait_for(lambda: next(tmp_path.glob("sessions/*.part"), None))
+    part = recorded(tmp_path, 0)
     part.with_suffix("").write_text("somebody else's")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
@@ -251,7 +253,7 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, t
 def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path, victim, words):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
-    os.kill(child_of(process.pid, victim), signal.SIGKILL)
+    os.kill(child_running(process.pid, victim), signal.SIGKILL)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 1, (output, errors)
     assert "Traceback" not in errors
@@ -270,11 +272,11 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path,
 def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, tmp_path):
     options = ("--json", "--duration", "2", "--rest", "0", "--repeat", "30", "--profile", patient)
     process = start_rigd("run", "hold", *options)
-    wait_for(lambda: list(tmp_path.glob("sessions/*-01.mcap")))
+    assert eventually(lambda: list(tmp_path.glob("sessions/*-01.mcap")))
     # One that has already made its file whole is not missed, and this test may have stood still.
     while process.poll() is None:
         with contextlib.suppress(AssertionError, ProcessLookupError):  # between two sessions
-            recorder = child_of(process.pid, "rigd.engine.recorder")
+            recorder = child_running(process.pid, "rigd.engine.recorder")
             recorded(tmp_path, 1000, timeout_s=10.0)
             os.kill(recorder, signal.SIGKILL)
         time.sleep(0.2)
@@ -292,7 +294,7 @@ def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
     (tmp_path / "sessions").symlink_to("moved")
     options = ("--json", "--duration", "1", "--rest", "0", "--repeat", "999", "--fast")
     process = start_rigd("run", "hold", *options)
-    wait_for(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
+    assert eventually(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "file").rename(tmp_path / "sessions")  # at one go: a missing folder is made anew
     output, errors = process.communicate(timeout=60)
@@ -343,7 +345,7 @@ def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_p
     try:
         recorded(tmp_path, 1000)
         termios.tcflow(slave, termios.TCOOFF)  # Ctrl-S
-        wait_for(lambda: list(tmp_path.glob("sessions/*.mcap")))
+        assert eventually(lambda: list(tmp_path.glob("sessions/*.mcap")))
     finally:
         termios.tcflow(slave, termios.TCOON)
     output, _ = process.communicate(timeout=60)
@@ -356,57 +358,14 @@ def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_p
 def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
-    control = child_of(process.pid, "rigd.engine.control")
+    control = child_running(process.pid, "rigd.engine.control")
     process.kill()
     process.wait()
-    path = wait_for(lambda: next(tmp_path.glob("sessions/*.mcap"), None))
+    assert eventually(lambda: list(tmp_path.glob("sessions/*.mcap")))
+    (path,) = tmp_path.glob("sessions/*.mcap")
     record = read_session(path)
     assert record.outcome["outcome"] == "fault"
     assert "supervising process" in record.outcome["reason"]
     assert record.samples[-1]["torque_command_nm"] == 0.0
     assert record.samples[-1]["status"] & Status.TORQUE_OFF
-    wait_for(lambda: ended(control))
-
-
-@contextlib.contextmanager
-def ignored(number):
-    """Ignore a signal; a process that is started meanwhile does so until it handles it."""
-    before = signal.signal(number, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(number, before)
-
-
-def ignores(pid, number):
-    status = Path(f"/proc/{pid}/status").read_text()
-    (mask,) = re.findall(r"^SigIgn:\s*(\w+)$", status, re.MULTILINE)
-    return bool(int(mask, 16) >> (number - 1) & 1)
-
-
-def wait_for(condition, timeout_s=60.0):
-    deadline = time.monotonic() + timeout_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
-    return found
-
-
-def child_of(pid, module):
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (folder / "cmdline").read_bytes().decode(errors="replace")
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue  # it has ended meanwhile
-        if parent == pid and module in command:
-            return int(folder.name)
-    raise AssertionError(f"no {module} below {pid}")
-
-
-def ended(pid):
-    """Whether a process has ended, reaped or not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
+    assert eventually(lambda: has_ended(control))

@@ -1,6 +1,5 @@
 """A fake control loop that fills a real ring, and the publisher as a real child process."""
 
-import contextlib
 import importlib.util
 import json
 import math
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
 from rigd.engine.board import Board, Word
@@ -28,7 +28,6 @@ from rigd.session.format import pack_sample_into, pack_timing_into
 from rigd.view.subject import Subject
 
 RATE_HZ = 1000.0
-LISTENING = "0A"  # as /proc/net/tcp writes it
 BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)
 
 
@@ -210,18 +209,6 @@ def send_object(pipe, name: str, value: object) -> None:
     pipe.flush()
 
 
-def children(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def state_of(task: Path) -> str:
-    """Return the state of a process or a thread, X if there is none any more."""
-    try:
-        return (task / "stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return "X"
-
-
 @pytest.fixture(scope="session", autouse=True)
 def rerun_runs():
     try:
@@ -328,7 +315,7 @@ def save(rerun_program, tmp_path):
 
 
 @pytest.fixture
-def receive(save, eventually):
+def receive(save):
     """Have what a publisher shows from now on saved.
 
     What that returns ends the session and the publisher, and gives each recording by its id.
@@ -351,75 +338,8 @@ def receive(save, eventually):
 
 
 @pytest.fixture
-def sockets():
-    """The TCP sockets that a process has open: (local, remote, state) of each."""
-    return sockets_of
-
-
-def sockets_of(pid: int) -> list[tuple[str, str, str]]:
-    """Return (local, remote, state) of each TCP socket that a process has open."""
-    inodes = inodes_of(pid)
-    return [socket for inode, socket in all_sockets().items() if inode in inodes]
-
-
-def inodes_of(pid: int) -> set[str]:
-    """Return by which number the system knows each socket that a process has open."""
-    inodes = set()
-    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-            target = str(descriptor.readlink())
-            if target.startswith("socket:["):
-                inodes.add(target[8:-1])
-    return inodes
-
-
-def all_sockets() -> dict[str, tuple[str, str, str]]:
-    """Return (local, remote, state) of every TCP socket of this computer, by its number."""
-    lines = [
-        line.split()
-        for table in ("tcp", "tcp6")
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
-    ]
-    return {words[9]: (words[1], words[2], words[3]) for words in lines}
-
-
-@pytest.fixture
-def listeners():
-    """The sockets on which somebody listens, or a process does: no two ever have one number.
-
-    The number of a port that was given back may be another test's by now.
-    """
-
-    def ask(pid: int | None = None) -> set[str]:
-        listening = {inode for inode, (*_, state) in all_sockets().items() if state == LISTENING}
-        return listening if pid is None else listening & inodes_of(pid)
-
-    return ask
-
-
-@pytest.fixture
 def send():
     return send_object
-
-
-@pytest.fixture
-def eventually():
-    """Whether a condition comes true; the limit only ends a test that fails."""
-
-    def wait(condition, within_s: float = 60.0, every_s: float = 0.02) -> bool:
-        deadline = time.monotonic() + within_s
-        while not (met := condition()) and time.monotonic() < deadline:
-            time.sleep(every_s)
-        return met
-
-    return wait
-
-
-@pytest.fixture
-def gone():
-    """Whether a process has ended, reaped or not."""
-
-    return lambda pid: state_of(Path(f"/proc/{pid}")) in "ZX"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from processes import eventually
 
 from rigd.devices.simulator import runtime_folder
 from rigd.live.address import LiveAddress, announce, find, running, withdraw
@@ -66,7 +67,7 @@ def test_what_a_dead_process_left_is_no_live_view(address, ended):
     assert running() == [address], "a new one takes its place"
 
 
-def test_a_process_that_has_not_been_waited_for_has_ended_all_the_same(address, eventually):
+def test_a_process_that_has_not_been_waited_for_has_ended_all_the_same(address):
     wait = "import sys; sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", wait], stdin=subprocess.PIPE) as process:
         fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()

@@ -8,6 +8,7 @@ import socket
 import threading
 
 import pytest
+from processes import sockets
 
 from rigd.live.page import PageServer, kept_here
 
@@ -103,9 +104,9 @@ def test_a_connection_does_not_last_for_ever(monkeypatch, page):
         assert connection.recv(1) == b""
 
 
-def test_a_page_that_is_closed_leaves_no_socket_and_no_thread_at_work(page, sockets):
+def test_a_page_that_is_closed_leaves_no_socket_and_no_thread_at_work(page):
     place = f"0100007F:{page.port:04X}"  # as /proc/net/tcp writes it
-    assert place in {local for local, *_ in sockets(os.getpid())}
+    assert place in {end.local for end in sockets(os.getpid())}
     page.close()
-    assert place not in {local for local, *_ in sockets(os.getpid())}
+    assert place not in {end.local for end in sockets(os.getpid())}
     assert not [t for t in threading.enumerate() if "serve_forever" in t.name]

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import eventually, has_ended, listeners, sockets
 
 from rigd.live.address import find
 from rigd.live.job import LiveJob
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
-LISTENING = "0A"
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
 
 
@@ -47,17 +47,17 @@ def test_first_line_is_where_the_view_is(publisher):
     assert all(accepts(port) for port in publisher.ports)
 
 
-def test_nothing_is_open_beyond_loopback(publisher, sockets, eventually):
+def test_nothing_is_open_beyond_loopback(publisher):
     assert eventually(lambda: page(publisher))
-    own, server = sockets(publisher.process.pid), sockets(publisher.server_pid)
-    listening = {local for local, _, state in own + server if state == LISTENING}
+    pids = publisher.process.pid, publisher.server_pid
+    listening = {end.local for pid in pids for end in listeners(pid)}
     assert {f"{LOOPBACK}:{port:04X}" for port in publisher.ports} <= listening
     assert len(listening) == 3  # the third is where the server has the page's files
-    ends = {end.split(":")[0] for local, remote, _ in own + server for end in (local, remote)}
-    assert ends == {LOOPBACK, "00000000"}  # the latter is the far end of a listening socket
+    addresses = {address for pid in pids for end in sockets(pid) for address in end.addresses}
+    assert addresses == {LOOPBACK, "00000000"}  # the latter is the far end of a listening socket
 
 
-def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive, eventually):
+def test_every_record_arrives_in_the_units_of_the_plots(unhurried, receive):
     publisher, producer = unhurried, unhurried.producer
     received = receive(publisher)
     assert eventually(lambda: producer.tick > 1000)
@@ -102,12 +102,12 @@ def test_two_rigs_have_a_view_each(publisher, start_producer, start_publisher, a
     assert all(accepts(port) for port in other.ports | own)
 
 
-def test_ends_with_its_input_and_takes_the_server_along(publisher, gone, listeners):
+def test_ends_with_its_input_and_takes_the_server_along(publisher):
     server = publisher.server_pid
     own = listeners(publisher.process.pid) | listeners(server)
     assert len(own) == 3
     assert publisher.end() == (0, "", "")
-    assert gone(server)
+    assert has_ended(server)
     assert not own & listeners()
 
 
@@ -123,22 +123,22 @@ def test_stays_open_for_as_long_as_asked(start_publisher):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_is_the_supervisors_business(publisher, gone, number):
+def test_interrupt_is_the_supervisors_business(publisher, number):
     server = publisher.server_pid
     os.kill(publisher.process.pid, number)
     os.kill(server, signal.SIGINT)
     time.sleep(0.3)
     assert publisher.process.poll() is None
-    assert not gone(server)
+    assert not has_ended(server)
 
 
-def test_a_killed_publisher_leaves_no_server(publisher, gone, eventually):
+def test_a_killed_publisher_leaves_no_server(publisher):
     server = publisher.server_pid
     publisher.process.kill()
-    assert eventually(lambda: gone(server))
+    assert eventually(lambda: has_ended(server))
 
 
-def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send, gone, eventually):
+def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send):
     middle = subprocess.Popen(
         [
             sys.executable,
@@ -158,11 +158,11 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send, g
         assert b"address" in middle.stdout.readline()
         (server,) = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
         middle.kill()
-        assert eventually(lambda: gone(pid) and gone(server))
+        assert eventually(lambda: has_ended(pid) and has_ended(server))
     assert find("orphan") is None, "what it left behind is told from a live view"
 
 
-def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher, gone, eventually):
+def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(producer, first=IMPATIENT)
     server = publisher.server_pid
@@ -182,13 +182,11 @@ def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher
     assert eventually(lambda: publisher.dropped > dropped + 500)
     code, more, _ = publisher.end()
     assert (code, more) == (0, "")
-    assert gone(server)
+    assert has_ended(server)
     assert producer.refused == 0
 
 
-def test_a_server_that_stays_frozen_is_replaced(
-    start_producer, start_publisher, receive, gone, eventually, own_port
-):
+def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher, receive, own_port):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
         producer, first=f"from rigd.live import feed; feed._MOST_STALLED_LOOKS = 20; {own_port}"
@@ -196,7 +194,7 @@ def test_a_server_that_stays_frozen_is_replaced(
     frozen = publisher.server_pid
     os.kill(frozen, signal.SIGSTOP)
     ports = publisher.ports
-    assert eventually(lambda: gone(frozen))
+    assert eventually(lambda: has_ended(frozen))
     killed_ns = producer.tick * 1_000_000
     publisher.next_address()
     assert publisher.server_pid != frozen
@@ -208,7 +206,7 @@ def test_a_server_that_stays_frozen_is_replaced(
 
 @pytest.mark.parametrize("frozen_first", [False, True])
 def test_a_killed_server_is_replaced_where_viewers_find_it(
-    start_producer, start_publisher, receive, eventually, own_port, frozen_first
+    start_producer, start_publisher, receive, own_port, frozen_first
 ):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(producer, first=f"{IMPATIENT}; {own_port}")
@@ -227,9 +225,7 @@ def test_a_killed_server_is_replaced_where_viewers_find_it(
     assert producer.refused == 0
 
 
-def test_what_was_overwritten_before_it_was_seen_is_counted(
-    start_producer, start_publisher, eventually
-):
+def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, start_publisher):
     producer = start_producer(capacity=1000)
     publisher = start_publisher(producer)
     os.kill(publisher.process.pid, signal.SIGSTOP)

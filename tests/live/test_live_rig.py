@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from processes import eventually
 
 from rigd.engine.board import Word
 from rigd.engine.signals import StopRequest
@@ -62,7 +63,7 @@ def run(rig, order):
     return run
 
 
-def test_a_series_has_one_view_which_gets_every_sample(rig, run, save, eventually):
+def test_a_series_has_one_view_which_gets_every_sample(rig, run, save):
     first, (told, *_) = run("first")
     view = rig.status().live_view
     assert told == f"Live view: {view.viewer_url}"
@@ -106,7 +107,7 @@ def test_the_counts_of_one_session_are_not_shown_in_the_next(rig, run, order):
     assert board[Word.GO] == 0
 
 
-def test_how_a_session_ended_is_shown(rig, run, save, eventually):
+def test_how_a_session_ended_is_shown(rig, run, save):
     stop_at = StopRequest()
 
     def stop(progress) -> None:
@@ -124,7 +125,7 @@ def test_how_a_session_ended_is_shown(rig, run, save, eventually):
     assert result.outcome == "stopped"
 
 
-def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run, eventually):
+def test_a_view_that_dies_between_sessions_is_there_for_the_next(rig, run):
     run("first")
     before = rig.status().live_view
     os.kill(before.pid, signal.SIGKILL)

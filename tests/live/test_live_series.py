@@ -5,8 +5,10 @@ import signal
 import time
 from pathlib import Path
 
+from processes import eventually
 
-def run_session(publisher, name: str, eventually) -> tuple[int, int]:
+
+def run_session(publisher, name: str) -> tuple[int, int]:
     """Have the producer's next quarter of a second be a session of its own.
 
     Returns with which sample it began, and how many there were when it was over.
@@ -29,14 +31,11 @@ def threads(pid: int) -> int:
     return len(list(Path(f"/proc/{pid}/task").iterdir()))
 
 
-def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive, eventually):
+def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive):
     publisher = unhurried
     received = receive(publisher)
     publisher.finish()
-    bounds = {
-        f"recording of {name}": run_session(publisher, name, eventually)
-        for name in ("second", "third")
-    }
+    bounds = {f"recording of {name}": run_session(publisher, name) for name in ("second", "third")}
     recordings = received()
     assert recordings.keys() == bounds.keys() | {"recording of chirp under test"}
     for name, (first, end) in bounds.items():
@@ -46,27 +45,25 @@ def test_every_session_is_a_recording_with_its_own_samples(unhurried, receive, e
         assert (ticks[1:] - ticks[:-1] == 1).all()
 
 
-def test_sessions_leave_nothing_behind(publisher, eventually):
+def test_sessions_leave_nothing_behind(publisher):
     publisher.finish()
     for number in range(4):  # what is made once, and kept
-        run_session(publisher, f"early {number}", eventually)
+        run_session(publisher, f"early {number}")
     pid, server = publisher.process.pid, publisher.server_pid
     before_mb, before = resident_mb(pid), threads(pid)
     for number in range(8):
-        run_session(publisher, f"later {number}", eventually)
+        run_session(publisher, f"later {number}")
     assert publisher.server_pid == server
     assert eventually(lambda: threads(pid) <= before + 3), "of streams that have come and gone"
     assert resident_mb(pid) < before_mb + 10.0
 
 
-def test_a_server_that_has_seen_many_sessions_makes_room(
-    start_publisher, receive, eventually, own_port
-):
+def test_a_server_that_has_seen_many_sessions_makes_room(start_publisher, receive, own_port):
     publisher = start_publisher(first=f"{own_port}; outlet._MOST_SESSIONS = 2")
     first = publisher.address
     publisher.finish()
-    run_session(publisher, "second", eventually)
-    run_session(publisher, "third", eventually)
+    run_session(publisher, "second")
+    run_session(publisher, "third")
     address = publisher.next_address()
     assert address.server != first.server
     assert address.grpc_port == first.grpc_port
@@ -75,7 +72,7 @@ def test_a_server_that_has_seen_many_sessions_makes_room(
 
 
 def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_on(
-    start_producer, start_publisher, receive, eventually
+    start_producer, start_publisher, receive
 ):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(

@@ -6,6 +6,7 @@ import signal
 
 import numpy as np
 import pytest
+from processes import eventually, sockets
 
 from rigd.live.viewer import Viewer
 
@@ -13,7 +14,7 @@ NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vu
 
 
 @pytest.fixture
-def viewer(publisher, tmp_path, eventually):
+def viewer(publisher, tmp_path):
     window = Viewer(publisher.address, tmp_path, ("--headless", "--window-size", "320x200"))
     if not eventually(lambda: window.control_url or window.exit_code is not None):
         pytest.fail(window.last_words)
@@ -41,15 +42,14 @@ def shown_s(viewer):
     return ask
 
 
-def test_it_keeps_up_through_everything(publisher, viewer, shown_s, sockets, eventually):
+def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
     def current() -> bool:
         return shown_s() > publisher.producer.tick * 1e-3 - 1.5
 
     assert eventually(lambda: shown_s() > 1.0)
     assert eventually(current)
-    every = sockets(viewer.pid)
-    ends = {end.split(":")[0] for local, remote, _ in every for end in (local, remote)}
-    assert ends == {"0100007F", "00000000"}, "127.0.0.1, and the far end of a listening socket"
+    addresses = {address for end in sockets(viewer.pid) for address in end.addresses}
+    assert addresses == {"0100007F", "00000000"}, "127.0.0.1, and the far end of a listening socket"
 
     # A window that stands still holds nobody up, and catches up.
     os.kill(viewer.pid, signal.SIGSTOP)
@@ -75,7 +75,7 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s, sockets, eve
 
 
 def test_a_window_that_does_not_answer_is_waited_for_by_nobody(
-    publisher, viewer, shown_s, eventually, monkeypatch
+    publisher, viewer, shown_s, monkeypatch
 ):
     assert eventually(lambda: shown_s() > 0.5)
     monkeypatch.setattr("rigd.live.viewer._ANSWER_S", 0.5)

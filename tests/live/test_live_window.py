@@ -17,6 +17,7 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from processes import eventually
 
 from rigd.view import plots
 from rigd.view.antenna import TITLE as ANTENNA
@@ -97,7 +98,7 @@ def session(write_profile, start_rigd, tmp_path):
 
 
 @pytest.fixture
-def viewer(rerun_program, session, tmp_path, eventually):
+def viewer(rerun_program, session, tmp_path):
     """Rerun's viewer, connected to the session's server."""
     from rerun.experimental import ViewerClient
 
@@ -135,7 +136,7 @@ def viewer(rerun_program, session, tmp_path, eventually):
 
 
 @pytest.fixture
-def session_s(tmp_path, eventually):
+def session_s(tmp_path):
     """How old the session is: from the clock and the start that its file states."""
     start = re.compile(rb"start_utc_ns....(\d{19})", re.DOTALL)
     assert eventually(lambda: any(start.search(part.read_bytes()) for part in parts(tmp_path)))
@@ -185,19 +186,19 @@ def count(image: np.ndarray, color: tuple[int, int, int]) -> int:
     return int(np.count_nonzero(np.all(distance < 12.0, axis=-1)))
 
 
-def test_every_view_shows_its_curves_as_they_come(viewer, session_s, eventually):
-    eventually = partial(eventually, every_s=0.2)  # for each answer the viewer draws everything
+def test_every_view_shows_its_curves_as_they_come(viewer, session_s):
+    shown = partial(eventually, every_s=0.2)  # for each answer the viewer draws everything
 
     def newest_s() -> float:
         recordings = [r for r in viewer.get_state().recordings if r.timelines]
         return (recordings[0].current_time or 0) * 1e-9 if recordings else -np.inf
 
     # It follows the newest sample, as long as the session lasts.
-    assert eventually(lambda: session_s() - newest_s() < 1.5)
+    assert shown(lambda: session_s() - newest_s() < 1.5)
     then = newest_s()
-    assert eventually(lambda: newest_s() > then + 0.5)
+    assert shown(lambda: newest_s() > then + 0.5)
     # Until there is something of everything to be seen.
-    assert eventually(lambda: newest_s() > LOOK_AT_S, within_s=100.0)
+    assert shown(lambda: newest_s() > LOOK_AT_S, within_s=100.0)
 
     assert tuple(COLORS) == TABS
     for tab, colors in COLORS.items():
@@ -206,7 +207,7 @@ def test_every_view_shows_its_curves_as_they_come(viewer, session_s, eventually)
         def views(ids: set[str] = ids) -> dict:
             return {v.name: v for v in viewer.get_state().views if v.view_id in ids}
 
-        assert eventually(lambda: views().keys() == colors.keys()), views().keys()  # noqa: B023
+        assert shown(lambda: views().keys() == colors.keys()), views().keys()  # noqa: B023
         waiting = {view.view_id: colors[name] for name, view in views().items() if colors[name]}
 
         def all_seen(waiting: dict = waiting) -> bool:
@@ -216,13 +217,13 @@ def test_every_view_shows_its_curves_as_they_come(viewer, session_s, eventually)
                     del waiting[view_id]
             return not waiting
 
-        assert eventually(all_seen), (tab, waiting)
+        assert shown(all_seen), (tab, waiting)
         assert [(v.name, v.reports) for v in views().values() if v.reports] == []
         if PICTURES:
-            assert eventually(lambda: newest_s() > PICTURES_FROM_S, within_s=30.0)
+            assert shown(lambda: newest_s() > PICTURES_FROM_S, within_s=30.0)
         whole = viewer.take_screenshot()
         assert matplotlib.image.imread(io.BytesIO(whole), "png").shape[:2] == (HEIGHT, WIDTH)
         if PICTURES:
             path = Path(PICTURES, f"live_{tab.lower().replace(' ', '_')}.png")
             path.write_bytes(whole)
-    assert eventually(lambda: session_s() - newest_s() < 1.5)
+    assert shown(lambda: session_s() - newest_s() < 1.5)

@@ -6,10 +6,10 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from processes import eventually
 
 from rigd.service.address import answers, socket_path
 from rigd.session import read_session
@@ -86,11 +86,14 @@ def serve(rigd, profile):
 
 
 def until(condition, daemon=None):
-    deadline = time.monotonic() + 60.0
-    while not condition():
-        assert daemon is None or daemon.poll() is None, daemon.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    """Wait for a condition, as long as the daemon runs."""
+
+    def ended():
+        return daemon is not None and daemon.poll() is not None
+
+    met = eventually(lambda: ended() or condition())
+    assert not ended(), daemon.communicate()
+    assert met
 
 
 def request(command, **fields):

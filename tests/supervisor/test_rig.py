@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import children
 
 from rigd.engine.board import Phase
 from rigd.engine.signals import StopRequest
@@ -45,18 +46,13 @@ def run(profile, tmp_path):
     return run
 
 
-def children() -> set[int]:
-    listed = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text()
-    return {int(pid) for pid in listed.split()}
-
-
 def descriptors() -> int:
     return sum(1 for _ in Path("/proc/self/fd").iterdir())
 
 
 def test_nothing_is_left_of_a_rig(profile, run):
     gc.collect()  # of other tests: it would close what counts here
-    before = children(), descriptors()
+    before = set(children(os.getpid())), descriptors()
     rig = Rig(profile, fast=True)
     assert rig.status() is None
     rig.connect()
@@ -65,7 +61,7 @@ def test_nothing_is_left_of_a_rig(profile, run):
     rig.disconnect()
     rig.disconnect()
     assert rig.status() is None
-    assert children() <= before[0]
+    assert set(children(os.getpid())) <= before[0]
     assert descriptors() <= before[1]
 
 

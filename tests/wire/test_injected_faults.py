@@ -1,11 +1,11 @@
 """Every row of docs/faults.md: a fault on the wire, and how the session and the drive end."""
 
 import re
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from processes import eventually
 
 from rigd.session import Status, read_session
 
@@ -60,13 +60,6 @@ def rows(heading):
         if line.startswith("|") and "`" in line
     ]
     return [Row(c[0], c[1].strip("`"), c[2], int(c[3]), c[4]) for c in cells]
-
-
-def eventually(condition, within_s=20.0):
-    deadline = time.monotonic() + within_s
-    while not (met := condition()) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return met
 
 
 def named(row):

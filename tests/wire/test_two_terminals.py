@@ -3,11 +3,11 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import child_running, eventually
 
 from rigd.session import Status, read_session, read_timings
 
@@ -16,25 +16,9 @@ CHIRP = ("--amplitude", "0.005", "--stop-hz", "5", "--duration", "1.5")
 LENGTHS = ("--rest", "0.2", "--ring-down", "0.3")
 
 
-def _recording(folder: Path, within_s: float = 60.0) -> bool:
-    """Wait until a session is being recorded in a folder and has its first samples."""
-    deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline:
-        if any(part.stat().st_size > 100_000 for part in folder.glob("sessions/*.part")):
-            return True
-        time.sleep(0.02)
-    return False
-
-
-def _control_process(supervisor: int) -> int:
-    """Return the process that talks to the devices."""
-    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
-    (control,) = (
-        int(child)
-        for child in children
-        if b"rigd.engine.control" in Path(f"/proc/{child}/cmdline").read_bytes()
-    )
-    return control
+def _recording(folder: Path) -> bool:
+    """Whether a session is being recorded in a folder and has its first samples."""
+    return any(part.stat().st_size > 100_000 for part in folder.glob("sessions/*.part"))
 
 
 @pytest.fixture
@@ -119,7 +103,7 @@ def test_ctrl_c_stops_the_motor_over_the_wire(
     log = tmp_path / "drive.jsonl"
     simulator = start_simulator(profile, "--log", log)
     running = start_chirp(profile)
-    assert _recording(tmp_path)
+    assert eventually(lambda: _recording(tmp_path))
     os.killpg(running.pid, signal.SIGINT)
     out, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
@@ -170,12 +154,9 @@ def test_without_the_loop_the_drive_goes_off_by_itself(
     log = tmp_path / "drive.jsonl"
     simulator = start_simulator(profile, "--log", log)
     running = start_chirp(profile)
-    assert _recording(tmp_path)
-    os.kill(_control_process(running.pid), how)
-    deadline = time.monotonic() + 30.0
-    while not any(e["code"] == 0x8130 for e in drive_log(log).of("emcy")):
-        assert time.monotonic() < deadline, "the drive does not miss the loop"
-        time.sleep(0.05)
+    assert eventually(lambda: _recording(tmp_path))
+    os.kill(child_running(running.pid, "rigd.engine.control"), how)
+    assert eventually(lambda: any(e["code"] == 0x8130 for e in drive_log(log).of("emcy")))
     running.send_signal(signal.SIGINT)  # the supervisor kills a process that does not answer
     running.communicate(timeout=60)
     simulator.send_signal(signal.SIGTERM)

@@ -15,6 +15,8 @@ from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
 _TRIES = 3
+# What was asked for again may be answered twice, and no reply says which row of the matrix it is.
+_LATE_REPLY_S = 0.5
 _LOST_POLL_S = 0.02
 # Firmware that can be asked for its counts per unit comes after this.
 _FIXED_COUNTS_UP_TO = (3, 7)
@@ -287,22 +289,26 @@ class AtiCanSensor:
         exchange, inbox = self.polls.exchange, self._inbox
         wanted = replies or (opcode,)
         frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
-        for _ in range(_TRIES):
+        for again in range(_TRIES):
             inbox.clear()
             exchange.send(frame)
-            deadline_ns = time.monotonic_ns() + int(_REPLY_TIMEOUT_S * 1e9)
-            if exchange.wait_until(lambda: all(each in inbox for each in wanted), deadline_ns):
+            if exchange.wait_until(
+                lambda: all(each in inbox for each in wanted), _in(_REPLY_TIMEOUT_S)
+            ):
+                found = [inbox[each] for each in wanted]
+                if again:
+                    exchange.wait_until(lambda: False, _in(_LATE_REPLY_S))  # all is dropped
                 break
         else:
             raise self._no_reply(what)
-        for each in wanted:
-            if len(inbox[each]) != REPLY_LENGTHS[each]:
+        for each, data in zip(wanted, found, strict=True):
+            if len(data) != REPLY_LENGTHS[each]:
                 raise DeviceError(
-                    f"{self._name}: asked for {what}, it sent {len(inbox[each])} bytes instead of "
+                    f"{self._name}: asked for {what}, it sent {len(data)} bytes instead of "
                     f"{REPLY_LENGTHS[each]}. Check that the box is a NETCANOEM and that no other "
                     "device uses its identifiers."
                 )
-        return b"".join(inbox[each] for each in wanted)
+        return b"".join(found)
 
     def _no_reply(self, what: str) -> DeviceError:
         return DeviceError(
@@ -368,6 +374,10 @@ class AtiCanSensor:
             raise DeviceError(
                 f"{self._name}, ati_can.calibration {self._settings.calibration}: {error}"
             ) from None
+
+
+def _in(duration_s: float) -> int:
+    return time.monotonic_ns() + int(duration_s * 1e9)
 
 
 def _quantile_s(sorted_ns: list[int], fraction: float) -> float:

@@ -25,6 +25,8 @@ _QUIET_S = 0.05
 _DRAIN_LIMIT_S = 0.5
 _REPLY_TIMEOUT_S = 0.3
 _TRIES = 3
+# What was asked for again may be answered twice, and no reply says which registers it holds.
+_LATE_REPLY_S = 0.5
 
 
 class SerialSetup:
@@ -114,13 +116,14 @@ class SerialSetup:
     def _ask(self, request: bytes, what: str) -> bytes:
         """Return what the reply to a request holds; disturbed ones are asked for again."""
         problem = ""
-        for _ in range(_TRIES):
+        for tries in range(_TRIES):
             time.sleep(SILENCE_S)
             length = modbus.reply_length(request)
+            reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
+            if tries:
+                self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
             try:
-                return modbus.content_of(
-                    request, self._line.transact(request, length, _REPLY_TIMEOUT_S)
-                )
+                return modbus.content_of(request, reply)
             except modbus.Refused as error:
                 raise DeviceError(
                     f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "

@@ -114,6 +114,33 @@ class FakeBus:
         pass
 
 
+class LateBus(FakeBus):
+    """One on which replies take time: none, but for requests (opcode, data) that have theirs."""
+
+    def __init__(self, answer):
+        super().__init__(answer)
+        self.late_s = {}
+
+    def send(self, frame):
+        can_id, length = struct.unpack_from("=IB", frame)
+        late_s = self.late_s.get((can_id & 0xF, frame[8 : 8 + length]))
+        arrives_s = time.monotonic() + (late_s.pop() if late_s else 0.0)
+        for reply in self.answer(frame):  # one after the other, whatever they belong to
+            last_s = self.queue[-1][0] if self.queue else 0.0
+            self.queue.append((max(arrives_s, last_s + 2e-3), reply))
+
+    def receive(self):
+        if self.queue and self.queue[0][0] <= time.monotonic():
+            return self.queue.popleft()[1]
+        return None
+
+    def wait(self, timeout_s):
+        until_s = time.monotonic() + timeout_s
+        if self.queue:
+            until_s = min(until_s, self.queue[0][0])
+        time.sleep(max(0.0, until_s - time.monotonic()))
+
+
 class FakeLink:
     """Stands in for the shared bus."""
 

@@ -19,9 +19,9 @@ from rigd.devices.simulator import SimulatorAddress
 class Bench:
     """A sensor on a fake bus."""
 
-    def __init__(self, fakes, rig):
+    def __init__(self, fakes, rig, bus=None):
         self.fake = fakes.FakeNetcanoem()
-        self.bus = fakes.FakeBus(self.fake.answer)
+        self.bus = (bus or fakes.FakeBus)(self.fake.answer)
         self.link = fakes.FakeLink(self.bus)
         self.sensor = AtiCanSensor(rig, self.link)
 
@@ -45,6 +45,7 @@ def bench(fakes, can_rig):
 def quick(monkeypatch):
     """No long waits for replies that never come."""
     monkeypatch.setattr("rigd.devices.ati.can_sensor._REPLY_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("rigd.devices.ati.can_sensor._LATE_REPLY_S", 0.01)
 
 
 def with_ati(rig, **changes):
@@ -128,6 +129,18 @@ def test_units_become_newtons(bench, fakes):
     wanted = expected_wrench(fakes, fakes.GAUGES)
     factors = [4.4482216152605] * 3 + [1e-3] * 3
     assert bench.tick() == pytest.approx([w * f for w, f in zip(wanted, factors, strict=True)])
+
+
+def test_a_reply_that_comes_twice_is_not_taken_for_that_to_the_next_request(
+    fakes, can_rig, monkeypatch
+):
+    """One that is late is asked for again, and then two are on their way."""
+    monkeypatch.setattr("rigd.devices.ati.can_sensor._REPLY_TIMEOUT_S", 0.05)
+    bench = Bench(fakes, can_rig, fakes.LateBus)
+    bench.bus.late_s = {(2, b"\0"): [0.07, 0.07]}
+    bench.sensor.connect()
+    assert bench.fake.asked.count((2, b"\0")) == 3
+    assert bench.sensor.calibration()["matrix"] == [list(row) for row in fakes.MATRIX]
 
 
 def test_a_lost_set_up_frame_is_asked_for_again(bench, quick):

@@ -19,6 +19,7 @@ from canopen.objectdictionary import (
     ODVariable,
 )
 from canopen.profiles.p402 import BaseNode402
+from processes import eventually
 
 NODE = 5
 
@@ -152,13 +153,6 @@ def configure(node, delivery):
     node.pdo.save()
 
 
-def until(condition, timeout_s=60.0):
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(2e-3)
-
-
 def test_sdo_reads_and_writes(node):
     assert node.sdo[0x1000].raw == 0x20192
     assert node.sdo[0x1018][1].raw == 0x1234
@@ -214,7 +208,7 @@ def test_the_library_takes_the_drive_through_its_states(bus, node, bench, delive
         node.rpdo[1].start(0.005)
     node.op_mode = "CYCLIC SYNCHRONOUS TORQUE"
     assert node.op_mode == "CYCLIC SYNCHRONOUS TORQUE"
-    until(lambda: node.state == "SWITCH ON DISABLED")
+    assert eventually(lambda: node.state == "SWITCH ON DISABLED")
     for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
         node.state = state
         assert node.state == state
@@ -222,11 +216,11 @@ def test_the_library_takes_the_drive_through_its_states(bus, node, bench, delive
     node.rpdo[1][0x6071].raw = 150
     if delivery == 255:
         node.rpdo[1].transmit()
-    until(lambda: node.tpdo[1][0x6077].raw == 150)
-    until(lambda: node.tpdo[1][0x6064].raw > 10)
+    assert eventually(lambda: node.tpdo[1][0x6077].raw == 150)
+    assert eventually(lambda: node.tpdo[1][0x6064].raw > 10)
     assert node.tpdo[1][0x6041].raw == 0x1237
     node.state = "QUICK STOP ACTIVE"
-    until(lambda: node.state == "SWITCH ON DISABLED")
+    assert eventually(lambda: node.state == "SWITCH ON DISABLED")
     with bus.lock:
         bench.assert_off()
     node.rpdo[1].stop()
@@ -241,13 +235,13 @@ def test_a_lost_heartbeat_reaches_the_library_s_emergency_consumer(bus, node, be
     node.setup_402_state_machine(read_pdos=False)
     bus.syncing = bus.beating = True
     node.op_mode = "CYCLIC SYNCHRONOUS TORQUE"
-    until(lambda: node.state == "SWITCH ON DISABLED")
+    assert eventually(lambda: node.state == "SWITCH ON DISABLED")
     node.state = "OPERATION ENABLED"
     assert node.emcy.active == []
     bus.beating = False
-    until(lambda: node.emcy.active)
+    assert eventually(lambda: node.emcy.active)
     assert (node.emcy.active[0].code, node.emcy.active[0].register) == (0x8130, 0x11)
-    until(lambda: node.state == "FAULT")
+    assert eventually(lambda: node.state == "FAULT")
     with bus.lock:
         bench.assert_off()
     bus.beating = True
@@ -255,5 +249,5 @@ def test_a_lost_heartbeat_reaches_the_library_s_emergency_consumer(bus, node, be
         bench.beat()
     node.controlword = 0x00
     node.controlword = 0x80
-    until(lambda: node.state == "SWITCH ON DISABLED")
-    until(lambda: node.emcy.active == [])
+    assert eventually(lambda: node.state == "SWITCH ON DISABLED")
+    assert eventually(lambda: node.emcy.active == [])
