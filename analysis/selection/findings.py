@@ -67,7 +67,7 @@ def _hum(field: Field) -> Iterator[Finding]:
             sentence=(
                 f"The torque hums at {line.frequency_hz:.2f} Hz{source}, with "
                 f"{1e3 * line.amplitude_nm:.3g} mN·m all through the record. The motor did not "
-                "cause it; these frequencies were left out."
+                "cause it; it was taken out."
             ),
             value=line.amplitude_nm,
             interval=None,

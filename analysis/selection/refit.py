@@ -164,9 +164,9 @@ class Refit:
         fit = summary(self.objective, self.x, self.noise)
         if not len(self.columns):
             return fit
-        # `summary` takes every column for one of the free decay.
+        # `summary` does not know that the amplitudes of other columns are free as well.
         projected = self.objective.project(self.objective.linearise(self.x), self.noise.weight)
-        decays = projected.amplitudes.size - len(self.columns)
+        decays = fit.ringing.degrees_of_freedom
         scale = np.sqrt(np.diag(projected.amplitude_gram))
         scale[scale == 0] = 1.0
         gram = projected.amplitude_gram / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)

@@ -15,10 +15,14 @@ from analysis.whole_record.prediction import Prediction
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
+    from analysis.whole_record.free_decay import Pole
     from analysis.whole_record.measurement import Measurement
     from analysis.whole_record.plant import Plant
+    from analysis.whole_record.steady_hum import Hum
 
 _FEWEST_BINS: Final = 50
 _LARGEST_REST: Final = 0.3
@@ -48,6 +52,8 @@ class Comparison:
         Torque that was taken out because it followed no reference, at the samples kept.
     apart_at_unknown_nm : ndarray, shape (u,)
         The same at the ticks whose torque is unknown.
+    hum : tuple of Hum
+        What was taken out besides, as well as it was known; the rest of it is projected out.
     """
 
     measurement: Measurement
@@ -62,6 +68,7 @@ class Comparison:
     decays: DecaySpectra
     apart_nm: NDArray[np.float64] | float = 0.0
     apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    hum: tuple[Hum, ...] = ()
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -128,6 +135,12 @@ class Comparison:
         """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
         return np.fft.rfft(values)[..., self.bins]
 
+    def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Turn a spectrum in the band, shape (K,), into the samples kept, shape (samples,)."""
+        every = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
+        every[self.bins] = spectrum
+        return np.fft.irfft(every, self.samples)
+
     def followed_rad(self) -> NDArray[np.float64]:
         """Part of the angle that follows the reference, shape (m,).
 
@@ -180,6 +193,39 @@ class Comparison:
                 plant, self.decimation.factor, self._places(~self.measurement.torque_known)
             )[0],
         )
+
+    @property
+    def hum_nm(self) -> NDArray[np.float64] | float:
+        """Hum that was taken out, at the samples kept."""
+        return self._hum_at(np.arange(self.samples) / self.decimation.rate_hz)
+
+    def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
+        """Take out hum, in place of what was taken out before."""
+        other = replace(self, hum=hum)
+        more = other.hum_nm - self.hum_nm
+        ticks = self._places(~self.measurement.torque_known)
+        first_s = self.kept.start / self.decimation.rate_hz
+        time_s = ticks / self.measurement.rate_hz - first_s
+        torque_nm = self.torque_nm.copy()
+        torque_nm[self.kept] -= more
+        return replace(
+            other,
+            torque_nm=torque_nm,
+            apart_nm=self.apart_nm + more,
+            apart_at_unknown_nm=self.apart_at_unknown_nm
+            + (other._hum_at(time_s) - self._hum_at(time_s)),
+        )
+
+    def _hum_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
+
+    def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Spectra of what has amplitudes that nobody knows: free decays, then hum; shape (m, K)."""
+        decays = self.decays.columns(poles)
+        if not self.hum:
+            return decays
+        hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
+        return np.concatenate([decays, hum])
 
     def filled(self, plant: Plant) -> Comparison:
         """Put what `plant` predicts where the torque is unknown, so that it does not count there.

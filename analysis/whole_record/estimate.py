@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.structures import STRUCTURES
@@ -91,8 +92,14 @@ def fit_record(
     comparison = reference.objective.comparison.following_reference(reference.plant)
     searches = [search.on(comparison) for search in searches]
     reference = Descent(searches[closest].objective, reference.x)
+    clean = reference.without_hum(_BEFORE_LINES)
+    if clean is not reference:
+        reference, comparison = clean, clean.objective.comparison
+        rough = RoughResponse(comparison)
+        searches = [Search.of(Objective(comparison, search.unknowns), rough) for search in searches]
     # Lines are looked for once, in what a fit to every bin leaves.
     noise = reference.noise(with_lines=True)
+    noise = replace(noise, lines=(*noise.lines, *(hum.line for hum in comparison.hum)))
     descents = [
         search.under(noise, reference if i == closest else None).settled(noise, _TOLERANCE)
         for i, search in enumerate(searches)

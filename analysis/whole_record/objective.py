@@ -115,7 +115,7 @@ class Objective:
             residual=comparison.spectrum(torque - comparison.torque_nm[comparison.kept]),
             jacobian=(chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128),
             poles=poles,
-            columns=comparison.decays.columns(poles),
+            columns=comparison.nuisance(poles),
         )
 
     def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
@@ -131,7 +131,7 @@ class Objective:
             That of `Noise`, or 1 not to whiten.
         """
         residual, jacobian = at.residual * weight, at.jacobian * weight
-        if not at.poles:
+        if not len(at.columns):
             return Projected(residual, jacobian, np.zeros(0), np.zeros((0, 0)))
         columns = _parts(at.columns * weight)
         scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))

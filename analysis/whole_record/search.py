@@ -11,6 +11,7 @@ from analysis.whole_record.descent import descend
 from analysis.whole_record.noise import Noise, noise_of
 from analysis.whole_record.objective import Objective
 from analysis.whole_record.rough import RoughResponse, rough_minima, rough_starts
+from analysis.whole_record.steady_hum import hum_beside_modes, resonance_reach_hz
 from analysis.whole_record.steps import Steps
 
 if TYPE_CHECKING:
@@ -32,11 +33,8 @@ _CLEARLY: Final = 0.9
 """Cost, relative to where a descent has ended, that makes another rough minimum worth a look."""
 
 _MOST_MINIMA: Final = 4
-_RESONANCE: Final = 3.0
-"""Half-widths of a resonance (damping ratio times frequency) within which no line is sought."""
-
-_RESONANCE_BINS: Final = 20
-"""The same for the sharpest of them, in bins."""
+_LOOKS: Final = 3
+"""As often hum is looked for: the first fit took part of it for the beam's doing."""
 
 _FILLINGS: Final = 8
 _SETTLED: Final = 1e-6
@@ -80,6 +78,23 @@ class Descent:
                 break
         return here
 
+    def without_hum(self, tolerance: float) -> Descent:
+        """Take out what hums beside a mode, and settle again; `self` if nothing does."""
+        here = self
+        for _ in range(_LOOKS):
+            comparison = here.objective.comparison
+            at, noise = here.objective.linearise(here.x), here.noise()
+            amplitudes = here.objective.project(at, noise.weight).amplitudes
+            decays = sum(1 + pole.oscillates for pole in at.poles)
+            decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
+            hum = hum_beside_modes(comparison, here.plant, at.poles, noise, decaying_nm)
+            if not hum:
+                return self
+            objective = Objective(comparison.without_hum(hum), here.objective.unknowns)
+            here = Descent(objective, here.x)
+            here = here.settled(here.noise(), tolerance)
+        return here
+
     def noise(self, *, with_lines: bool = False) -> Noise:
         """Take for noise what remains here and is no free decay."""
         objective, comparison = self.objective, self.objective.comparison
@@ -89,10 +104,7 @@ class Descent:
             hz = comparison.frequency_hz
             near_mode = np.zeros(hz.size, dtype=bool)
             for pole in at.poles:
-                width = max(
-                    _RESONANCE * abs(pole.at_rad_s.real) / (2 * np.pi),
-                    _RESONANCE_BINS * (hz[1] - hz[0]),
-                )
+                width = resonance_reach_hz(pole, float(hz[1] - hz[0]))
                 near_mode |= np.abs(hz - abs(pole.at_rad_s.imag) / (2 * np.pi)) < width
         return noise_of(
             objective.project(at, 1.0).residual,

@@ -168,12 +168,13 @@ def ringing(
     scatter : float
         Variance of the whitened residual's parts.
     columns : ndarray of complex, shape (m, K)
-        Whitened spectra of the free decays.
+        Whitened spectra of the free decays, and of what was projected out beside them.
     hum : ndarray of complex, shape (h, K)
-        Those of what was left out as lines.
+        Those of the lines.
     """
-    decays = projected.amplitudes
-    explained = float(decays @ projected.amplitude_gram @ decays)
+    count = sum(1 + pole.oscillates for pole in poles)
+    columns, decays = columns[:count], projected.amplitudes[:count]
+    explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
     if len(hum) and decays.size:
         without = projected.residual - decays @ columns
         beside, left = _combination(without, np.concatenate([columns, hum]))
