@@ -14,8 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.levenberg_marquardt import Minimum, NormalEquations, minimise
+from analysis.descent import Box, Minimum, NormalEquations, descend
 from analysis.model import FrequencyResponseModel
+from analysis.recent import Recent
 from analysis.spread import sandwich_covariance
 from analysis.starts import starts
 from analysis.structures import PARAMETERS, STRUCTURES, Structure
@@ -161,25 +162,22 @@ class _Problem:
     def __init__(self, unknowns: Unknowns, grid: _Grid) -> None:
         self.unknowns = unknowns
         self.grid = grid
-        self._newest: tuple[bytes, _Linearised] | None = None
+        self._recent: Recent[_Linearised] = Recent()
 
     def cost(self, x: NDArray[np.float64]) -> float:
         deviation = self.grid.model.evaluate(self.unknowns.damping(x)) - self.grid.measured
         return float(self.grid.weights @ (deviation.real**2 + deviation.imag**2))
 
     def deviation_and_jacobian(self, x: NDArray[np.float64]) -> _Linearised:
-        """Model minus measurement, shape (n,), and its derivatives by the unknowns, (k, n).
+        """Model minus measurement, shape (n,), and its derivatives by the unknowns, (k, n)."""
+        return self._recent.at(x, self._linearise)
 
-        The newest are kept: where a descent ends is where standard deviations are asked for.
-        """
-        place = x.tobytes()
-        if self._newest is None or self._newest[0] != place:
-            model, gradient = self.grid.model.evaluate_with_gradient(
-                self.unknowns.damping(x), self.unknowns.structure.free
-            )
-            jacobian = self.unknowns.derivative_of_parameters(x).T @ gradient
-            self._newest = place, (model - self.grid.measured, jacobian)
-        return self._newest[1]
+    def _linearise(self, x: NDArray[np.float64]) -> _Linearised:
+        model, gradient = self.grid.model.evaluate_with_gradient(
+            self.unknowns.damping(x), self.unknowns.structure.free
+        )
+        jacobian = self.unknowns.derivative_of_parameters(x).T @ gradient
+        return model - self.grid.measured, jacobian
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         deviation, jacobian = self.deviation_and_jacobian(x)
@@ -193,30 +191,23 @@ class _Problem:
 
 def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfFit:
     unknowns = Unknowns.of(structure, whole.model.beam)
-    lower, upper = unknowns.bounds
+    bounds = Box(*unknowns.bounds)
     thin, full = _Problem(unknowns, few), _Problem(unknowns, whole)
     found = [
-        minimise(thin.normal_equations, x, lower, upper, relative_tolerance=_THINNED_TOLERANCE)
+        descend(
+            thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE, learns=False
+        )
         for x in starts(structure, thin.cost)
     ]
-    polished = _different(found)[:_POLISHED]
     # To the bottom of the few points first, and on with the Hessian learnt there: that leaves one
     # or two steps on every point.
-    for problem in (thin, full):
-        polished = [
-            minimise(
-                problem.normal_equations,
-                rough.x,
-                lower,
-                upper,
-                relative_tolerance=_POLISHED_TOLERANCE,
-                residual_part=rough.residual_part,
-            )
-            for rough in polished
-        ]
+    polished = _different(
+        [_polished(thin, rough, bounds) for rough in _different(found)[:_POLISHED]]
+    )
+    polished = [_polished(full, rough, bounds) for rough in polished]
     best = min(polished, key=lambda minimum: minimum.cost)
     parameters = unknowns.parameters(best.x)
-    on_edge = (best.x <= lower) | (best.x >= upper)
+    on_edge = (best.x <= bounds.lower) | (best.x >= bounds.upper)
     return FrfFit(
         structure=structure,
         weighting=weighting,
@@ -225,6 +216,17 @@ def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfF
         std=None if on_edge.any() else _standard_deviations(full, best.x),
         cost=best.cost,
         at_bounds=tuple(name for name, held in zip(structure.free, on_edge, strict=True) if held),
+    )
+
+
+def _polished(problem: _Problem, rough: Minimum, bounds: Box) -> Minimum:
+    """Descend to the bottom from where a rougher descent ended."""
+    return descend(
+        problem.normal_equations,
+        rough.x,
+        bounds,
+        relative_tolerance=_POLISHED_TOLERANCE,
+        second_part=rough.second_part,
     )
 
 

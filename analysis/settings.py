@@ -15,11 +15,22 @@ from rigd.spectral import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rigd.spectral import Estimator
 
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
 PAPER_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
 PAPER_WEIGHTINGS: Final = ("const", "omega")
+
+ESTIMATOR_WORDS: Final[Mapping[Estimator, str]] = {
+    "h1": "Welch's H1",
+    "h2": "Welch's H2",
+    "hv": "Welch's Hv",
+    "iv": "Welch's Hiv",
+    "fft": "whole-record FFT",
+}
+"""What reports and figures call an estimator."""
 
 
 @dataclass(frozen=True, slots=True)

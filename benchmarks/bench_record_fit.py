@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.descent import descend
 from analysis.structures import STRUCTURES
 from analysis.whole_record import (
     SETTINGS,
@@ -34,7 +35,6 @@ from analysis.whole_record import (
     fit_record,
 )
 from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.descent import descend
 from analysis.whole_record.free_decay import mode_poles
 from analysis.whole_record.objective import Objective
 from analysis.whole_record.steps import Steps

@@ -9,6 +9,7 @@ import numpy as np
 from analysis.campaigns.nominal import best_models
 from analysis.report import style
 from analysis.report.frf_figure import line_styles
+from analysis.settings import ESTIMATOR_WORDS
 from analysis.structures import STRUCTURES
 from rigd.view.response_charts import magnitude_db, phase_deg
 
@@ -28,13 +29,6 @@ _WIDE_COLUMNS: Final = 1500
 _MOST_LINES: Final = 40
 """Most sessions drawn: more would not be told apart."""
 _SYMBOLS: Final = {"zeta": "ζ", "alpha": "α", "gamma": "γ", "lambda": "λ"}
-_ESTIMATES: Final = {
-    "h1": "Welch's H1",
-    "h2": "Welch's H2",
-    "hv": "Welch's Hv",
-    "iv": "Welch's Hiv",
-    "fft": "whole-record FFT",
-}
 _MEASURED: Final[dict[str, Any]] = {
     "color": "#A8A8A8", "linewidth": 0.5, "alpha": 0.7, "rasterized": True,
 }  # fmt: skip
@@ -100,9 +94,10 @@ def best_figure(campaign: Campaign) -> Figure:
 def _figure(campaign: Campaign, width_in: float, height_in: float, what: str) -> Figure:
     count = len(campaign.sessions)
     drawn = "" if count <= _MOST_LINES else f", {_MOST_LINES} of them drawn"
+    estimator = ESTIMATOR_WORDS[campaign.settings.estimator]
     return style.new_figure(
         width_in, height_in, f"{count} sessions — {what}",
-        f"coupling torque over motor angle, {_ESTIMATES[campaign.settings.estimator]}{drawn}  ·  "
+        f"coupling torque over motor angle, {estimator}{drawn}  ·  "
         "a nominal model has the mean of the sessions' parameters",
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.report import style
+from analysis.settings import ESTIMATOR_WORDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,13 +30,6 @@ _MORE_LINES: Final[tuple[dict[str, Any], ...]] = (
     {"color": style.ORANGE, "linestyle": "-"},
 )
 _DAMPINGS: Final = {"zeta": "ζ", "alpha": "α", "gamma": "γ", "lambda": "λ"}
-_ESTIMATORS: Final = {
-    "h1": "Welch, H1",
-    "h2": "Welch, H2",
-    "hv": "Welch, Hv",
-    "iv": "Welch, Hiv",
-    "fft": "whole-record FFT",
-}
 
 
 def frf_figure(analysis: WelchAnalysis) -> Figure:
@@ -100,9 +94,9 @@ def _estimate_text(analysis: WelchAnalysis) -> str:
     settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     band = f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
     if settings.estimator == "fft":
-        return f"ratio of the transforms of the whole record  ·  {band}"
+        return f"{ESTIMATOR_WORDS['fft']}  ·  {band}"
     return (
-        f"{_ESTIMATORS[settings.estimator]}, {response.segments} Hamming segments of "
+        f"{ESTIMATOR_WORDS[settings.estimator]}, {response.segments} Hamming segments of "
         f"{segmentation.segment_length}, overlap {segmentation.overlap}, "
         f"nfft {segmentation.nfft}  ·  {band}"
     )
@@ -122,14 +116,14 @@ def _panel(
         whole = analysis.whole_record
         curves.append(
             (
-                "measured, whole-record FFT", whole.frequency_hz, whole.response,
+                f"measured, {ESTIMATOR_WORDS['fft']}", whole.frequency_hz, whole.response,
                 {"color": style.FAINT, "linewidth": 0.6},
             )
         )  # fmt: skip
     measured = analysis.response
     curves.append(
         (
-            f"measured, {_ESTIMATORS[analysis.settings.estimator]}", measured.frequency_hz,
+            f"measured, {ESTIMATOR_WORDS[analysis.settings.estimator]}", measured.frequency_hz,
             measured.response, {"color": style.GREY, "linewidth": 1.3},
         )
     )  # fmt: skip

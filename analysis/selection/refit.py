@@ -7,11 +7,12 @@ column of known shape and unknown size, which is projected out like the free dec
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.levenberg_marquardt import NormalEquations, minimise
+from analysis.descent import Box, descend
 from analysis.whole_record.noise import Noise, smooth_power
 from analysis.whole_record.objective import Linearisation, Objective
 from analysis.whole_record.summary import summary
@@ -19,6 +20,7 @@ from analysis.whole_record.summary import summary
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.descent import NormalEquations
     from analysis.whole_record import Plant, RecordFit
     from analysis.whole_record.comparison import Comparison
     from analysis.whole_record.unknowns import Unknowns
@@ -100,7 +102,7 @@ class Refit:
         max_evaluations : int
             Of the sum of squares; with 1 nothing moves.
         relative_tolerance : float
-            As `minimise` takes it.
+            As `descend` takes it.
         hold : str, optional
             An unknown that stays where it starts.
         """
@@ -111,13 +113,20 @@ class Refit:
         if hold is not None:
             place = unknowns.names.index(hold)
             lower[place] = upper[place] = x[place]
+        bounds = Box(lower, upper)
         complete = bool(comparison.measurement.torque_known.all())
         for _ in range(1 if complete else _FILLINGS):
             objective = WithColumns(comparison.filled(unknowns.plant(x)), unknowns, further)
-            x, equations = _lowest(
-                objective, x, (lower, upper), noise.weight, relative_tolerance, max_evaluations
+            found = descend(
+                partial(objective.normal_equations, weight=noise.weight),
+                x,
+                bounds,
+                relative_tolerance=relative_tolerance,
+                max_evaluations=max_evaluations,
+                learns=False,
             )
-        return cls(objective, x, equations, noise, further)
+            x = found.x
+        return cls(objective, x, found.equations, noise, further)
 
     @property
     def cost(self) -> float:
@@ -184,28 +193,3 @@ class Refit:
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         share = self.objective.comparison.measurement.torque_share
         return replace(self.noise, power=smooth_power(residual) / share)
-
-
-def _lowest(
-    objective: Objective,
-    start: NDArray[np.float64],
-    bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
-    weight: NDArray[np.float64],
-    relative_tolerance: float,
-    max_evaluations: int,
-) -> tuple[NDArray[np.float64], NormalEquations]:
-    """Descend, and keep the normal equations of where that ended."""
-    seen: dict[bytes, NormalEquations] = {}
-
-    def problem(x: NDArray[np.float64]) -> NormalEquations:
-        seen[x.tobytes()] = equations = objective.normal_equations(x, weight)
-        return equations
-
-    found = minimise(
-        problem,
-        start,
-        *bounds,
-        relative_tolerance=relative_tolerance,
-        max_evaluations=max_evaluations,
-    )
-    return found.x, seen[found.x.tobytes()]

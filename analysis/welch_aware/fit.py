@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.levenberg_marquardt import minimise
+from analysis.descent import Box, descend
 from analysis.structures import STRUCTURES
 from analysis.weights import Weighting, weighting_name, weights
 from analysis.welch_aware.comparison import Measured
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.levenberg_marquardt import Minimum
+    from analysis.descent import Minimum
     from analysis.structures import Structure
     from analysis.welch_aware.result import WelchAwareFit
     from analysis.whole_record import Setting
@@ -174,19 +174,24 @@ def _check_enough(objective: Objective) -> None:
 
 def _descend(objective: Objective, plain: PlainResponse) -> Minimum:
     """Descend from the best few starts, and on from where it is lowest."""
-    lower, upper = objective.unknowns.bounds
+    bounds = Box(*objective.unknowns.bounds)
+    # The most promising start last: what was computed where it ends is kept for going on.
     ends = [
-        minimise(
+        descend(
             objective.normal_equations,
             start,
-            lower,
-            upper,
+            bounds,
             relative_tolerance=_FIRST_TOLERANCE,
+            learns=False,
             max_evaluations=_FIRST_EVALUATIONS,
         )
-        for start in starting_points(plain, objective.unknowns)
+        for start in reversed(starting_points(plain, objective.unknowns))
     ]
     lowest = min(ends, key=lambda end: end.cost)
-    return minimise(
-        objective.normal_equations, lowest.x, lower, upper, relative_tolerance=_TOLERANCE
+    return descend(
+        objective.normal_equations,
+        lowest.x,
+        bounds,
+        relative_tolerance=_TOLERANCE,
+        learns=False,
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.levenberg_marquardt import NormalEquations
+from analysis.descent import NormalEquations
+from analysis.recent import Recent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from analysis.whole_record.unknowns import Unknowns
 
     _Linearised = tuple[NDArray[np.complex128], NDArray[np.complex128]]
-
-
-_NONE: Final = np.empty(0, dtype=np.complex128)
 
 
 class Objective:
@@ -30,29 +27,16 @@ class Objective:
     unknowns : Unknowns
     """
 
-    __slots__ = ("_lowest", "comparison", "unknowns")
+    __slots__ = ("_recent", "comparison", "unknowns")
 
     def __init__(self, comparison: Comparison, unknowns: Unknowns) -> None:
         self.comparison = comparison
         self.unknowns = unknowns
-        self._lowest: tuple[bytes, float, _Linearised] = (b"", math.inf, (_NONE, _NONE))
+        self._recent: Recent[_Linearised] = Recent()
 
     def linearise(self, x: NDArray[np.float64]) -> _Linearised:
-        """Model minus measurement, shape (K,), and its derivatives by the unknowns, (k, K).
-
-        Where the cost was lowest they are kept: a descent goes on from there, and the covariance
-        is asked for there. So they are read-only.
-        """
-        place = x.tobytes()
-        if place == self._lowest[0]:
-            return self._lowest[2]
-        found = self._linearise(x)
-        for each in found:
-            each.setflags(write=False)
-        cost = self._cost(found[0])
-        if cost < self._lowest[1]:
-            self._lowest = place, cost, found
-        return found
+        """Model minus measurement, shape (K,), and its derivatives by the unknowns, (k, K)."""
+        return self._recent.at(x, self._linearise)
 
     def _linearise(self, x: NDArray[np.float64]) -> _Linearised:
         unknowns = self.unknowns
@@ -62,15 +46,12 @@ class Objective:
             unknowns.gradient_by_unknowns(x).T @ gradient,
         )
 
-    def _cost(self, deviation: NDArray[np.complex128]) -> float:
-        return float(self.comparison.weights @ (deviation.real**2 + deviation.imag**2))
-
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Cost at `x`, with what a Gauss-Newton step needs."""
         deviation, jacobian = self.linearise(x)
         weighted = jacobian.conj() * self.comparison.weights
         return NormalEquations(
-            cost=self._cost(deviation),
+            cost=float(self.comparison.weights @ (deviation.real**2 + deviation.imag**2)),
             gradient=(weighted @ deviation).real,
             hessian=(weighted @ jacobian.T).real,
         )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.levenberg_marquardt import Minimum, NormalEquations, minimise
+from analysis.descent import Box, Minimum, NormalEquations, descend
 from analysis.starts import starts
 from analysis.thinning import thinned
 from analysis.whole_record.resonance_shift import resonance_shift
@@ -86,15 +86,15 @@ def starting_points(plain: PlainResponse, unknowns: Unknowns) -> list[NDArray[np
 
 def _minima(plain: PlainResponse, unknowns: Unknowns) -> list[Minimum]:
     """Different minima, the lowest first."""
-    lower, upper = unknowns.bounds
+    bounds = Box(*unknowns.bounds)
     shift = resonance_shift(plain.cost, unknowns)
     found = [
-        minimise(
+        descend(
             lambda x: plain.normal_equations(unknowns, x),
             unknowns.start(sizes) + shift,
-            lower,
-            upper,
+            bounds,
             relative_tolerance=_TOLERANCE,
+            learns=False,
             max_evaluations=_MAX_EVALUATIONS,
         )
         for sizes in starts(

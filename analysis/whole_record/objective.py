@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.levenberg_marquardt import NormalEquations
+from analysis.descent import NormalEquations
+from analysis.recent import Recent
 from analysis.whole_record.free_decay import Pole, mode_poles
 
 if TYPE_CHECKING:
@@ -88,19 +89,11 @@ class Objective:
     def __init__(self, comparison: Comparison, unknowns: Unknowns) -> None:
         self.comparison = comparison
         self.unknowns = unknowns
-        self._recent: dict[bytes, Linearisation] = {}
+        self._recent: Recent[Linearisation] = Recent()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Residual and derivatives at `x`; the last two points cost nothing again.
-
-        A new noise spectrum begins where the last descent ended.
-        """
-        key = x.tobytes()
-        if key not in self._recent:
-            if len(self._recent) == 2:
-                del self._recent[next(iter(self._recent))]
-            self._recent[key] = self._linearise(x)
-        return self._recent[key]
+        """Residual and derivatives at `x`; the last two points cost nothing again."""
+        return self._recent.at(x, self._linearise)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
         comparison, unknowns = self.comparison, self.unknowns

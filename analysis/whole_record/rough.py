@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.levenberg_marquardt import NormalEquations
+from analysis.descent import NormalEquations, descend
 from analysis.thinning import thinned
-from analysis.whole_record.descent import descend
 from analysis.whole_record.resonance_shift import resonance_shift
 from analysis.whole_record.response import ResponseGrid
 from analysis.whole_record.steps import Steps
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.levenberg_marquardt import Minimum
+    from analysis.descent import Minimum
     from analysis.whole_record.comparison import Comparison
     from analysis.whole_record.noise import Noise
     from analysis.whole_record.plant import Plant

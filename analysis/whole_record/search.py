@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.whole_record.descent import descend
+from analysis.descent import descend
 from analysis.whole_record.noise import Noise, noise_of
 from analysis.whole_record.objective import Objective
 from analysis.whole_record.rough import RoughResponse, rough_minima, rough_starts
@@ -17,7 +17,7 @@ from analysis.whole_record.steps import Steps
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.levenberg_marquardt import Minimum
+    from analysis.descent import Minimum
     from analysis.whole_record.comparison import Comparison
     from analysis.whole_record.plant import Plant
     from analysis.whole_record.unknowns import Unknowns

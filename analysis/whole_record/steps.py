@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class Steps:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     dampings: tuple[tuple[int, int, bool], ...]
+    straight: ClassVar[bool] = False
 
     @classmethod
     def of(cls, unknowns: Unknowns) -> Steps:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from analysis.descent import descend
 from analysis.structures import STRUCTURES
 from analysis.whole_record import SETTINGS, MeasurementError, Plant, fit_record
 from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.descent import descend
 from analysis.whole_record.objective import Objective
 from analysis.whole_record.steps import Steps
 from analysis.whole_record.unknowns import Unknowns

@@ -11,6 +11,7 @@ import numpy as np
 
 import rigd
 from analysis.report.html.markup import Markup, element
+from analysis.settings import ESTIMATOR_WORDS
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -133,19 +134,15 @@ def _record_fit_facts(subject: Subject) -> list[tuple[str, str]]:
 def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
     settings, used, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
-    estimator = {
-        "h1": "Welch, H1",
-        "h2": "Welch, H2",
-        "hv": "Welch, Hv",
-        "iv": "Welch, Hiv by way of the reference",
-    }.get(settings.estimator)
     facts = [
-        ("estimator", estimator or "ratio of the transforms of the whole record"),
+        ("estimator", ESTIMATOR_WORDS[settings.estimator]),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {len(response.frequency_hz)} bins"),
         ("types", ", ".join(settings.types)),
         ("weights", ", ".join(settings.weightings)),
     ]
-    if estimator:
+    if settings.estimator == "iv":
+        facts.append(("instrument", "the reference"))
+    if settings.estimator != "fft":
         facts.append(
             (
                 "segments",

@@ -1,0 +1,227 @@
+"""The descent: known minima, bounds, large residuals, and scipy's answer on the same problems."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from analysis.descent import Box, NormalEquations, descend
+from analysis.whole_record.steps import Steps
+
+T = np.linspace(0.0, 4.0, 200)
+
+
+def equations(residual, jacobian):
+    r, j = residual, jacobian
+    return NormalEquations(float(np.vdot(r, r).real), (j.conj() @ r).real, (j.conj() @ j.T).real)
+
+
+def decay(x):
+    """A damped rotation exp(-(a + j b) t) and its derivatives."""
+    model = np.exp(-(x[0] + 1j * x[1]) * T)
+    return model, np.array([-T * model, -1j * T * model])
+
+
+def decay_problem(measured):
+    def problem(x):
+        model, jacobian = decay(x)
+        return equations(model - measured, jacobian)
+
+    return problem
+
+
+FREE = Box(np.array([-50.0, -50.0]), np.array([50.0, 50.0]))
+
+
+def test_finds_what_made_the_data():
+    measured = decay([0.7, 2.0])[0]
+    found = descend(decay_problem(measured), np.array([0.3, 1.5]), FREE, relative_tolerance=1e-12)
+    np.testing.assert_allclose(found.x, [0.7, 2.0], rtol=1e-9)
+    assert found.cost < 1e-18
+
+
+@pytest.mark.parametrize("seed", [3, 44, 505, 6066])
+def test_agrees_with_scipy_with_residuals_left(seed):
+    rng = np.random.default_rng(seed)
+    measured = decay([0.7, 2.0])[0] + 0.3 * (rng.normal(size=200) + 1j * rng.normal(size=200))
+    found = descend(decay_problem(measured), np.array([0.5, 1.8]), FREE, relative_tolerance=1e-14)
+
+    def stacked(x):
+        r = decay(x)[0] - measured
+        return np.concatenate((r.real, r.imag))
+
+    peer = least_squares(stacked, [0.5, 1.8], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(found.x, peer.x, rtol=1e-5)
+    assert found.cost == pytest.approx(2 * peer.cost, rel=1e-10)
+
+
+def rosenbrock(x):
+    return equations(
+        np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]),
+        np.array([[-20 * x[0], -1.0], [10.0, 0.0]]),
+    )
+
+
+def test_follows_a_curved_valley():
+    found = descend(rosenbrock, np.array([-1.2, 1.0]), FREE, relative_tolerance=1e-14)
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("low", "high", "rest"), [(-2.0, 0.5, 0.5), (1.5, 3.0, 1.5)])
+def test_rests_on_a_bound_and_moves_along_it(low, high, rest):
+    found = descend(
+        rosenbrock,
+        np.array([1.0, -3.0]),
+        Box(np.array([low, -4.0]), np.array([high, 4.0])),
+        relative_tolerance=1e-14,
+    )
+    np.testing.assert_allclose(found.x, [rest, rest**2], atol=1e-8)
+    assert found.x[0] == rest
+    # Once the bound is known to hold, the other unknown is a linear problem.
+    assert found.evaluations < 12
+
+
+def test_start_outside_is_brought_inside():
+    box = Box(np.array([0.0, 0.0]), np.array([3.0, 3.0]))
+    found = descend(rosenbrock, np.array([9.0, -9.0]), box, relative_tolerance=1e-14)
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-7)
+
+
+def test_unknown_without_effect_stays():
+    def problem(x):
+        return equations(np.array([x[0] - 3.0]), np.array([[1.0], [0.0]]))
+
+    found = descend(problem, np.array([0.0, 1.25]), FREE, relative_tolerance=1e-12)
+    np.testing.assert_allclose(found.x, [3.0, 1.25], rtol=1e-12)
+
+
+def test_never_climbs_and_stops_when_told():
+    costs = []
+
+    def problem(x):
+        costs.append(rosenbrock(x).cost)
+        return rosenbrock(x)
+
+    found = descend(
+        problem, np.array([-1.2, 1.0]), FREE, relative_tolerance=1e-14, max_evaluations=7
+    )
+    assert found.evaluations == len(costs) == 7
+    assert found.cost == min(costs)
+
+
+misfit = decay_problem(decay([0.3, 2.0])[0] + decay([0.3, 3.0])[0])
+"""One rotation cannot follow two: most of the residual stays."""
+
+
+def test_large_residuals_are_descended_in_fewer_steps_if_the_start_is_near():
+    rough = descend(misfit, np.array([0.4, 2.3]), FREE, relative_tolerance=1e-3)
+    plain = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, learns=False)
+    near = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=np.zeros((2, 2)))
+    assert near.cost > 1.0
+    assert near.cost <= plain.cost * (1 + 1e-13)
+    np.testing.assert_allclose(near.x, plain.x, rtol=1e-6)
+    assert near.evaluations <= plain.evaluations / 2
+    again = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=near.second_part)
+    np.testing.assert_allclose(again.x, near.x, rtol=1e-6)
+    assert again.evaluations < near.evaluations
+
+
+def test_the_second_part_is_what_the_second_derivatives_make_of_the_residual():
+    near = descend(
+        misfit, np.array([0.3, 2.4]), FREE, relative_tolerance=1e-16,
+        second_part=np.zeros((2, 2)),
+    )  # fmt: skip
+    gradients = [
+        (misfit(near.x + h).gradient - misfit(near.x - h).gradient) / 2e-5 for h in 1e-5 * np.eye(2)
+    ]
+    beyond = np.array(gradients) - misfit(near.x).hessian
+    assert np.abs(beyond).max() > 0.05 * np.abs(misfit(near.x).hessian).max()
+    np.testing.assert_allclose(near.second_part, beyond, atol=0.1 * np.abs(beyond).max())
+
+
+def test_what_was_learnt_wrongly_does_no_harm():
+    found = descend(
+        rosenbrock, np.array([1.2, 1.3]), FREE, relative_tolerance=1e-14,
+        second_part=np.array([[-900.0, 0.0], [0.0, 300.0]]),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-6)
+
+
+def free(k):
+    return Steps(np.full(k, -10.0), np.full(k, 10.0), ())
+
+
+class Counted:
+    """Normal equations of real residuals; says how often it was asked."""
+
+    def __init__(self, residual, jacobian):
+        self.residual, self.jacobian, self.asked = residual, jacobian, 0
+
+    def __call__(self, x):
+        self.asked += 1
+        r, j = self.residual(x), self.jacobian(x)
+        return NormalEquations(float(r @ r), j.T @ r, j.T @ j)
+
+
+TIME = np.linspace(0.0, 3.0, 60)
+
+
+def decays(x):
+    """Two exponentials where the data hold none of that kind: the residual stays large."""
+    data = 1.5 * np.exp(-2.0 * TIME) + 0.8 * np.sin(4 * TIME) + 0.6
+    return x[0] * np.exp(-x[1] * TIME) + np.exp(-x[2] * TIME) - data
+
+
+def slopes(x):
+    first, second = np.exp(-x[1] * TIME), np.exp(-x[2] * TIME)
+    return np.stack([first, -x[0] * TIME * first, -TIME * second], axis=1)
+
+
+def test_a_large_residual_costs_few_evaluations_more():
+    start = np.array([1.0, 1.5, 0.5])
+    ours, theirs = Counted(decays, slopes), Counted(decays, slopes)
+    found = descend(ours, start, free(3), relative_tolerance=1e-12)
+    box = Box(np.full(3, -10.0), np.full(3, 10.0))
+    plain = descend(theirs, start, box, relative_tolerance=1e-12, learns=False)
+    other = least_squares(decays, start, slopes, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert 2 * other.cost > 5
+    assert found.cost == pytest.approx(2 * other.cost, rel=1e-10)
+    assert found.cost <= plain.cost * (1 + 1e-11)
+    assert found.evaluations == ours.asked
+    assert ours.asked <= 0.6 * theirs.asked
+
+
+def test_an_exact_fit_is_found_as_well():
+    def residual(x):
+        return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+    def jacobian(x):
+        return np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+
+    found = descend(
+        Counted(residual, jacobian), np.array([-1.2, 1.0]), free(2), relative_tolerance=1e-12
+    )
+    assert found.x == pytest.approx([1.0, 1.0], abs=1e-6)
+
+
+def test_on_a_bound_the_others_make_the_best_of_it():
+    matrix = np.array([[2.0, 1.9], [1.9, 2.0], [0.3, 0.1]])
+    target = np.array([1.0, -2.0, 0.5])
+    problem = Counted(lambda x: matrix @ x - target, lambda x: matrix)
+    bounded = Steps(np.array([-10.0, -0.5]), np.array([1.2, 10.0]), ())
+    found = descend(problem, np.array([0.0, 0.0]), bounded, relative_tolerance=1e-13)
+    other = least_squares(
+        lambda x: matrix @ x - target, [0.0, 0.0], bounds=(bounded.lower, bounded.upper), xtol=1e-14
+    )
+    assert found.x == pytest.approx(other.x, abs=1e-6)
+    assert found.x[1] == -0.5 or found.x[0] == 1.2
+    assert problem.asked < 12
+
+
+def test_it_ends_where_it_is_told_to():
+    problem = Counted(decays, slopes)
+    start = np.array([1.0, 1.5, 0.5])
+    found = descend(problem, start, free(3), relative_tolerance=1e-12, max_evaluations=4)
+    assert problem.asked == found.evaluations == 4
+    assert found.cost < problem(start).cost
+    nothing = Counted(lambda x: np.ones(3), lambda x: np.zeros((3, 2)))
+    assert descend(nothing, np.zeros(2), free(2), relative_tolerance=1e-9).evaluations == 1
