@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from analysis.descent import Minimum
     from analysis.whole_record.comparison import Comparison
     from analysis.whole_record.plant import Plant
+    from analysis.whole_record.steady_hum import Hum
     from analysis.whole_record.unknowns import Unknowns
 
 _BETWEEN_RIVALS: Final = 1e-2
@@ -78,19 +79,25 @@ class Descent:
                 break
         return here
 
+    def hum(self) -> tuple[Hum, ...]:
+        """Look for what hums beside a mode, with the beam found so far."""
+        comparison = self.objective.comparison
+        at, noise = self.objective.linearise(self.x), self.noise()
+        amplitudes = self.objective.project(at, noise.weight).amplitudes
+        decays = sum(1 + pole.oscillates for pole in at.poles)
+        decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
+        return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+
     def without_hum(self, tolerance: float) -> Descent:
         """Take out what hums beside a mode, and settle again; `self` if nothing does."""
         here = self
         for _ in range(_LOOKS):
-            comparison = here.objective.comparison
-            at, noise = here.objective.linearise(here.x), here.noise()
-            amplitudes = here.objective.project(at, noise.weight).amplitudes
-            decays = sum(1 + pole.oscillates for pole in at.poles)
-            decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
-            hum = hum_beside_modes(comparison, here.plant, at.poles, noise, decaying_nm)
+            hum = here.hum()
             if not hum:
                 return self
-            objective = Objective(comparison.without_hum(hum), here.objective.unknowns)
+            objective = Objective(
+                here.objective.comparison.without_hum(hum), here.objective.unknowns
+            )
             here = Descent(objective, here.x)
             here = here.settled(here.noise(), tolerance)
         return here

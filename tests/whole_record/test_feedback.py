@@ -32,13 +32,15 @@ def answers(n, damping):
 
 @pytest.fixture
 def controlled(sessions, plants, references):
-    """Let the sensor's noise move the motor, and the beam answer; the angle shows it all."""
+    """Let the sensor's noise (and a hum: Hz, N·m) move the motor, and the beam answer."""
 
-    def make(name, seed, *, multisine=False, **masks):
+    def make(name, seed, *, multisine=False, hum=(0.0, 0.0), **masks):
         session = sessions(name, tool_inertia_kg_m2=CLAMP, multisine=multisine)
         n = session.angle_rad.size
         decay = np.exp(-5 * np.arange(n) / n)
         noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=n)
+        hum_hz, amplitude_nm = hum
+        noise += amplitude_nm * np.sin(2 * np.pi * hum_hz * np.arange(n) / RATE_HZ)
         spectrum = np.fft.rfft(noise * decay, 4 * n)
         turned, answered = (
             np.fft.irfft(spectrum * answer, 4 * n)[:n] / decay
@@ -139,3 +141,14 @@ def test_between_the_lines_of_a_multisine_there_is_noise_only(controlled, true_p
     for name, value in true_parameters("VI", tool_inertia_kg_m2=CLAMP).items():
         if seventh.std[name]:
             assert abs(deviates(seventh, name, value)) < 3.0, name
+
+
+@pytest.mark.parametrize("hum", [(16.011, 5e-3), (16.08, 2e-2)])
+def test_a_hum_on_a_mode_that_moves_the_motor_is_no_response(controlled, hum):
+    quiet = fit(controlled("VI", 5), "VI")
+    analysis = fit_record(controlled("VI", 5, hum=hum), [STRUCTURES["VI"]])
+    (found,), (line,) = analysis.fits, analysis.lines
+    assert line.frequency_hz == pytest.approx(hum[0], abs=2e-3)
+    assert line.amplitude_nm == pytest.approx(hum[1], abs=3e-4)
+    for name in quiet.determined:
+        assert abs(found.parameters[name] - quiet.parameters[name]) < quiet.std[name], name
