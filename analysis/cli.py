@@ -14,6 +14,7 @@ import typer
 from analysis.commands.default_command import DEFAULT, DefaultCommandGroup
 from analysis.commands.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.commands.sessions import Routes, session_command
+from analysis.commands.version import Version
 from analysis.commands.welch_options import (
     Band,
     Estimator,
@@ -137,6 +138,7 @@ def analyze(
         str | None,
         typer.Option(metavar="ADDRESS", help="Campaign: Dask scheduler whose workers are used."),
     ] = None,
+    version: Version = False,  # noqa: ARG001 - its callback has told it
 ) -> None:
     """Identify the damping of a slewing beam from recorded sessions.
 

@@ -1,12 +1,15 @@
 """Entry point of ``rigd``, in a module that takes no time to import."""
 
 import os
+import select
 import signal
+
+_NOTHING_BEGAN = b"Stopped before anything began.\n"
 
 
 def main() -> None:
     """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    signal.signal(signal.SIGINT, _end)
     _fill_standard_descriptors()
     from rigd.cli.app import main as run
     from rigd.interruption import let_pass
@@ -15,6 +18,16 @@ def main() -> None:
         run()
     finally:
         let_pass()
+
+
+def _end(*_: object) -> None:
+    """Say that nothing has begun, where somebody listens, and end at once."""
+    try:
+        if select.select([], [2], [], 0)[1]:  # a full pipe would be waited for
+            os.write(2, _NOTHING_BEGAN)
+    except OSError:
+        pass  # closed, or its terminal is gone
+    os._exit(130)
 
 
 def _fill_standard_descriptors() -> None:

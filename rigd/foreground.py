@@ -43,7 +43,7 @@ class ForegroundError(Exception):
         super().__init__(message)
         self.wrong_use = wrong_use
         self.results = list(results)
-        """The sessions before."""
+        """The sessions before, and the one that failed."""
 
 
 def run_in_foreground(
@@ -131,6 +131,8 @@ def run_in_foreground(
                 _tell_result(tell, results[-1])
                 if not results[-1].went_well:
                     break
+        if stop.requested:
+            _tell_stop(results, repeat)
     except NoRoomError as error:
         raise ForegroundError(str(error), wrong_use=not results, results=results) from error
     except (
@@ -146,6 +148,7 @@ def run_in_foreground(
         raise ForegroundError(str(error), wrong_use=False) from error
     except SessionFailedError as error:
         text = f"{error} The drive is disabled. {what_is_kept(error.path)}"
+        results.append(error.result())
         raise ForegroundError(text, wrong_use=False, results=results) from error
     except RigError as error:
         raise ForegroundError(str(error), wrong_use=False, results=results) from error
@@ -162,12 +165,20 @@ def _tell_plan(tell: Tell, profile: Profile, excitation: Excitation, plan: Plan)
     predicted, limits = plan.prediction, profile.limits
     tell(f"{excitation.kind} on {profile.name}: {duration_s:g} s of record.")
     tell(
-        f"Predicted peaks: angle {predicted.peak_angle_rad:.4f} of {limits.angle_rad:g} rad, "
-        f"speed {predicted.peak_velocity_rad_s:.2f} of {limits.velocity_rad_s:g} rad/s, "
-        f"torque {predicted.peak_torque_nm:.2f} of {profile.rig.motor.peak_torque_nm:g} N·m."
+        f"Predicted peaks: angle {predicted.peak_angle_rad:.3g} of {limits.angle_rad:g} rad, "
+        f"speed {predicted.peak_velocity_rad_s:.3g} of {limits.velocity_rad_s:g} rad/s, "
+        f"torque {predicted.peak_torque_nm:.3g} of {profile.rig.motor.peak_torque_nm:g} N·m."
     )
     for warning in plan.warnings:
         tell(f"Warning: {warning}")
+
+
+def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
+    """Say that a stop came between two sessions or before the first; in a session, that tells."""
+    if len(results) == repeat or any(not result.went_well for result in results):
+        return
+    after = f" after {len(results)} of {repeat} sessions" if results else ""
+    _tell(f"stopped: no record{after}. Stopped by the operator before the session began.", err=True)
 
 
 def _tell_result(tell: Tell, result: SessionResult) -> None:

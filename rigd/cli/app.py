@@ -1,5 +1,7 @@
 """The command line of the rig, put together: ``rigd``."""
 
+import contextlib
+import errno
 import io
 import os
 import signal
@@ -19,6 +21,7 @@ from rigd.cli.replay import replay
 from rigd.cli.run import run_app, start_app
 from rigd.cli.serve import serve
 from rigd.cli.simulate import inject, simulate
+from rigd.cli.version import before_a_command
 from rigd.interruption import raise_on
 
 app = typer.Typer(
@@ -29,6 +32,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
 )
+app.callback()(before_a_command)
 # In the order in which an operator meets them.
 app.command()(check)
 app.add_typer(run_app, name="run")
@@ -51,17 +55,32 @@ app.command()(inject)
 
 def main() -> None:
     """Entry point of ``rigd``."""
+    command = typer.main.get_command(app)  # as long as Ctrl-C only has to say that nothing began
     raise_on(signal.SIGINT)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that does not know "·" or "²" gets a "?" instead of an error.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        app()
+        command()
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
     except OSError as error:
-        # Nobody reads what a command writes, or the disk behind it is full.
-        sys.stderr.write(f"Error: the output cannot be written ({error.strerror}).\n")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        with contextlib.suppress(OSError):  # nobody may read that either
+            sys.stderr.write(f"Error: {_explained(error)}\n")
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)
+
+
+def _explained(error: OSError) -> str:
+    """Say what the system refused, where no command has."""
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return (
+            f"Not enough files may be open at once ({error.strerror}); raise the limit (ulimit -n) "
+            "or close other programs."
+        )
+    if error.filename is not None:
+        return f"{error.filename}: {error.strerror}."
+    # Nobody reads what a command writes, or the disk behind it is full.
+    return f"the output cannot be written ({error.strerror})."

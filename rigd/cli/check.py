@@ -59,7 +59,7 @@ def reset(
     _end_as_by_ctrl_c()
     if reset_by_daemon(profile):
         return
-    rig_profile = _openable_profile(profile or "sim")
+    rig_profile = _openable_profile("sim" if profile is None else profile)
     from rigd.devices.contracts import DeviceError
     from rigd.devices.resetting import reset_drive
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.crew import start_crew
+from rigd.cli.crew import CrewGroup, start_crew
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed, profile_named
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     Prepare = Callable[[Profile], Profile]
 
 identify_app = typer.Typer(
+    cls=CrewGroup,
     help="Measure data of the rig that its profile has to state.",
     no_args_is_help=True,
     rich_markup_mode=None,

@@ -41,6 +41,7 @@ def replay(
             _save(path, save, web=web)
         return
     if not web and not has_screen():
+        _check_shown(path)  # what is no file for a window is none elsewhere, either
         elsewhere = (
             "the file can be looked at elsewhere as it is"
             if path.suffix == SUFFIX
@@ -77,6 +78,19 @@ def _save(path: Path, out: Path, *, web: bool) -> None:
         fail(f"--save {error}", EXIT_WRONG_USE)
     _convert(path, out)
     typer.echo(f"{out}: open it with rigd replay {out}.", err=True)
+
+
+def _check_shown(path: Path) -> None:
+    """End the command if a file is not of a kind that is shown, as far as its beginning tells."""
+    from rigd.session import SessionError, check_beginning
+
+    try:
+        if path.suffix == SUFFIX:
+            check_rrd_file(path)
+        else:
+            check_beginning(path)
+    except (RrdFileError, SessionError) as error:
+        fail(str(error), EXIT_FAILED)
 
 
 def _convert(path: Path, out: Path) -> None:

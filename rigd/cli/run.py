@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rigd.cli.crew import start_crew
+from rigd.cli.crew import CrewGroup, start_crew
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from rigd.cli.options import (
     SESSIONS,
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 run_app = typer.Typer(
     name="run",
+    cls=CrewGroup,
     help="Run one or more sessions in the foreground; Ctrl-C stops safely.\n\n"
     "Example: rigd run chirp --profile sim --fast",
     no_args_is_help=True,

@@ -19,7 +19,9 @@ def simulate(
     ] = False,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Write every event as a line of JSON."),
+        typer.Option(
+            "--log", metavar="FILE", help="Write every event as a line of JSON, to a new file."
+        ),
     ] = None,
     fault: Annotated[
         list[str] | None,
@@ -45,7 +47,7 @@ def simulate(
             quiet=quiet,
         )
         code = simulator.run_simulator(profile_named(profile).rig, options)
-    except simulator.FaultError as error:
+    except simulator.WrongUseError as error:
         fail(str(error), EXIT_WRONG_USE)
     except simulator.DeviceError as error:
         fail(str(error), EXIT_FAILED)
@@ -84,8 +86,10 @@ def inject(
 
     simulator = registry.simulator()
     try:
-        lines = simulator.inject(profile_named(profile).rig.name, fault or [])
-    except simulator.FaultError as error:
+        rig = profile_named(profile).rig
+        simulator.check_on_wire(rig)
+        lines = simulator.inject(rig.name, fault or [])
+    except simulator.WrongUseError as error:
         fail(str(error), EXIT_WRONG_USE)
     except simulator.DeviceError as error:
         fail(str(error), EXIT_FAILED)

@@ -131,9 +131,9 @@ def _follow(
 
 def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
     typer.echo(
-        f"{plan['record_s']:g} s of record. Predicted peaks: angle {plan['peak_angle_rad']:.4f} "
-        f"rad, speed {plan['peak_velocity_rad_s']:.2f} rad/s, torque "
-        f"{plan['peak_torque_nm']:.2f} N·m.",
+        f"{plan['record_s']:g} s of record. Predicted peaks: angle {plan['peak_angle_rad']:.3g} "
+        f"rad, speed {plan['peak_velocity_rad_s']:.3g} rad/s, torque "
+        f"{plan['peak_torque_nm']:.3g} N·m.",
         err=err,
     )
     for warning in plan["warnings"]:

@@ -40,5 +40,8 @@ def reset_drive(rig: RigParameters, moving: Reality | None = None) -> str:
     finally:
         drive.close()
     if fault is None:
-        return "The drive is not in fault; nothing was reset. It is disabled."
+        return (
+            "The drive is not in fault, so there is nothing to reset. It is disabled; the next "
+            "session can be started."
+        )
     return f"The drive was in fault: {fault}. The fault is reset; the drive is disabled."

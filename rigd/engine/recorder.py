@@ -45,23 +45,25 @@ def main() -> None:
     try:
         _record(parent, channels, writer, job.path.parent)
     except SessionError as error:
-        parent.send(error=f"{error}{_abandoned(writer)}")
+        text, kept = _abandoned(writer)
+        parent.send(error=f"{error}{text}", kept=None if kept is None else str(kept))
         raise SystemExit(1) from None
 
 
-def _abandoned(writer: SessionWriter) -> str:
+def _abandoned(writer: SessionWriter) -> tuple[str, Path | None]:
     """End a recording that cannot go on; say where its contents are if not under their name."""
     try:
         kept = writer.abandon()
     except SessionError:
-        return ""  # disk full, device gone: what reached the disk stays there
+        return "", None  # disk full, device gone: what reached the disk stays there
     if kept == writer.part:
-        return ""
+        return "", None
     if kept is None:
-        return " What was recorded could not be saved elsewhere."
+        return " What was recorded could not be saved elsewhere.", None
     return (
         f" What was recorded is now {kept}; rigd recover {shlex.quote(str(kept))} makes "
-        "a session file of it."
+        "a session file of it.",
+        kept,
     )
 
 

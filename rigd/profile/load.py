@@ -103,6 +103,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 
 def _find(name_or_path: str | Path) -> Path:
+    if not str(name_or_path):
+        raise ProfileError(f"No profile is named; {_known_profiles()}, or give a .toml file.")
     given = Path(name_or_path)
     if given.suffix == ".toml" or given.parent != Path():
         if given.is_file():

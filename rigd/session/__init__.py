@@ -11,8 +11,16 @@ if TYPE_CHECKING:
     from rigd.session.errors import SessionError, SessionExistsError
     from rigd.session.format import SAMPLE_DTYPE, SAMPLE_SIZE, Status
     from rigd.session.info import SessionInfo, describe
-    from rigd.session.reader import Event, Session, read_controls, read_session, read_timings
+    from rigd.session.reader import (
+        Event,
+        Session,
+        check_beginning,
+        read_controls,
+        read_session,
+        read_timings,
+    )
     from rigd.session.recovery import Recovery, recover
+    from rigd.session.remedy import holds_samples
     from rigd.session.writer import SessionWriter
 
 __all__ = [
@@ -26,7 +34,9 @@ __all__ = [
     "SessionInfo",
     "SessionWriter",
     "Status",
+    "check_beginning",
     "describe",
+    "holds_samples",
     "read_controls",
     "read_session",
     "read_timings",
@@ -37,8 +47,16 @@ _HOMES = {
     "errors": ("SessionError", "SessionExistsError"),
     "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "Status"),
     "info": ("SessionInfo", "describe"),
-    "reader": ("Event", "Session", "read_controls", "read_session", "read_timings"),
+    "reader": (
+        "Event",
+        "Session",
+        "check_beginning",
+        "read_controls",
+        "read_session",
+        "read_timings",
+    ),
     "recovery": ("Recovery", "recover"),
+    "remedy": ("holds_samples",),
     "writer": ("SessionWriter",),
 }
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ class SessionInfo:
         return [f"{key:{width}}  {_one_line(value)}" for key, value in rows]
 
 
-def describe(path: Path) -> SessionInfo:
+def describe(path: str | PathLike[str]) -> SessionInfo:
     """Read a session file and summarise it.
 
     Raises
@@ -102,6 +103,7 @@ def describe(path: Path) -> SessionInfo:
     SessionError
         If the file cannot be read or does not state a rate greater than 0.
     """
+    path = Path(path)
     session = read_session(path)
     rate_hz = session.number("rate_hz")
     if rate_hz <= 0:

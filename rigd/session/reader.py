@@ -1,11 +1,11 @@
 """Reader of session files: the whole file to arrays, or an error that says what is wrong."""
 
 import mmap
-import shlex
 import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -34,7 +34,7 @@ from rigd.session.mcap_reader import (
     McapTooLargeError,
     read_mcap,
 )
-from rigd.session.mcap_writer import MESSAGE_HEAD
+from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
 from rigd.session.schema import (
     CONTROL_SCHEMA,
     CONTROL_TOPIC,
@@ -180,7 +180,7 @@ class Session:
         return value
 
 
-def read_session(path: Path, *, max_bytes: int = MAX_TOTAL_BYTES) -> Session:
+def read_session(path: str | PathLike[str], *, max_bytes: int = MAX_TOTAL_BYTES) -> Session:
     """Read a whole session file.
 
     Parameters
@@ -194,6 +194,7 @@ def read_session(path: Path, *, max_bytes: int = MAX_TOTAL_BYTES) -> Session:
         If the file is missing, empty, not an MCAP file, incomplete, damaged, too large, of a later
         format version, or no session.
     """
+    path = Path(path)
     contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC), max_bytes=max_bytes)
     metadata = merged_metadata(contents, "session") or {}
     version = metadata.get("format_version", FORMAT_VERSION)
@@ -216,7 +217,7 @@ def read_session(path: Path, *, max_bytes: int = MAX_TOTAL_BYTES) -> Session:
     )
 
 
-def read_timings(path: Path) -> npt.NDArray[np.void]:
+def read_timings(path: str | PathLike[str]) -> npt.NDArray[np.void]:
     """Read the ages of the readings of a session file.
 
     Returns
@@ -228,10 +229,11 @@ def read_timings(path: Path) -> npt.NDArray[np.void]:
     SessionError
         As `read_session` does.
     """
+    path = Path(path)
     return _decode_topic(path, _load(path, (TIMING_TOPIC,)), _TIMINGS)
 
 
-def read_controls(path: Path) -> npt.NDArray[np.void]:
+def read_controls(path: str | PathLike[str]) -> npt.NDArray[np.void]:
     """Read the controller's terms of a session file.
 
     Returns
@@ -243,6 +245,7 @@ def read_controls(path: Path) -> npt.NDArray[np.void]:
     SessionError
         As `read_session` does.
     """
+    path = Path(path)
     return _decode_topic(path, _load(path, (CONTROL_TOPIC,)), _CONTROLS)
 
 
@@ -285,11 +288,7 @@ def load_contents(
         If the file is missing, empty, too large or not an MCAP file.
     """
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
-        if status.st_size == 0:
-            raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
+        _refuse_no_file(path)
         with path.open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
@@ -297,13 +296,47 @@ def load_contents(
             on_progress=on_progress,
         )  # fmt: skip
     except OSError as error:
-        raise SessionError(
-            f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
-        ) from None
+        raise _unreadable(path, error) from None
     except McapTooLargeError as error:
         raise SessionError(f"{path} {error}. Give a shorter session.") from None
     except McapError as error:
-        raise SessionError(f"{path} {error}. Give a session file (*.mcap).") from None
+        raise _foreign(path, error) from None
+
+
+def check_beginning(path: Path) -> None:
+    """See that a file begins as session files do.
+
+    Raises
+    ------
+    SessionError
+        If it is missing, empty or not an MCAP file.
+    """
+    try:
+        _refuse_no_file(path)
+        with path.open("rb") as file:
+            read_mcap(memoryview(file.read(len(MAGIC))), ())
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    except McapError as error:
+        raise _foreign(path, error) from None
+
+
+def _refuse_no_file(path: Path) -> None:
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
+    if status.st_size == 0:
+        raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
+
+
+def _unreadable(path: Path, error: OSError) -> SessionError:
+    return SessionError(
+        f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
+    )
+
+
+def _foreign(path: Path, error: McapError) -> SessionError:
+    return SessionError(f"{path} {error}. Give a session file (*.mcap).")
 
 
 def load_samples(path: Path, contents: McapContents) -> npt.NDArray[np.void]:
@@ -320,21 +353,16 @@ def load_samples(path: Path, contents: McapContents) -> npt.NDArray[np.void]:
 
 
 def _damage_message(path: Path, contents: McapContents) -> str:
-    remedy = f"`rigd recover {shlex.quote(str(path))}`"
+    from rigd.session.remedy import remedy  # it reads files, too
+
     if contents.complete:
-        return (
-            f"{path} is damaged: it {contents.damage}. Copy it again from where it was recorded, "
-            f"or save what is intact with {remedy}."
-        )
+        return f"{path} is damaged: it {contents.damage}{remedy(path, was_whole=True)}"
     if is_being_written(path):
         return (
             f"{path} is incomplete, because it is still being recorded. Wait for the end of the "
             "session, or stop it."
         )
-    return (
-        f"{path} is incomplete: it {contents.damage}; {contents.count(SAMPLE_TOPIC)} complete "
-        f"samples are readable before that. Save them with {remedy}."
-    )
+    return f"{path} is incomplete: it {contents.damage}{remedy(path, was_whole=False)}"
 
 
 def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:

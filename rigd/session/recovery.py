@@ -102,7 +102,9 @@ def recovered_path(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(_SESSION_SUFFIX) + _RECOVERED_SUFFIX)
 
 
-def recover(path: Path, on_progress: Callable[[float], None] | None = None) -> Recovery:
+def recover(
+    path: str | os.PathLike[str], on_progress: Callable[[float], None] | None = None
+) -> Recovery:
     """Write what is intact of a session file, up to the damage, to a new file beside it.
 
     The file itself is left as it is. The new one appears under its name when it is complete, on
@@ -121,6 +123,7 @@ def recover(path: Path, on_progress: Callable[[float], None] | None = None) -> R
         If the file cannot be read, is still being recorded, or holds no sample before the damage;
         or if the new one cannot be written.
     """
+    path = Path(path)
     if path.exists() and not path.is_file():  # a pipe would be waited for
         raise SessionError(f"{path} is not a file. Give the path of a session file.")
     target = recovered_path(path)

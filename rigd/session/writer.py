@@ -155,8 +155,8 @@ class SessionWriter:
         If the file cannot be created.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = path = Path(path)
         self.part = path.with_name(path.name + PART_SUFFIX)
         self._samples = bytearray()
         self._controls = bytearray()

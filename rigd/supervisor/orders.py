@@ -135,7 +135,16 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     if number is not None:
         stem += f"-{number:02d}"
     path = folder / f"{stem}.mcap"
-    while path.exists() or path.with_name(path.name + PART_SUFFIX).exists():
+    return _free(path)
+
+
+def part_of(path: Path) -> Path:
+    """Name the file that is to become another when it is whole."""
+    return path.with_name(path.name + PART_SUFFIX)
+
+
+def _free(path: Path) -> Path:
+    while path.exists() or part_of(path).exists():
         path = another_path(path)
     return path
 
@@ -156,16 +165,23 @@ def what_is_kept(path: Path | None) -> str:
     path
         The file that was begun for it, if any.
     """
+    from rigd.session import holds_samples
+
     if path is None:
         return "There is no file of it."
-    part = path.with_name(path.name + PART_SUFFIX)
+    part = part_of(path)
     try:
         kept, whole = part.exists(), path.exists()
     except OSError as error:
         return f"Its folder {path.parent} cannot be looked into ({error.strerror})."
-    if kept:
-        return (
-            f"What was recorded is in {part}; rigd recover {shlex.quote(str(part))} makes a clean "
-            "file of it."
-        )
-    return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
+    if not kept:
+        return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
+    if not holds_samples(part):
+        return f"Nothing was recorded; {part} holds no sample and can be removed."
+    old, new = (shlex.quote(str(part_of(name))) for name in (path, _free(path)))
+    if not whole:
+        return f"What was recorded is in {part}; rigd recover {old} makes a clean file of it."
+    return (
+        f"What was recorded is in {part}, whose name without {PART_SUFFIX} is taken: after "
+        f"mv {old} {new} rigd recover {new} makes a clean file of it."
+    )

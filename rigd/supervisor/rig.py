@@ -317,6 +317,6 @@ def _lay_out(crew: Crew, rate_hz: float, *, fast: bool) -> None:
         crew.lay_out(rate_hz, fast=fast)
     except OSError as error:
         raise RigError(
-            "There is not enough shared memory for the processes of a session "
-            f"({error.strerror}); free some in /dev/shm."
+            f"The processes of a session get no shared memory ({error.strerror}); look at the "
+            "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
         ) from error

@@ -6,9 +6,10 @@ has the file closed with the outcome.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.events import Event, read_events
@@ -21,7 +22,7 @@ from rigd.engine.signals import StopRequest
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.header import file_header
 from rigd.supervisor.live_view import LiveView
-from rigd.supervisor.orders import Order, another_path
+from rigd.supervisor.orders import Order, another_path, part_of
 
 _POLL_S = 0.05
 _PATIENCE_S = 5.0
@@ -40,9 +41,37 @@ class SessionFailedError(Exception):
     ----------
     path
         Its file, if one was begun.
+    kept
+        Where its record was saved, if that is not the ``.part`` of the file.
+    counts
+        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``.
     """
 
     path: Path | None = None
+    kept: Path | None = None
+    counts: Mapping[str, int] = MappingProxyType({"scheduled": 0, "missed": 0, "late": 0})
+
+    def result(self) -> "SessionResult":
+        """Return how the session ended, once its processes have."""
+        part, whole = self.kept, None
+        if part is None and self.path is not None:
+            try:
+                if part_of(self.path).exists():
+                    part = part_of(self.path)
+                elif self.path.exists():
+                    whole = self.path  # by a recorder that was only slow
+            except OSError:
+                part = part_of(self.path)  # as far as anybody knows
+        return SessionResult(
+            path=whole,
+            outcome="fault",
+            reason=str(self),
+            recorded=None,
+            lost=None,
+            fault=True,
+            part=part,
+            **self.counts,
+        )
 
 
 class _NameTakenError(SessionFailedError):
@@ -54,18 +83,21 @@ class SessionResult:
     """How a session ended."""
 
     path: Path | None
-    """None: it ended before tick 0, and there is no file."""
+    """None: there is no file, for it ended before tick 0, or none that is whole."""
     outcome: str
     reason: str
     scheduled: int
-    recorded: int
+    recorded: int | None
+    """None: not known before the file is recovered; likewise `lost`."""
     missed: int
     late: int
-    lost: int
+    lost: int | None
     fault: bool
     """Something failed, in the record or after it, whatever was asked for meanwhile."""
     live_dropped: int = 0
     """Samples that the live view did not get."""
+    part: Path | None = None
+    """What there is of a file that could not be made whole."""
 
     @property
     def went_well(self) -> bool:
@@ -76,6 +108,7 @@ class SessionResult:
         """Return it as JSON documents have it."""
         return {
             "path": None if self.path is None else str(self.path),
+            "part": None if self.part is None else str(self.part),
             "outcome": self.outcome,
             "reason": self.reason,
             "scheduled": self.scheduled,
@@ -146,6 +179,7 @@ class Session:
         self._recorder_lost: str | None = None
         self._control_at_work = False
         self._opened: Path | None = None
+        self._kept: Path | None = None
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
@@ -167,7 +201,8 @@ class Session:
                 self._board[Word.STOP] = Stop.NO_RECORDER
                 self._listen_to_control()
             failure = SessionFailedError(self._recorder_lost)
-            failure.path = self._opened
+            failure.path, failure.kept = self._opened, self._kept
+            failure.counts = self._counts()
             raise failure from None
         finally:
             stop.on_request = _nothing
@@ -183,8 +218,8 @@ class Session:
             )
         except OSError as error:
             raise SessionFailedError(
-                f"There is not enough shared memory for a session of this length "
-                f"({error.strerror}); free some in /dev/shm."
+                f"A session of this length gets no shared memory ({error.strerror}); look at the "
+                "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
             ) from None
         self._open_file()
         order = self._order
@@ -276,25 +311,35 @@ class Session:
 
     def _as_finished(self, reason: str) -> Message:
         """Say what the control process would have said, as far as the board tells."""
-        board = self._board
-        words = (Word.SCHEDULED, Word.MISSED, Word.LATE)
-        # Before this session's record they stand where the last one left them.
-        scheduled, missed, late = (board[word] if board[Word.GO] else 0 for word in words)
-        whole = scheduled == self._order.excitation.reference_rad.size
+        counts = self._counts()
+        whole = counts["scheduled"] == self._order.excitation.reference_rad.size
         return {
             "finished": "complete" if whole else "fault",
             "reason": f"After the record: {reason}" if whole else reason,
             "fault": True,
-            "counts": {"scheduled": scheduled, "missed": missed, "late": late},
+            "counts": counts,
             "results": {},
         }
+
+    def _counts(self) -> dict[str, int]:
+        board = self._board
+        words = {"scheduled": Word.SCHEDULED, "missed": Word.MISSED, "late": Word.LATE}
+        # Before this session's record they stand where the last one left them.
+        return {name: board[word] if board[Word.GO] else 0 for name, word in words.items()}
 
     def _recorder_trouble(self) -> str | None:
         try:
             message = self._crew.recorder.poll(0.0)
         except ChildError as error:
             return str(error)
-        return None if message is None else str(message.get("error", message))
+        if message is None:
+            return None
+        self._note_kept(message)
+        return str(message.get("error", message))
+
+    def _note_kept(self, message: Message) -> None:
+        if message.get("kept"):
+            self._kept = Path(message["kept"])
 
     def _ask_recorder(self, expected: str, patience_s: float = _PATIENCE_S) -> Message:
         """Wait for its answer, going on watching: the motor may be held meanwhile."""
@@ -308,6 +353,7 @@ class Session:
                 f"The recorder process does not answer within {patience_s:g} s."
             )
         if "error" in message:
+            self._note_kept(message)
             failed = _NameTakenError if message.get("taken") else SessionFailedError
             raise failed(message["error"])
         if expected not in message:

@@ -1,9 +1,16 @@
 """Ctrl-C ends `rigd` with 130 wherever in Python's own doings it arrives."""
 
+import contextlib
+import json
+import os
 import subprocess
 import sys
 
 import pytest
+
+from rigd.engine.signals import StopRequest
+from rigd.foreground import _tell_stop
+from rigd.supervisor.session import SessionResult
 
 DURING = {
     # What defines a dataclass or a named tuple is an `exec` of text.
@@ -46,16 +53,101 @@ DURING = {
 }
 
 
+@pytest.fixture
+def stop(tmp_path):
+    """Run a command that is stopped in the middle of something; returns the completed process."""
+
+    def run(before, *command, **options):
+        (tmp_path / "stopped.py").write_text(before + "from rigd.__main__ import main\nmain()\n")
+        return subprocess.run(
+            [sys.executable, "-m", "stopped", *command],
+            cwd=tmp_path,
+            check=False,
+            stdout=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            **options,
+        )
+
+    return run
+
+
 @pytest.mark.parametrize("before", DURING.values(), ids=DURING.keys())
-def test_ctrl_c_ends_with_130(tmp_path, before):
-    (tmp_path / "stopped.py").write_text(before + "from rigd.__main__ import main\nmain()\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "stopped", "replay", "seen.rrd"],
-        cwd=tmp_path,
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+def test_ctrl_c_ends_with_130(stop, before):
+    done = stop(before, "replay", "seen.rrd", stderr=subprocess.PIPE)
     assert (done.returncode, done.stdout) == (130, "")
     assert "Traceback" not in done.stderr
+
+
+def test_before_anything_began_it_says_so(stop):
+    done = stop(DURING["imports"], "run", "hold", stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (130, "Stopped before anything began.\n")
+
+
+def test_nobody_who_hears_that_is_waited_for(stop):
+    heard, told = os.pipe()
+    os.set_blocking(told, False)
+    try:
+        while os.write(told, bytes(4096)):
+            pass
+    except BlockingIOError:
+        os.set_blocking(told, True)
+    assert stop(DURING["imports"], "run", "hold", stderr=told).returncode == 130
+    os.close(heard)
+    assert stop(DURING["imports"], "run", "hold", stderr=told).returncode == 130
+    os.close(told)
+
+
+def interrupt(**_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("command", [("run", "hold"), ("identify", "motor")])
+def test_before_a_session_s_processes_are_started_it_says_so(rigd_here, monkeypatch, command):
+    monkeypatch.setattr(f"rigd.cli.{command[0]}.start_crew", interrupt)
+    done = rigd_here(*command)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "Stopped before anything began.\n"
+
+
+@pytest.fixture
+def stopped_early(monkeypatch, rigd_here):
+    """Run a command whose stop was asked for before it connected anything."""
+    stop = StopRequest()
+    stop.requested = True
+    for command in ("run", "identify"):
+        monkeypatch.setattr(
+            f"rigd.cli.{command}.start_crew", lambda **_: (stop, contextlib.nullcontext())
+        )
+    return rigd_here
+
+
+def test_before_the_devices_are_connected_it_says_that_there_is_no_record(stopped_early, tmp_path):
+    done = stopped_early("run", "hold", "--fast", "--json")
+    assert done.returncode == 130
+    assert json.loads(done.stdout) == {"sessions": []}
+    *_, last = done.stderr.splitlines()
+    assert last == "stopped: no record. Stopped by the operator before the session began."
+    assert not list(tmp_path.glob("sessions/*"))
+
+
+def test_so_does_identify(stopped_early):
+    done = stopped_early("identify", "motor", "--fast")
+    assert done.returncode == 130
+    assert done.stderr.count("stopped: no record. Stopped by the operator") == 1
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "said"),
+    [
+        (["complete"], "stopped: no record after 1 of 3 sessions."),
+        (["complete", "stopped"], ""),  # that one has told
+        (["complete"] * 3, ""),
+    ],
+)
+def test_a_stop_between_two_sessions_is_told(capsys, outcomes, said):
+    results = [SessionResult(None, each, "", 1, 1, 0, 0, 0, fault=False) for each in outcomes]
+    _tell_stop(results, 3)
+    told = capsys.readouterr().err
+    assert told.startswith(said)
+    assert bool(told) == bool(said)

@@ -438,7 +438,14 @@ def test_without_a_screen_it_says_what_else_there_is(rigd_here, short, monkeypat
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     refused(rigd_here("replay", short), 1, "no screen", "--web", "--save")
-    recording = rigd_here("replay", "seen.rrd")
+    for name in ("nonsense.txt", "nonsense.rrd"):
+        nonsense = short.with_name(name)
+        nonsense.write_text("hello")
+        refused(rigd_here("replay", nonsense), 1, str(nonsense), "Give a")
+        refused(rigd_here("replay", f"{nonsense}.gone.mcap"), 1, "No such file")
+    seen = short.with_name("seen.rrd")
+    seen.write_bytes(b"RRF2")
+    recording = rigd_here("replay", seen)
     refused(recording, 1, "no screen", "--web")
     assert "--save" not in recording.stderr
 

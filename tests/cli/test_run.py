@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -243,6 +244,7 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, t
     assert process.returncode == 1
     assert "Traceback" not in errors
     assert "not overwritten" in errors
+    assert re.search(r"after mv \S+\.mcap\.part \S+_2\.mcap\.part rigd recover \S+_2\.", errors)
     assert part.with_suffix("").read_text() == "somebody else's"
     assert part.exists()
 
@@ -283,9 +285,13 @@ def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, 
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     (part,) = tmp_path.glob("sessions/*.part")
-    sessions = json.loads(output)["sessions"]
-    assert len(sessions) == int(part.name.split(".")[0].rsplit("-")[-1]) - 1 >= 1
-    assert {session["outcome"] for session in sessions} == {"complete"}
+    *before, failed = json.loads(output)["sessions"]
+    assert len(before) == int(part.name.split(".")[0].rsplit("-")[-1]) - 1 >= 1
+    assert {session["outcome"] for session in before} == {"complete"}
+    assert {session["part"] for session in before} == {None}
+    assert (failed["outcome"], failed["path"]) == ("fault", None)
+    assert tmp_path / failed["part"] == part
+    assert "recorder process was killed by signal 9" in failed["reason"]
     assert part.name in errors
 
 

@@ -1,6 +1,11 @@
 """What an operator can get wrong: one or two sentences, an exit code, nothing broken."""
 
+import contextlib
+import errno
+import re
+
 import pytest
+from typer.testing import CliRunner
 
 PROFILE_CHANGES = {
     "missing key": ("viscous_nm_s_per_rad = ", "# viscous_nm_s_per_rad = ", "viscous_nm_s_per_rad"),
@@ -62,6 +67,7 @@ def test_a_bad_profile_is_refused(rigd_here, tmp_path, change):
         (("--repeat", "0"), ("--repeat",)),
         (("--seed", "-1"), ("--seed",)),
         (("--profile", "nowhere"), ("nowhere", "sim")),
+        (("--profile", ""), ("No profile is named; known profiles are",)),
         (("--no-such-option",), ("--no-such-option",)),
         (("--output", "taken"), ("taken",)),
         (("--note", "two\nlines"), ("--note",)),
@@ -100,3 +106,42 @@ def test_info_on_what_is_no_session_file(rigd_here, tmp_path, content):
 def test_a_plain_word_in_the_wrong_place_is_explained(rigd_here, tmp_path):
     (tmp_path / "reference.csv").write_text("time_s;angle_rad\n0;0\n1;0.1\n")
     assert_refused(rigd_here("run", "file", "reference.csv", "--fast"), 2, "semicolons", "commas")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.EMFILE, "Too many open files", "x.py"), ("ulimit -n", "Too many open")),
+        (OSError(errno.ENFILE, "Too many open files in system"), ("close other programs",)),
+        (OSError(errno.EACCES, "Permission denied", "/x"), ("/x: Permission denied.",)),
+        (OSError(errno.ENOSPC, "No space left on device"), ("the output cannot be written (No",)),
+    ],
+)
+def test_what_the_system_refuses_is_told_as_what_it_is(error, words):
+    from rigd.cli.app import _explained
+
+    for word in words:
+        assert word in _explained(error)
+    assert ("output" in _explained(error)) == (error.errno == errno.ENOSPC)
+
+
+def test_both_commands_say_which_version_they_are(rigd_here):
+    import rigd
+    from analysis.cli import app
+
+    assert rigd_here("--version").stdout == f"rigd {rigd.__version__}\n"
+    assert CliRunner().invoke(app, ["--version"]).stdout == f"analyze {rigd.__version__}\n"
+
+
+def test_predicted_peaks_of_a_tiny_motion_are_numbers(rigd_here, monkeypatch):
+    from rigd.engine.signals import StopRequest
+
+    stop = StopRequest()
+    stop.requested = True  # told is what is planned, and nothing is run
+    monkeypatch.setattr("rigd.cli.run.start_crew", lambda **_: (stop, contextlib.nullcontext()))
+    options = ("--amplitude", "1e-6", "--stop-hz", "1", "--duration", "5", "--ring-down", "0")
+    told = rigd_here("run", "chirp", "--fast", *options).stdout
+    angle, speed, torque = map(float, re.findall(r"(?:angle|speed|torque) (\S+) of", told))
+    assert 0.9e-6 < angle < 1.1e-6
+    assert 1e-6 < speed < 1e-5
+    assert torque > 0.0

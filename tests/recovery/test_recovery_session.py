@@ -1,5 +1,6 @@
 """A session whose file cannot be written any more stops safely and keeps what it has."""
 
+import json
 import os
 import resource
 import shutil
@@ -19,7 +20,7 @@ def limit_files():
 
 def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
     result = subprocess.run(
-        [RIGD, "run", "chirp", "--fast", "--output", tmp_path],
+        [RIGD, "run", "chirp", "--fast", "--json", "--output", tmp_path],
         capture_output=True,
         text=True,
         timeout=60,
@@ -31,6 +32,11 @@ def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
     (part,) = tmp_path.glob("*.mcap.part")
     assert f"{part} cannot be written: File too large" in result.stderr
     assert f"What was recorded is in {part}" in result.stderr
+    (session,) = json.loads(result.stdout)["sessions"]
+    assert (session["outcome"], session["path"], session["part"]) == ("fault", None, str(part))
+    assert "File too large" in session["reason"]
+    assert session["scheduled"] > 20_000
+    assert session["recorded"] is session["lost"] is None
     samples = read_session(recover(part).path).samples
     assert samples["tick"].tolist() == list(range(len(samples)))
     assert len(samples) > 20_000
@@ -40,7 +46,7 @@ def test_a_folder_that_is_removed_ends_the_session(write_profile, tmp_path):
     folder = tmp_path / "sessions"
     where = ("--profile", write_profile("sim", patient=True), "--output", folder)
     process = subprocess.Popen(
-        [RIGD, "run", "hold", "--duration", "60", "--rest", "0", *where],
+        [RIGD, "run", "hold", "--json", "--duration", "60", "--rest", "0", *where],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -62,6 +68,8 @@ def test_a_folder_that_is_removed_ends_the_session(write_profile, tmp_path):
     (part,) = tmp_path.glob("*.mcap.part")
     assert "was removed or moved while it was recorded" in errors
     assert f"What was recorded is now {part}; rigd recover {part}" in errors
+    (session,) = json.loads(output)["sessions"]
+    assert (session["outcome"], session["path"], session["part"]) == ("fault", None, str(part))
     samples = read_session(recover(part).path).samples
     assert len(samples) > 300
     assert (samples["tick"][1:] > samples["tick"][:-1]).all()

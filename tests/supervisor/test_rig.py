@@ -133,7 +133,7 @@ def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
     assert read_session(after.path).samples["tick"].tolist() == list(range(1200))
 
 
-def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run):
+def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_path):
     def watcher(progress, events):
         if progress.phase is Phase.RUNNING:
             (recorder,) = (p for p in rig.status().processes if p.name == "recorder")
@@ -142,7 +142,16 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run):
 
     from rigd.supervisor.session import SessionFailedError
 
-    with pytest.raises(SessionFailedError, match="recorder process was killed by signal 9"):
+    with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
         run(rig, watcher=watcher, duration_s=100.0)
+    told = caught.value.result()
+    assert (told.outcome, told.fault, told.path) == ("fault", True, None)
+    assert told.part == tmp_path / "0.mcap.part"
+    assert 0 < told.scheduled < 100_200
+    assert told.as_dict()["recorded"] is None
+    (tmp_path / "0.mcap").touch()  # made whole by a recorder that was only slow, or another's
+    assert caught.value.result().path is None
+    told.part.unlink()
+    assert caught.value.result().path == tmp_path / "0.mcap"
     assert rig.status().phase is Phase.OFF
     assert run(rig).went_well

@@ -28,6 +28,7 @@ MESSAGES = {
     "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
     "encoder jumps": r"encoder's jump of .* rad exceeds",
     "statusword corrupted": r"Drive .*statusword",
+    "controlword corrupted": r"Drive .*command came over the bus that this computer did not give",
     "sensor reports an error": r"Sensor .*0x8040.*calibration",
     "gauge at its end": r"sensor's f. of .* N exceeds its limit",
     "bus cut": r"CAN bus .*(cut off|takes no more frames|cannot be read)",
@@ -99,7 +100,9 @@ def test_a_fault_ends_in_a_drive_without_torque(
     assert (end["enabled"], end["torque_nm"]) == (False, 0.0)
     off = next(e for e in said.of("torque") if e["t_s"] >= begun["t_s"] and not e["enabled"])
     assert off["torque_nm"] == 0.0
-    ticks = row.ticks - (10 - STALE if shortened and row.last.startswith("the loop: ten") else 0)
+    ticks = row.ticks - (
+        10 - STALE if shortened and row.last.startswith("the loop: more than ten") else 0
+    )
     if row.name == "torque commands lost":
         # Nor does it get the command to switch off. That is tried for 50 ms of the computer's time
         # before it goes by SDO, in which a lock-step passes as many ticks as it can.

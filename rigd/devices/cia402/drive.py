@@ -8,6 +8,7 @@ that are all late by the same whole number of periods it cannot tell; that is wh
 from math import isnan
 
 from rigd.devices.canbus import CanExchange, CanLink
+from rigd.devices.cia402.departure import left_operation
 from rigd.devices.cia402.following import TorqueFollowing
 from rigd.devices.cia402.frames import NodeFrames
 from rigd.devices.cia402.inbox import Inbox
@@ -21,12 +22,10 @@ from rigd.devices.cia402.states import (
     FAULT_BIT,
     FOLLOWS_TARGET,
     STATE_BITS,
-    DriveState,
-    state_of,
 )
 from rigd.devices.cia402.switching import step_up, switch_off
 from rigd.devices.cia402.values import torque_limit_per_mille
-from rigd.devices.contracts import DeviceError, LineHealth, wired_stop_dropped
+from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.parameters import RigParameters
 
 _HALF_TURN = 1 << 31
@@ -360,15 +359,7 @@ class Cia402Drive:
         if statusword & self._guard_mask & STATE_BITS != self._guard_value & STATE_BITS:
             node.await_alarm()
             node.refuse_alarm()
-            state = state_of(statusword)
-            left = (
-                f'it has left "{DriveState.OPERATION_ENABLED.value}" for "{state.value}" '
-                f"(statusword 0x{statusword:04X}) by itself"
-            )
-            if state is DriveState.SWITCH_ON_DISABLED:
-                # Nothing but the power stage's supply takes a drive there without a command.
-                raise wired_stop_dropped(self._name, f", or the motor's supply failed: {left}")
-            raise DeviceError(f"{self._name}: {left}; look at STO, supply and its own diagnosis.")
+            raise left_operation(self._name, statusword)
         if statusword & self._guard_mask != self._guard_value:
             raise DeviceError(
                 f"{self._name}: it ignores the target torque: bit 12 of its statusword "

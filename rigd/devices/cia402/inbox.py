@@ -129,7 +129,10 @@ class Inbox:
                 what = "it has restarted by itself; look at its supply"
             else:
                 words = NMT_STATES.get(state, f"state {state}")
-                what = f"it has left operational for {words}, as it does when it misses heartbeats"
+                what = (
+                    f"it has left operational for {words}, as it does when it misses heartbeats, "
+                    "or when another master on the bus tells it to"
+                )
             self.alarm = f"{self.name}: {what}."
 
     def take_reply(self, data: bytes) -> None:

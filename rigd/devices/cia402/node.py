@@ -218,8 +218,13 @@ class Node:
             f'{self.name}: it is in the state "{state_of(inbox.statusword).value}" (statusword '
             f"0x{inbox.statusword:04X}) and names no cause."
         )
-        if in_fault or inbox.emergency:
+        if in_fault:
             reason += f" Remove the cause, then: {self._reset_command}"
+        elif inbox.emergency:
+            # A drive that was off may only have spoken; one that was on tells its state later.
+            reason += (
+                f" Remove the cause; if drive or daemon are in fault then: {self._reset_command}"
+            )
         raise DeviceError(reason)
 
     def _is_operational(self) -> bool:

@@ -27,6 +27,8 @@ FAULT_RESET: Final = 0x80
 
 FAULT_BIT: Final = 0x0008
 """Set in fault and in fault reaction active."""
+VOLTAGE_ENABLED: Final = 0x0010
+"""The power stage is supplied; STO takes it from most drives."""
 FOLLOWS_TARGET: Final = 0x1000
 """In cyclic synchronous torque mode: without it the drive ignores the target torque."""
 STATE_BITS: Final = 0x006F

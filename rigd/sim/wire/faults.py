@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from rigd.sim.wire.errors import WrongUseError
+
 Value = int | float | str
 Deliver = Callable[[int, bytes, object], None]
 """Takes identifier, data and origin of what gets through."""
@@ -16,7 +18,7 @@ SERIAL = -1
 """Stands for the identifier of what a serial line carries."""
 
 
-class FaultError(ValueError):
+class FaultError(WrongUseError):
     """A fault is not written as it should be, or this rig cannot have it; the message says why."""
 
 

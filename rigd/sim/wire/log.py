@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TextIO
 
 from rigd.devices.contracts import DeviceError
+from rigd.sim.wire.errors import WrongUseError
 from rigd.sim.wire.faults import LINE_KINDS
 
 _FLUSH_S = 0.2
@@ -22,7 +23,7 @@ class EventLog:
     Parameters
     ----------
     path
-        Of the file of JSON lines; None for none.
+        Of the file of JSON lines, which is new; None for none.
     quiet
         Tell nothing on the terminal.
 
@@ -33,22 +34,18 @@ class EventLog:
 
     Raises
     ------
+    WrongUseError
+        If there is a file of that name.
     DeviceError
         If the file cannot be written.
     """
 
     def __init__(self, path: Path | None, *, quiet: bool) -> None:
         self._quiet = quiet
-        self._file: TextIO | None = None
+        self._path = path
+        self._file = None if path is None else _new_file(path)
         self._flushed_s = 0.0
         self.time_s = 0.0
-        if path is not None:
-            try:
-                self._file = path.open("w", encoding="utf-8")
-            except OSError as error:
-                raise DeviceError(
-                    f"The log {path} of the simulated rig cannot be written ({error.strerror})."
-                ) from None
 
     def __call__(self, device: str, what: str, **values: object) -> None:
         """Write down that something happened to a device."""
@@ -80,6 +77,12 @@ class EventLog:
             with suppress(OSError):
                 file.close()
 
+    def discard(self) -> None:
+        """Leave no file, for nothing happened; a pipe or a device stays."""
+        self.close()
+        if self._path is not None and self._path.is_file():
+            self._path.unlink()
+
     def _write_out(self) -> None:
         self._flushed_s = time.monotonic()
         self._attempt(lambda file: file.flush())
@@ -93,3 +96,21 @@ class EventLog:
         except OSError as error:
             self.close()
             self.tell(f"The log cannot be written any more ({error.strerror}).")
+
+
+def _new_file(path: Path) -> TextIO:
+    """Open a file that was not there, or a device or pipe, in which nothing can be overwritten."""
+    try:
+        try:
+            return path.open("x", encoding="utf-8")
+        except FileExistsError:
+            if path.is_file() or not path.exists():  # a link that leads nowhere is a name, too
+                raise WrongUseError(
+                    f"--log {path} exists; choose another name or move it away, nothing is "
+                    "overwritten."
+                ) from None
+            return path.open("w", encoding="utf-8")
+    except OSError as error:
+        raise DeviceError(
+            f"The log {path} of the simulated rig cannot be written ({error.strerror})."
+        ) from None

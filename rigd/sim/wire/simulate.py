@@ -19,6 +19,7 @@ from rigd.devices.parameters import RigParameters
 from rigd.devices.simulator import SimulatorAddress, announce, described, find_simulator, forget
 from rigd.sim.devices import SimulatedRig
 from rigd.sim.wire.control import ControlSocket, ask
+from rigd.sim.wire.errors import WrongUseError
 from rigd.sim.wire.faults import Fault, FaultError, parse_fault
 from rigd.sim.wire.hub import Handlers, Hub, VirtualCan, is_virtual
 from rigd.sim.wire.log import EventLog
@@ -29,8 +30,9 @@ from rigd.sim.wire.world import World
 
 __all__ = [
     "DeviceError",
-    "FaultError",
     "SimulatorOptions",
+    "WrongUseError",
+    "check_on_wire",
     "inject",
     "parse_fault",
     "run_simulator",
@@ -47,10 +49,26 @@ class SimulatorOptions:
     lock_step: bool = False
     """Move on by one period a SYNC instead of by wall time."""
     log: Path | None = None
-    """File of JSON lines, one an event."""
+    """File of JSON lines, one an event; a new one."""
     faults: tuple[Fault, ...] = ()
     quiet: bool = False
     """Tell nothing on the terminal."""
+
+
+def check_on_wire(rig: RigParameters) -> None:
+    """Refuse a rig of which there is nothing to put on the wire.
+
+    Raises
+    ------
+    WrongUseError
+        If it has no drive on a bus.
+    """
+    if rig.cia402 is None or rig.can is None:
+        raise WrongUseError(
+            f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): its "
+            "devices are simulated within a session, so there is nothing to put on the wire and "
+            "no fault to inject there. Take a profile of a rig with a bus, such as antenna_can."
+        )
 
 
 def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
@@ -63,26 +81,25 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
 
     Raises
     ------
+    WrongUseError
+        If the profile cannot be simulated on the wire, a fault is none that this rig can have, or
+        the log's name is taken.
     DeviceError
-        If the profile cannot be simulated on the wire, if its simulated rig runs already, or if
-        sockets or files cannot be made.
-    FaultError
-        If a fault is none that this rig can have.
+        If its simulated rig runs already, or if sockets or files cannot be made.
     """
-    if rig.cia402 is None or rig.can is None:
-        raise DeviceError(
-            f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): there is "
-            "nothing to put on the wire. Its devices are simulated within a session already."
-        )
+    check_on_wire(rig)
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
     with ExitStack() as stack:
         stack.enter_context(only_one(rig.name))
         log = EventLog(options.log, quiet=options.quiet)
         stack.callback(log.close)
+        starting = stack.enter_context(ExitStack())
+        starting.callback(log.discard)
         process = _Process(rig, options, log, stack)
         stop = stack.enter_context(stop_requested())
         process.start()
+        starting.pop_all()
         process.serve(stop)
     return 0
 
@@ -99,7 +116,7 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     ------
     DeviceError
         If no simulated rig of that name runs, or it refuses.
-    FaultError
+    WrongUseError
         If a fault is not written as it should be; then none is injected.
     """
     address = find_simulator(rig_name)

@@ -23,6 +23,7 @@ _HIGHEST_ID = 0x7FF
 _RECORD_SIZE = 13
 _WORDS_ON_CAN = ("id",)
 _WORDS_ON_SERIAL = ("bytes",)
+_CAN_BYTES = 8
 
 
 class Node(Protocol):
@@ -324,6 +325,11 @@ class World:
                     f"Fault '{fault}': {word} is for a sensor on "
                     f"{'CAN' if on_serial else 'a serial line'}, which this one is not."
                 )
+        if fault.kind == "corrupt" and not on_serial and int(values["byte"]) >= _CAN_BYTES:
+            raise FaultError(
+                f"Fault '{fault}': byte={values['byte']} hits nothing; a CAN frame has at most "
+                f"the bytes 0 to {_CAN_BYTES - 1}."
+            )
 
     def _begin(self, fault: Fault) -> None:
         self._log("simulator", "fault", fault=str(fault))

@@ -19,6 +19,7 @@ from rigd.profile import load_profile
 NODE, HOST = 5, 100
 _STATUS = {
     "switch-on disabled": 0x0250,
+    "switch-on disabled, no supply": 0x0240,
     "ready": 0x0231,
     "switched on": 0x0233,
     "enabled": 0x1237,

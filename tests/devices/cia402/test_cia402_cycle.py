@@ -228,6 +228,10 @@ def switched_off(scripted):
     scripted.state = "switch-on disabled"
 
 
+def told_to_disable(scripted):
+    scripted.state = "ready"
+
+
 def switched_off_with_a_reason(scripted):
     switched_off(scripted)
     scripted.emergency(0x3220)
@@ -260,15 +264,28 @@ def falls_silent(scripted):
             emergency_and_fault,
             ["following error (error code 0x8611)", "01 02 00 00 00", "rigd reset"],
         ),
-        (quick_stop, ['left "operation enabled"', '"quick stop active"', "0x0217"]),
+        (
+            quick_stop,
+            ['left "operation enabled"', '"quick stop active"', "0x0217", "STO", "second master"],
+        ),
         (
             switched_off,
-            ["the wired stop (STO) was dropped, or", 'left "operation enabled"', "reset the rig"],
+            [
+                "the wired stop (STO) was dropped, or the motor's supply failed, or a command came",
+                "this computer did not give (a corrupt frame, a second master)",
+                'left "operation enabled"',
+                "bit 4 says that the supply is there",
+                "reset the rig. If nobody pressed it, look at the cable of the bus",
+            ],
+        ),
+        (
+            told_to_disable,
+            ['for "ready to switch on"', "a corrupt frame, a second master", "the cable"],
         ),
         (switched_off_with_a_reason, ["under-voltage in the DC link", "rigd reset"]),
         (ignores_torque, ["ignores the target torque", "bit 12"]),
         (restarts, ["restarted"]),
-        (leaves_operational, ["left operational for pre-operational"]),
+        (leaves_operational, ["left operational for pre-operational", "another master"]),
         (falls_silent, ["no heartbeat", "drive_heartbeat_timeout_s = 0.05 s"]),
     ],
 )
@@ -313,10 +330,24 @@ def test_silence_is_told_as_soon_as_it_is_too_long(ticks, drive, scripted):
         ticks(2)
 
 
+def test_without_its_supply_a_drive_says_nothing_for_a_command(make_drive, rig, scripted):
+    ticks = Ticks(make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e5))))
+    ticks.drive.connect()
+    ticks.drive.enable()
+    ticks(5, torque_nm=0.1)
+    scripted.state = "switch-on disabled, no supply"
+    with pytest.raises(DeviceError, match=r"wired stop \(STO\).*\(statusword 0x0240\)\. Find out"):
+        ticks(5, torque_nm=0.1)
+
+
 def test_an_emergency_message_before_enabling_ends_the_session_too(ticks, scripted):
-    scripted.emergency(0x3220)
-    with pytest.raises(DeviceError, match="under-voltage in the DC link"):
+    scripted.emergency(0x8130)
+    with pytest.raises(DeviceError, match="heartbeat of this computer lost") as caught:
         ticks(2)
+    # It is not in fault then, and the operator's reset would find nothing to do.
+    assert "if drive or daemon are in fault then: rigd reset --profile scripted" in str(
+        caught.value
+    )
 
 
 def test_the_end_of_an_emergency_is_none(ticks, scripted):

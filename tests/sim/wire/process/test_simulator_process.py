@@ -41,7 +41,8 @@ class Simulator:
 
     def __init__(self, folder, profile="antenna_can", *options):
         self.profile = profile
-        self.log = folder / f"{profile}.jsonl"
+        number = len(list(folder.glob("*.jsonl")))
+        self.log = folder / f"{profile}-{number}.jsonl"
         self.process = subprocess.Popen(
             command("simulate", "--profile", profile, "--log", self.log, *options),
             stdout=subprocess.PIPE,
@@ -372,7 +373,9 @@ def test_long_folder_names_get_short_sockets(simulate, connect, runtime, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (("simulate", "--profile", "sim"), 1, "nothing to put on the wire"),
+        (("simulate", "--profile", "sim"), 2, "nothing to put on the wire"),
+        (("inject", "--profile", "sim", "sto"), 2, "Take a profile of a rig with a bus"),
+        (("simulate", "--profile", ""), 2, "No profile is named; known profiles are"),
         (("simulate", "--profile", "nothing"), 2, "There is no profile 'nothing'"),
         (("simulate", "--profile", "antenna_can", "--fault", "cut@x"), 2, "'@x'"),
         (
@@ -391,6 +394,31 @@ def test_wrong_use_is_told_in_a_sentence(runtime, rigd_here, arguments, code, sa
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert find_simulator("antenna_can") is None
+
+
+def test_a_log_takes_no_other_file_s_name(simulate, runtime, rigd_here, tmp_path):
+    session = tmp_path / "session.mcap"
+    session.write_bytes(b"two minutes of the rig")
+    nowhere = tmp_path / "link"
+    nowhere.symlink_to("gone")
+    for taken in (session, nowhere):
+        done = rigd_here("simulate", "--profile", "antenna_can", "--log", taken)
+        assert done.returncode == 2
+        assert f"--log {taken} exists; choose another name or move it away" in done.stderr
+    assert session.read_bytes() == b"two minutes of the rig"
+    before = simulate()
+    before.end()
+    witness = before.log.read_bytes()
+    assert witness
+    assert rigd_here("simulate", "--profile", "antenna_can", "--log", before.log).returncode == 2
+    assert before.log.read_bytes() == witness
+
+
+def test_a_rig_that_is_not_started_leaves_no_log(runtime, rigd_here, tmp_path):
+    faults = ("--fault", "sto", "--fault", "cut,device=sensor")
+    arguments = ("simulate", "--profile", "antenna_can", "--log", tmp_path / "log", *faults)
+    assert rigd_here(*arguments).returncode == 2
+    assert not (tmp_path / "log").exists()
 
 
 def test_the_help_names_every_fault(rigd_here):

@@ -325,6 +325,10 @@ def test_the_bus_is_cut_by_who_holds_it(make_world):
     [
         ("cut,device=sensor", "no line of its own"),
         ("drop,from=sensor,bytes=3", "bytes is for a sensor on a serial line"),
+        (
+            "corrupt,from=drive,byte=8",
+            "byte=8 hits nothing; a CAN frame has at most the bytes 0 to 7",
+        ),
     ],
 )
 def test_a_fault_that_this_rig_cannot_have_is_refused(make_world, spec, said):
