@@ -139,7 +139,7 @@ def recorded(folder, size=50_000, timeout_s=60.0):
     def grown():
         for part in folder.glob("sessions/*.part"):
             with contextlib.suppress(FileNotFoundError):
-                if part.stat().st_size >= size:
+                if part.stat().st_size > size:
                     return part
         return None
 
@@ -238,7 +238,7 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
 
 def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, tmp_path):
     process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
-    part = recorded(tmp_path, 0)
+    part = recorded(tmp_path, 1000)  # before, its name is only being tried
     part.with_suffix("").write_text("somebody else's")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
