@@ -331,9 +331,11 @@ def _damage_message(path: Path, contents: McapContents) -> str:
             f"{path} is incomplete, because it is still being recorded. Wait for the end of the "
             "session, or stop it."
         )
+    readable = contents.count(SAMPLE_TOPIC)
+    advice = f"Save them with {remedy}" if readable else "Record the session again"
     return (
-        f"{path} is incomplete: it {contents.damage}; {contents.count(SAMPLE_TOPIC)} complete "
-        f"samples are readable before that. Save them with {remedy}."
+        f"{path} is incomplete: it {contents.damage}; {readable} complete samples are readable "
+        f"before that. {advice}."
     )
 
 
