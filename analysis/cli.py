@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -14,14 +13,15 @@ import typer
 from analysis.commands.default_command import DEFAULT, DefaultCommandGroup
 from analysis.commands.exchange import IMPORT_EPILOG, export_app, import_command
 from analysis.commands.sessions import Routes, session_command
+from analysis.commands.standard_streams import standard_streams
 from analysis.commands.version import Version
 from analysis.commands.welch_options import (
     Band,
     Estimator,
-    Frf,
     Nfft,
     Overlap,
     Segment,
+    choice,
     welch_settings,
 )
 from rigd.interruption import raise_on
@@ -29,6 +29,7 @@ from rigd.interruption import raise_on
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from analysis.campaigns.errors import LoneSessionError
     from analysis.whole_record import Setting
 
 _EXIT_INTERRUPTED: Final = 130
@@ -40,15 +41,18 @@ Writes figures, tables and JSON into session.report/ beside the file (session.re
 exists). Several files are a campaign: statistics, nominal models, pooled estimate and validation go
 to campaign.report/ beside the first. Records of other programs: analyze import --help; results for
 them: analyze export --help.
-Exit code: 0 done, 1 a file could not be analysed, 2 wrong use, 130 stopped by Ctrl-C."""
+Exit code: 0 done; 1 a file could not be analysed, being too short for --segment for one; 2 wrong
+use, options that contradict each other or the record's rate included; 130 stopped by Ctrl-C."""
 
 
-class Method(Enum):
-    """Ways from a record to models."""
+_METHODS: Final = ("welch", "record", "all")
+"""Ways from a record to models."""
 
-    WELCH = "welch"
-    ALL = "all"
+_OF_PAPER: Final = ("types", "weights", "band", "frf", "segment", "overlap", "nfft")
+"""Options of the paper's route alone."""
 
+_TYPED: Final = "COMMANDLINE"
+"""What click calls the source of an option's value that is no default."""
 
 # Plain messages of one or two sentences, not boxes: they end up in logs.
 app = typer.Typer(
@@ -67,21 +71,27 @@ def main() -> None:
     # Threads gain nothing on matrices as small as a fit's, and cost a tenth of the time.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    try:
-        app()
-    except KeyboardInterrupt:
-        sys.exit(_EXIT_INTERRUPTED)
+    with standard_streams():
+        try:
+            app()
+        except KeyboardInterrupt:
+            sys.exit(_EXIT_INTERRUPTED)
 
 
 @app.command(DEFAULT, epilog=_EPILOG)
 def analyze(
+    context: typer.Context,
     files: Annotated[
         list[Path],
         typer.Argument(metavar="FILE", readable=False, help="Session files (.mcap)."),
     ],
     method: Annotated[
-        Method, typer.Option(help="welch: the paper's; all: the whole record's before it.")
-    ] = Method.ALL,
+        str,
+        typer.Option(
+            metavar="welch|record|all",
+            help="welch: the paper's; record: the whole record's, of all types; all: both.",
+        ),
+    ] = "all",
     fix: Annotated[
         str,
         typer.Option(
@@ -101,7 +111,7 @@ def analyze(
         ),
     ] = "const,omega",
     band: Band = "0.5875,50",
-    frf: Estimator = Frf.H1,
+    frf: Estimator = "h1",
     segment: Segment = None,
     overlap: Overlap = None,
     nfft: Nfft = None,
@@ -145,7 +155,7 @@ def analyze(
     Estimates the frequency response from motor angle to coupling torque, fits the fractional
     damping models to it, and prints and draws the results.
     """
-    from analysis.campaigns.errors import CampaignError
+    from analysis.campaigns.errors import CampaignError, LoneSessionError
     from analysis.report.folder import OutputError, OutputExistsError, check_new_file
 
     is_campaign = len(files) > 1 and not each
@@ -156,14 +166,22 @@ def analyze(
         raise typer.BadParameter(
             "the workers are those of --dask; leave one of the two out.", param_hint="--jobs"
         )
-    if fix and method is Method.WELCH:
+    method = choice(method, _METHODS, "--method")
+    if fix and method == "welch":
         raise typer.BadParameter(
             "the paper's route takes all of them from the file; leave it out, or take "
             "--method all.",
             param_hint="--fix",
         )
+    if method == "record":
+        _check_without_paper(context, is_campaign=is_campaign, rerun=rerun)
     settings = welch_settings(types, weights, band, frf, segment, overlap, nfft)
-    routes = Routes(settings, whole_record=method is Method.ALL, fixed=_fixed(fix))
+    routes = Routes(
+        settings,
+        paper=method != "record",
+        whole_record=method != "welch",
+        fixed=_fixed(fix),
+    )
     try:
         to_stdout = json is not None and str(json) == "-"
         if json is not None and not to_stdout:
@@ -176,11 +194,14 @@ def analyze(
             from analysis.campaigns.command import campaign_command
             from analysis.structures import STRUCTURES
 
-            code = campaign_command(
-                files, settings, structures=tuple(STRUCTURES) if routes.whole_record else (),
-                fixed=routes.fixed, report=report, json=json, jobs=jobs, dask=dask,
-                with_paper=paper,
-            )  # fmt: skip
+            try:
+                code = campaign_command(
+                    files, settings, structures=tuple(STRUCTURES) if routes.whole_record else (),
+                    fixed=routes.fixed, report=report, json=json, jobs=jobs, dask=dask,
+                    with_paper=paper,
+                )  # fmt: skip
+            except LoneSessionError as lone:
+                code = _lone_session(lone, routes, report, json)
     except OutputExistsError as error:
         _complain(str(error))
         code = 2
@@ -202,6 +223,41 @@ def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
     else:
         why = "--each makes no campaign of the sessions; leave one of the two out."
     raise typer.BadParameter(why, param_hint=" and ".join(options))
+
+
+def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Path | None) -> None:
+    """Refuse what is made of the paper's route where that is left out, and say what has no say."""
+    if is_campaign:
+        raise typer.BadParameter(
+            "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
+            "--method all, or add --each.",
+            param_hint="--method",
+        )
+    if rerun is not None:
+        raise typer.BadParameter(
+            "its charts are of the paper's fits, which --method record leaves out; take --method "
+            "all.",
+            param_hint="--rerun",
+        )
+    sources = {name: context.get_parameter_source(name) for name in _OF_PAPER}
+    given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]
+    if given:
+        typer.echo(
+            f"Warning: {', '.join(given)} concern the paper's route alone, which --method record "
+            "leaves out: the whole record is fitted by every type, from 0 to 50 Hz.",
+            err=True,
+        )
+
+
+def _lone_session(
+    lone: LoneSessionError, routes: Routes, report: Path | None, json: Path | None
+) -> int:
+    """Tell what is wrong with the other files of a campaign, and report the one that is left."""
+    for failure in lone.failures:
+        _complain(failure.message)
+    typer.echo(f"One session makes no campaign: {lone.path} is reported by itself.", err=True)
+    others = {str(failure.path): failure.message for failure in lone.failures}
+    return max(1, session_command([lone.path], routes, report, json, others=others))
 
 
 def _fixed(text: str) -> tuple[Setting, ...]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import (
     PAPER_OVERLAP_FRACTION,
     PAPER_SEGMENTS,
@@ -169,6 +170,19 @@ def estimate_warnings(
         found.append(
             f"Only {response.segments} Welch segment(s) of {length} samples fit "
             f"the sweep of {record.sweep_samples}{_remedy(record.sweep_samples)}"
+        )
+    length = (
+        len(record.time_s)
+        if settings.estimator == "fft"
+        else settings.segmentation(record.rate_hz).segment_length
+    )
+    resolution_hz = record.rate_hz / length
+    first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
+    if resolution_hz > first_mode_hz:
+        found.append(
+            f"A transform of {1 / resolution_hz:.3g} s resolves {resolution_hz:.3g} Hz and cannot "
+            f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
+            "longer."
         )
     excited_hz = _excited_band_hz(record.metadata)
     first_hz, last_hz = settings.band_hz

@@ -74,7 +74,11 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
             f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m {density:g} "
             f"kg/m and beam_bending_stiffness_n_m2 {stiffness:g} N·m² the first mode would be at "
             f"{first_hz:.3g} Hz, which {ticks / rate_hz:.3g} s at {rate_hz:g} Hz cannot show; "
-            "correct the file's metadata."
+            + (
+                "record longer, or correct the file's metadata if these are wrong."
+                if first_hz <= lowest_hz
+                else "correct the file's metadata."
+            )
         )
     return Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
 

@@ -234,6 +234,8 @@ def _reason_against(
     if isinstance(result, SessionFailure):
         return None
     for other in before:
+        if result.path == other.path:
+            return "the file is given more than once, and counts once."
         if result.experiment.identity == other.experiment.identity:
             return f"it is the same session as {other.path}, which would count twice."
     if not np.array_equal(common.frequency_hz, result.frequency_hz):

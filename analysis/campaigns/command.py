@@ -63,6 +63,8 @@ def campaign_command(
     ------
     CampaignError
         None of the files could be used, or the workers could not be had.
+    LoneSessionError
+        One of the files alone could be used, which makes no campaign: nothing was written.
     OutputExistsError, OutputError
         Something cannot be written.
     """
@@ -84,16 +86,16 @@ def campaign_command(
     console = Console(stderr=to_stdout, highlight=False)
     if not console.is_terminal:
         console = Console(stderr=to_stdout, highlight=False, width=_TEXT_WIDTH)
-    console.print(campaign_tables(found, with_paper=with_paper))
     lines = [f"Report of the campaign: {folder}"]
-    if json is not None:
-        text = document_text(campaign_document(found, with_paper=with_paper))
-        if to_stdout:
-            print(text, end="")  # noqa: T201 - what was asked for
-        else:
-            write_new(json, text)
-            lines.append(f"All results as JSON: {json}")
+    if json is not None and not to_stdout:
+        # Before anything is said: the streams may take nothing.
+        write_new(json, document_text(campaign_document(found, with_paper=with_paper)))
+        lines.append(f"All results as JSON: {json}")
+    console.print(campaign_tables(found, with_paper=with_paper))
     console.print("\n".join(lines), markup=False, soft_wrap=True)
+    if to_stdout:
+        content = campaign_document(found, with_paper=with_paper)
+        print(document_text(content, ascii_only=True), end="")  # noqa: T201 - what was asked for
     return 1 if found.failures or found.lost_trials else 0
 
 
@@ -104,6 +106,7 @@ def _analysed(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from analysis.campaigns.errors import LoneSessionError
     from analysis.campaigns.write import write_campaign
     from analysis.report.folder import new_folder
 
@@ -124,6 +127,8 @@ def _analysed(
 
         with new_folder(folder) as part:
             found = run(on_progress=on_progress)
+            if len(found.sessions) == 1:
+                raise LoneSessionError(found.sessions[0].path, found.failures)
             write_campaign(
                 found, part, with_paper=with_paper,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),

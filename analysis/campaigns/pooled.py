@@ -171,12 +171,13 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
     of the number of all data. What the sessions lose by sharing a value follows from their own
     estimates and covariances (the likelihood is taken to be normal about each). Settings of rig and
     beam are each session's own, with every structure alike, and so cost nothing here. A parameter
-    that some session leaves undetermined cannot be shared: it counts in every session.
+    that some session leaves undetermined cannot be shared: it counts in every session. One session
+    shares with none, and loses nothing.
     """
     of_specimen = _of_specimen(estimates[0])
     shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]
     deviance = sum(e.deviance for e in estimates)
-    if shared:
+    if shared and len(estimates) >= _FEWEST:
         deviance += random_effects(*_stacked(estimates, shared)).deviance
     each_its_own = (len(of_specimen) - len(shared)) * sum(math.log(e.values) for e in estimates)
     return deviance + len(shared) * math.log(sum(e.values for e in estimates)) + each_its_own

@@ -12,7 +12,6 @@ from typer.models import OptionInfo
 from analysis.commands.welch_options import (
     Band,
     Estimator,
-    Frf,
     Nfft,
     Overlap,
     Segment,
@@ -201,7 +200,7 @@ def export_frf_command(
     session: _Session,
     target: _Target,
     binary: _Binary = False,
-    frf: Estimator = Frf.H1,
+    frf: Estimator = "h1",
     band: Band = "0.5875,50",
     segment: Segment = None,
     overlap: Overlap = None,

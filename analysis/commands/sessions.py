@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import typer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from analysis.welch_route import WelchAnalysis
     from analysis.whole_record import Setting
 
-    _Found = tuple[WelchAnalysis, Subject | None]
+    _Found = tuple[WelchAnalysis | None, Subject | None]
 
 _FIGURE_STEPS: Final = 4
 """How many times longer a figure takes than another step, roughly."""
@@ -28,9 +28,10 @@ _FIGURE_STEPS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Routes:
-    """What is done with a record: the paper's route, and the whole record's if it is asked for."""
+    """What is done with a record: the paper's route, by these settings, and the whole record's."""
 
     settings: WelchSettings
+    paper: bool
     whole_record: bool
     fixed: tuple[Setting, ...]
 
@@ -40,7 +41,8 @@ def session_command(
     routes: Routes,
     report: Path | None,
     json: Path | None,
-    rerun: Path | None,
+    rerun: Path | None = None,
+    others: Mapping[str, str] | None = None,
 ) -> int:
     """Analyse the files one after the other, write a report of each, and print the tables.
 
@@ -54,6 +56,8 @@ def session_command(
         New file for all results; ``-`` for standard output, which then holds nothing else.
     rerun : Path, optional
         New file with session and fits for Rerun's viewer, of one session.
+    others : mapping of str to str, optional
+        Files that were left out before, with the reason that was told: errors of the results, too.
 
     Returns
     -------
@@ -69,41 +73,54 @@ def session_command(
 
     from analysis.report.document import document, document_text
     from analysis.report.folder import report_folders, write_new
-    from analysis.report.record_text import record_text
-    from analysis.report.tables import analysis_tables, summary_table
 
     folders = report_folders(files, report)
     found, errors, code = _analyse_all(files, folders, routes, rerun)
     if not found:
         return code
-    analyses = [analysis for analysis, _ in found]
+    analyses = [analysis for analysis, _ in found if analysis is not None]
     subjects = [subject for _, subject in found if subject is not None]
+    results = document(analyses, {**(others or {}), **errors}, subjects)
     to_stdout = json is not None and str(json) == "-"
+    if json is not None and not to_stdout:
+        # Before anything is said: the streams may take nothing.
+        write_new(json, document_text(results))
     console = Console(stderr=to_stdout, highlight=False)
     if not console.is_terminal:
         console = Console(stderr=to_stdout, highlight=False, width=120)
-    if len(files) == 1:
-        withheld: frozenset[str] = frozenset()
-        for subject in subjects:
-            console.print(record_text(subject))
-            withheld = subject.verdict.unsupported
-        console.print(analysis_tables(analyses[0], withheld))
-    else:
-        console.print(summary_table(analyses))
+    _print_tables(console, analyses, subjects, single=len(files) == 1)
     _say(console, "")
     for file, folder in zip(files, folders, strict=True):
         if str(file) not in errors:
             _say(console, f"Report of {file}: {folder}")
     if rerun is not None:
         _say(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
-    if json is not None:
-        text = document_text(document(analyses, errors, subjects))
-        if to_stdout:
-            typer.echo(text, nl=False)
-        else:
-            write_new(json, text)
-            _say(console, f"All results as JSON: {json}")
+    if to_stdout:
+        typer.echo(document_text(results, ascii_only=True), nl=False)
+    elif json is not None:
+        _say(console, f"All results as JSON: {json}")
     return code
+
+
+def _print_tables(
+    console: Console,
+    analyses: Sequence[WelchAnalysis],
+    subjects: Sequence[Subject],
+    *,
+    single: bool,
+) -> None:
+    """Print all of a single file, of several what the paper's route has together."""
+    from analysis.report.record_text import record_text
+    from analysis.report.tables import analysis_tables, summary_table
+
+    if single or not analyses:
+        for subject in subjects:
+            console.print(record_text(subject))
+    if single and analyses:
+        withheld = subjects[0].verdict.unsupported if subjects else frozenset()
+        console.print(analysis_tables(analyses[0], withheld))
+    elif analyses:
+        console.print(summary_table(analyses))
 
 
 def _analyse_all(
@@ -116,6 +133,7 @@ def _analyse_all(
     from analysis.estimate import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError
+    from analysis.whole_record import MeasurementError
     from rigd.session import SessionError
 
     found: list[_Found] = []
@@ -142,7 +160,8 @@ def _analyse_all(
             try:
                 found.append(_analyse_file(file, folder, routes, rerun, on_step, tell))
             except (
-                SessionError, RecordError, EstimateError, OutputError, MemoryError, LinAlgError
+                SessionError, RecordError, EstimateError, MeasurementError, OutputError,
+                MemoryError, LinAlgError,
             ) as error:  # fmt: skip
                 code = max(code, 2 if isinstance(error, SettingsError) else 1)
                 errors[str(file)] = message = _told(file, error)
@@ -163,11 +182,12 @@ def _told(file: Path, error: Exception) -> str:
 
 def _steps(routes: Routes, rerun: Path | None) -> int:
     from analysis.report.html.write import FIGURES as OF_RECORD
-    from analysis.report.write import FIGURES, FIGURES_BESIDE_RECORD
+    from analysis.report.write import figures_of_paper
 
-    figures = (*FIGURES_BESIDE_RECORD, *OF_RECORD) if routes.whole_record else FIGURES
-    pictures = len(figures) + (rerun is not None)
-    return 2 + routes.whole_record + len(routes.settings.types) + _FIGURE_STEPS * pictures
+    figures = figures_of_paper(paper=routes.paper, whole_record=routes.whole_record)
+    pictures = len(figures) + routes.whole_record * len(OF_RECORD) + (rerun is not None)
+    steps = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
+    return steps + _FIGURE_STEPS * pictures
 
 
 def _analyse_file(
@@ -186,17 +206,19 @@ def _analyse_file(
 
     record = load_record(file)
     on_step("read")
-    analysis = analyse(record, routes.settings, on_step)
+    analysis = analyse(record, routes.settings, on_step) if routes.paper else None
     subject = None
     if routes.whole_record:
         on_step("whole record")
         try:
             subject = _whole_record(record, routes, analysis)
         except MeasurementError as error:
+            if analysis is None:
+                raise
             warn(f"Warning: {error} Only the paper's route was gone.")
     with new_folder(folder) as part:
         write_report(analysis, part, on_step, subject)
-    if rerun is not None:
+    if rerun is not None and analysis is not None:
         from analysis.report.rerun_file import write_rerun_file
 
         write_rerun_file(analysis, rerun)
@@ -204,7 +226,7 @@ def _analyse_file(
     return analysis, subject
 
 
-def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis) -> Subject:
+def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis | None) -> Subject:
     from analysis.report.html import Subject
     from analysis.selection import select
     from analysis.whole_record import BAND_HZ, Measurement

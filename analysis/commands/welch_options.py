@@ -3,36 +3,30 @@
 from __future__ import annotations
 
 import math
-from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar, get_args
 
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from analysis.settings import WelchSettings
 
 _MAX_NFFT: Final = 2**22
 """Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
 
 
-class Frf(Enum):
-    """Estimators of the frequency response."""
-
-    H1 = "h1"
-    H2 = "h2"
-    HV = "hv"
-    IV = "iv"
-    FFT = "fft"
-
+_Choice = TypeVar("_Choice", bound=str)
 
 Band = Annotated[
     str, typer.Option(metavar="F0,F1", help="Band that is fitted, in Hz, ends included.")
 ]
 Estimator = Annotated[
-    Frf,
+    str,
     typer.Option(
+        metavar="h1|h2|hv|iv|fft",
         help="Estimate that is fitted: Welch's H1, H2 or Hv, Hiv by way of the reference (noise "
-        "that the controller feeds back is no response then), or one FFT of the whole record."
+        "that the controller feeds back is no response then), or one FFT of the whole record.",
     ),
 ]
 Segment = Annotated[
@@ -53,13 +47,14 @@ def welch_settings(
     types: str,
     weights: str,
     band: str,
-    frf: Frf,
+    frf: str,
     segment: int | None,
     overlap: int | None,
     nfft: int | None,
 ) -> WelchSettings:
     """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2)."""
     from analysis.settings import WelchSettings
+    from rigd.spectral import Estimator as FrfEstimator
 
     if segment is not None and overlap is not None and overlap >= segment:
         raise typer.BadParameter(
@@ -72,13 +67,23 @@ def welch_settings(
             param_hint="--nfft",
         )
     return WelchSettings(
-        estimator=frf.value,
+        estimator=choice(frf, get_args(FrfEstimator), "--frf"),
         segment_length=segment,
         overlap=overlap,
         nfft=nfft,
         band_hz=_band(band),
         types=_types(types),
         weightings=_weightings(weights),
+    )
+
+
+def choice(text: str, choices: Sequence[_Choice], option: str) -> _Choice:
+    """Return the choice that was named; a wrong one ends in typer.BadParameter (exit code 2)."""
+    for each in choices:
+        if each == text.lower():
+            return each
+    raise typer.BadParameter(
+        f"there is no '{text}'; choose from {', '.join(choices)}.", param_hint=option
     )
 
 

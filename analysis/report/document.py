@@ -17,6 +17,7 @@ from analysis.report.record_indices import whole_record_indices
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from analysis.record import Record
     from analysis.report.html import Subject
     from analysis.welch_route import FittedModel, WelchAnalysis
 
@@ -39,9 +40,9 @@ def document(
     Returns
     -------
     dict
-        ``versions``, ``files`` (what was read and how it was estimated), ``fits``, ``modes``,
-        ``peaks``, ``records``, ``errors``:
-        lists of flat objects that name their file. Finite numbers only.
+        ``versions``, ``files`` (what was read, and how the paper's route estimated it), ``fits``,
+        ``modes``, ``peaks``, ``records``, ``errors``: lists of flat objects that name their file.
+        Finite numbers only.
     """
     of_records = [_record_entries(subject) for subject in subjects]
     withheld = {subject.record.path: subject.verdict.unsupported for subject in subjects}
@@ -52,7 +53,14 @@ def document(
                 "python": platform.python_version(),
                 "numpy": np.__version__,
             },
-            "files": [_file(analysis) for analysis in analyses],
+            "files": [
+                *(_file(analysis) for analysis in analyses),
+                *(
+                    _record_facts(subject.record, subject.warnings)
+                    for subject in subjects
+                    if subject.welch is None
+                ),
+            ],
             "fits": [
                 *(
                     fit
@@ -89,9 +97,16 @@ def document(
     return content
 
 
-def document_text(content: Mapping[str, Any]) -> str:
-    """Write a document as JSON, with a newline at its end."""
-    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+def document_text(content: Mapping[str, Any], *, ascii_only: bool = False) -> str:
+    """Write a document as JSON, with a newline at its end.
+
+    Parameters
+    ----------
+    content : mapping
+    ascii_only : bool
+        Whether other characters are escaped, for a stream that may have any encoding.
+    """
+    return json.dumps(content, indent=2, ensure_ascii=ascii_only, allow_nan=False) + "\n"
 
 
 def _record_entries(subject: Subject) -> dict[str, Any]:
@@ -101,7 +116,22 @@ def _record_entries(subject: Subject) -> dict[str, Any]:
 
 
 def _file(analysis: WelchAnalysis) -> dict[str, Any]:
-    record, settings, response = analysis.record, analysis.settings, analysis.response
+    settings, response = analysis.settings, analysis.response
+    return {
+        **_record_facts(analysis.record, analysis.warnings),
+        "settings": {
+            **asdict(settings),
+            **asdict(analysis.segmentation),
+            "band_hz": list(settings.band_hz),
+            "types": list(settings.types),
+            "weightings": list(settings.weightings),
+            "segments": response.segments,
+            "bins": len(response.frequency_hz),
+        },
+    }
+
+
+def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
     return {
         "file": str(record.path),
         "outcome": record.outcome,
@@ -117,16 +147,7 @@ def _file(analysis: WelchAnalysis) -> dict[str, Any]:
         "torque_delay_s": record.torque_delay_s,
         "gaps": asdict(record.gaps),
         "flags": dict(record.flags),
-        "warnings": list(analysis.warnings),
-        "settings": {
-            **asdict(settings),
-            **asdict(analysis.segmentation),
-            "band_hz": list(settings.band_hz),
-            "types": list(settings.types),
-            "weightings": list(settings.weightings),
-            "segments": response.segments,
-            "bins": len(response.frequency_hz),
-        },
+        "warnings": list(warnings),
     }
 
 

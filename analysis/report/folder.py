@@ -93,7 +93,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a new text file, with the folders it needs.
+    """Write a new text file in UTF-8, with the folders it needs.
 
     Raises
     ------
@@ -103,7 +103,8 @@ def write_new(path: Path, text: str) -> None:
     check_new_file(path, "The file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as stream:
+        # File names may hold bytes that are no text; as escapes they are text, and JSON.
+        with path.open("x", encoding="utf-8", errors="backslashreplace") as stream:
             stream.write(text)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.report.record_figure_bands import ResponseBand
-    from analysis.whole_record import RecordFit
+    from analysis.whole_record import ModeEstimate, RecordFit
     from rigd.spectral import FrequencyResponse
 
 _BAND: Final = "#8CC4E8"
@@ -82,8 +82,7 @@ def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure
         style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
     for column, mode in enumerate(shown):
         detail = figure.add_subplot(grid[1, column])
-        half = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
-        limits = mode.frequency_hz * (1 - half), mode.frequency_hz * (1 + half)
+        limits = _detail(mode, measured.frequency_hz)
         near = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
         close = response_band(fit, np.linspace(*limits, _DETAIL_POINTS))
         _magnitude(detail, measured.frequency_hz[near], seen[near], close, style.GREY)
@@ -119,6 +118,15 @@ def _magnitude(
         label="95 % band of the model",
     )  # fmt: skip
     axes.plot(band.frequency_hz, _db(band.response), color=style.BLUE, linewidth=1.1, label="model")
+
+
+def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
+    """Choose what is shown of a mode: so much that a bin of a short record lies inside, too."""
+    spacing_hz = float(np.diff(frequency_hz).max())
+    share = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
+    half_hz = max(share * mode.frequency_hz, spacing_hz)
+    lowest_hz = float(frequency_hz[0]) / 2
+    return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
 
 
 def _grid(first_hz: float, last_hz: float, peaks_hz: list[float]) -> NDArray[np.float64]:

@@ -27,6 +27,7 @@ _KOLMOGOROV_95: Final = 1.358
 _BINS_A_POINT: Final = 24
 _SMOOTH_POINTS: Final = 600
 _STRETCHES: Final = 120
+"""At most: a short record has fewer independent values."""
 
 
 def residual_figure(name: str, analysis: RecordAnalysis, fit: RecordFit) -> Figure:
@@ -112,7 +113,7 @@ def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
 
 def _in_time(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     times_s, power = residual_power(analysis, fit)
-    half = NORMAL_95 * np.sqrt(_STRETCHES / np.count_nonzero(analysis.compared))
+    half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
         max(1 - half, 0.0), 1 + half, color=style.SHADE, linewidth=0, zorder=0,
         label="95 % of white noise",
@@ -143,8 +144,9 @@ def residual_power(
     bins = fit.residual.size
     envelope = np.abs(np.fft.ifft(fit.residual)) ** 2 * bins / 2
     envelope *= bins / np.count_nonzero(analysis.compared)
+    stretches = min(_STRETCHES, bins)
     power: NDArray[np.float64] = np.array(
-        [part.mean() for part in np.array_split(envelope, _STRETCHES)]
+        [part.mean() for part in np.array_split(envelope, stretches)]
     )
-    times_s = (np.arange(_STRETCHES, dtype=np.float64) + 0.5) / (_STRETCHES * spacing_hz)
+    times_s = (np.arange(stretches, dtype=np.float64) + 0.5) / (stretches * spacing_hz)
     return times_s, power

@@ -85,8 +85,9 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> 
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
-    # A file name may hold dollar signs, which are not mathematics.
+    # A file name may hold dollar signs, which are not mathematics, and bytes that are no text.
     common: dict[str, Any] = {"va": "top", "parse_math": False}
+    title, subtitle = (each.encode("utf-8", "replace").decode() for each in (title, subtitle))
     for text in (
         figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **common),
         figure.text(

@@ -161,7 +161,8 @@ def input_relation(
     # Where the motor was not driven, the angle is what the loop makes of the torque's noise: such
     # bins would say that the residual follows the angle, and count for next to nothing here.
     power = np.abs(angle) ** 2
-    around = np.convolve(power, np.full(_NEIGHBOURS, 1 / _NEIGHBOURS), mode="same")
+    neighbours = min(_NEIGHBOURS, power.size)
+    around = np.convolve(power, np.full(neighbours, 1 / neighbours), mode="same")
     driven = angle / np.sqrt(np.maximum(around, np.finfo(float).tiny))
     # A hum is no linear dynamics, however loud.
     limited = residual / np.maximum(np.abs(residual) / _LOUDEST, 1.0)

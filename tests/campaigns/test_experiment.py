@@ -57,9 +57,9 @@ def test_another_experiment_is_the_reason_where_the_analysis_failed_too(chirps, 
 
 def test_no_session_counts_twice(chirps):
     one, other = chirps("0.mcap"), chirps("1.mcap")
-    sessions, (failure,) = _of_one_experiment([one, other, one])
+    sessions, (failure,) = _of_one_experiment([one, other, replace(one, path=Path("copy.mcap"))])
     assert sessions == [one, other]
-    assert "the same session as 0.mcap" in failure.message
+    assert "copy.mcap: it is the same session as 0.mcap" in failure.message
 
 
 def test_a_sweep_that_ended_early_is_left_out_and_one_stopped_after_it_is_not(make_experiment):

@@ -65,6 +65,8 @@ _TRANSPORT_S = 5e-3
 _STARTED_S = 60.0
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
+_COMMAND_S = 60.0
+"""Within which `rigd recover` and `analyze` are done, on a busy computer, too."""
 
 # By when the drive has to be off, after the signal: its own watchdog, or the process that notices.
 OFF_WITHIN_S = {
@@ -228,10 +230,13 @@ class Scene:
     @property
     def state(self) -> str:
         """What the daemon says of itself."""
-        done = subprocess.run(
-            [BIN / "rigd", "status", "--json"],
-            env=self._environment, capture_output=True, text=True, timeout=30.0, check=False,
-        )  # fmt: skip
+        try:
+            done = subprocess.run(
+                [BIN / "rigd", "status", "--json"],
+                env=self._environment, capture_output=True, text=True, timeout=30.0, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return "no answer"
         return str(json.loads(done.stdout)["state"]) if done.returncode == 0 else ""
 
     def _await_simulator(self) -> float:
@@ -527,10 +532,9 @@ def _only_file(verdict: Verdict, scene: Scene) -> Path | None:
 
 def _recovered(verdict: Verdict, part: Path, scene: Scene) -> Path | None:
     """Make a file of what the recorder left."""
-    done = subprocess.run(
-        [BIN / "rigd", "recover", part],
-        cwd=scene.folder, capture_output=True, text=True, timeout=60.0, check=False,
-    )  # fmt: skip
+    done = _finished(verdict, [BIN / "rigd", "recover", part], scene.folder)
+    if done is None:
+        return None
     path = part.with_suffix("")
     if "Traceback" in done.stderr:
         verdict.complaints.append("a traceback of rigd recover")
@@ -543,10 +547,9 @@ def _recovered(verdict: Verdict, part: Path, scene: Scene) -> Path | None:
 
 def _analysed(verdict: Verdict, path: Path, samples: int) -> str:
     options = ["--frf", "fft", "--types", "VI", "--weights", "omega", "--json", "-"]
-    done = subprocess.run(
-        [BIN / "analyze", path, *options],
-        cwd=path.parent, capture_output=True, text=True, timeout=60.0, check=False,
-    )  # fmt: skip
+    done = _finished(verdict, [BIN / "analyze", path, *options], path.parent)
+    if done is None:
+        return "too slow"
     if done.returncode == 0:
         return "accepted"
     if "Traceback" in done.stderr or not done.stderr.startswith("Error: "):
@@ -557,6 +560,20 @@ def _analysed(verdict: Verdict, path: Path, samples: int) -> str:
     if samples > 1000 * (REST_S + 1.5):
         verdict.complaints.append(f"analyze on {samples} samples: {_line(done.stderr)}")
     return "too short"
+
+
+def _finished(
+    verdict: Verdict, command: list[str | Path], folder: Path
+) -> subprocess.CompletedProcess[str] | None:
+    """Run a command on the file; one that takes too long is a complaint, and None."""
+    try:
+        return subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=_COMMAND_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        name = " ".join(Path(each).name for each in command[:2])
+        verdict.complaints.append(f"{name}: not done after {_COMMAND_S:g} s")
+        return None
 
 
 def _line(text: str) -> str:

@@ -4,6 +4,7 @@ import importlib.util
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -56,3 +57,20 @@ def test_the_judge_sees_a_drive_that_goes_on(rig, tmp_path, off_s, torque_nm, co
     rig._judge_drive(verdict, log, 10.0, 10.0, was_on=True)
     assert complaint in "; ".join(verdict.complaints)
     assert bool(verdict.complaints) == bool(complaint)
+
+
+def test_a_command_that_takes_too_long_is_a_complaint_of_its_case(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr(rig, "BIN", tmp_path)
+    monkeypatch.setattr(rig, "_COMMAND_S", 0.2)
+    for name in ("analyze", "rigd"):
+        (tmp_path / name).write_text("#!/bin/sh\nexec sleep 20\n")
+        (tmp_path / name).chmod(0o700)
+    verdict = rig.Verdict(rig.Case("control", signal.SIGKILL, 1.0))
+    assert rig._analysed(verdict, tmp_path / "a.mcap", 1000) == "too slow"
+    part = tmp_path / "a.mcap.part"
+    part.write_bytes(b"x")
+    assert rig._recovered(verdict, part, SimpleNamespace(folder=tmp_path)) is None
+    assert verdict.complaints == [
+        "analyze a.mcap: not done after 0.2 s",
+        "rigd recover: not done after 0.2 s",
+    ]

@@ -89,12 +89,15 @@ def test_one_session_from_end_to_end(session, tmp_path):
 
 
 def test_json_on_standard_output_is_alone_there(session, tmp_path):
+    named = session.rename(tmp_path / "ζ.mcap")
     result = run(
-        session.name, "--json", "-", "--types", "vi,III", "--weights", "omega,omega^-0.5",
+        named.name, "--json", "-", "--types", "vi,III", "--weights", "omega,omega^-0.5",
         "--frf", "hv", "--band", "1,49", "--report", "out", "--method", "welch", cwd=tmp_path,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
+    assert result.stdout.isascii()  # whatever the stream's encoding is
     content = json.loads(result.stdout)
+    assert content["files"][0]["file"] == "ζ.mcap"
     names = [(fit["type"], fit["weighting"], fit["frf"]) for fit in content["fits"]]
     assert names == [
         (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
@@ -189,8 +192,10 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, ru
         (("--weights", "log"), ("log", "const, omega")),
         (("--weights", "omega^nan"), ("omega^nan", "omega^K")),
         (("--weights", "omega^1e308"), ("omega^1e308",)),
-        (("--method", "record"), ("record", "welch", "all")),
-        (("--frf", "h3"), ("h3", "h1", "fft")),
+        (("--method", "recrod"), ("there is no 'recrod'; choose from welch, record, all.",)),
+        (("--method", "record", "b.mcap"), ("--method", "Tables 3 to 5", "add --each")),
+        (("--method", "record", "--rerun", "a.rrd"), ("--rerun", "take --method all")),
+        (("--frf", "h3"), ("there is no 'h3'; choose from h1, h2, hv, iv, fft.",)),
         (("--band", "nan,50"), ("--band", "nan,50")),
         (("--band", "50,1"), ("--band", "0 < F0 < F1")),
         (("--band", "-1,50"), ("--band",)),

@@ -99,6 +99,13 @@ def test_truncated_files_without_chunks_count_their_messages(kit, tmp_path):
     refused(path, "; 7 complete samples are readable")
 
 
+@pytest.mark.parametrize("length", [8, 20, 300])
+def test_where_no_sample_is_whole_nothing_is_there_to_be_recovered(recorded, tmp_path, length):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(recorded.data[:length])
+    refused(path, "; 0 complete samples are readable before that, so there is nothing to recover")
+
+
 def test_a_tail_of_zeros_as_a_dead_host_leaves_it(recorded, tmp_path):
     path = tmp_path / "a.mcap.part"
     path.write_bytes(recorded.data[:60_000] + bytes(60_000))

@@ -1,0 +1,88 @@
+"""Campaigns of which one session is left, or one whole record: nothing is there to be pooled."""
+
+import json
+import math
+import shutil
+import sys
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from analysis.campaigns.pooled import pooled_bic
+from analysis.campaigns.ranking import ranked_structures
+from analysis.cli import app
+
+QUICK = (
+    "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50"
+)  # fmt: skip
+
+
+class Here:
+    """Workers of this process: what is tested is not that there are several."""
+
+    def run(self, function, tasks, on_done):
+        return [function(*task) for task in tasks]
+
+
+@pytest.fixture
+def run_here(monkeypatch, tmp_path):
+    @contextmanager
+    def here(_count):
+        yield Here()
+
+    monkeypatch.setattr(sys.modules["analysis.campaigns.campaign"], "process_pool", here)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        done = CliRunner().invoke(app, [*arguments, *QUICK])
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return SimpleNamespace(code=done.exit_code, stdout=done.stdout, stderr=done.stderr)
+
+    return run
+
+
+def errors(result):
+    return [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+
+
+def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
+    run_here, short_sessions, tmp_path
+):
+    shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
+    result = run_here("ok.mcap", "nosuch.mcap", "--json", "all.json")
+    assert result.code == 1
+    (error,) = errors(result)
+    assert "nosuch.mcap cannot be read: No such file" in error
+    assert "ok.mcap is reported by itself" in result.stderr
+    assert "Warning" not in result.stderr
+    assert "ok.mcap: verdict" in result.stdout
+    assert (tmp_path / "ok.report" / "report.html").exists()
+    assert not (tmp_path / "campaign.report").exists()
+    content = json.loads((tmp_path / "all.json").read_text())
+    assert {fit["file"] for fit in content["fits"]} == {"ok.mcap"}
+    (told,) = content["errors"]
+    assert told["file"] == "nosuch.mcap"
+    assert told["message"] in error
+
+
+def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
+    shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
+    result = run_here("ok.mcap", "./ok.mcap", "--method", "welch", "--report", "r")
+    assert result.code == 1
+    assert errors(result) == ["Error: ok.mcap: the file is given more than once, and counts once."]
+    assert (tmp_path / "r" / "frf.png").exists()
+
+
+def test_one_whole_record_of_several_sessions_is_ranked_by_itself(make_estimate, make_session):
+    """The others' could not be used; with nothing to share, BIC is the session's own."""
+    one = make_estimate(
+        "III", {"zeta": 3e-4, "gamma": 0.2}, np.diag([1e-12, 1e-6]), ("zeta", "gamma"), cost=90.0
+    )
+    assert pooled_bic([one]) == pytest.approx(90.0 + 2 * math.log(100), abs=1e-9)
+    sessions = [make_session("a.mcap", estimates=[one]), make_session("b.mcap")]
+    (ranked,) = ranked_structures(sessions, ())
+    assert (ranked.name, ranked.fitted, ranked.pooled) == ("III", 1, False)
+    assert ranked.bic_above_lowest == 0.0

@@ -1,0 +1,48 @@
+"""`--method record`: the whole record alone, with nothing of the paper's route."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from analysis.cli import app
+
+
+@pytest.fixture(scope="module")
+def done(write_session, make_signals, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("record")
+    path = write_session(folder / "a.mcap", make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3))
+    result = CliRunner().invoke(
+        app,
+        [str(path), "--method", "record", "--band", "1,20", "--json", str(folder / "a.json")],
+    )
+    assert result.exit_code == 0, result.stderr
+    return result, folder, json.loads((folder / "a.json").read_text())
+
+
+def test_only_the_whole_record_is_fitted_and_by_every_type(done):
+    result, _, content = done
+    assert {fit["estimator"] for fit in content["fits"]} == {"record"}
+    assert {fit["type"] for fit in content["fits"]} == {"I", "II", "III", "IV", "V", "VI", "VII"}
+    assert {mode["estimator"] for mode in content["modes"]} == {"record"}
+    (record,) = content["records"]
+    assert record["verdict"][0] in result.stdout.replace("\n  ", " ")
+    assert "weights" not in result.stdout
+
+
+def test_the_file_is_described_without_settings_of_the_paper(done):
+    (file,) = done[2]["files"]
+    assert (file["samples"], file["rate_hz"]) == (5500, 1000.0)
+    assert "settings" not in file
+
+
+def test_the_report_has_no_figure_of_the_paper(done):
+    report = done[1] / "a.report"
+    assert sorted(path.name for path in report.iterdir()) == [
+        "analysis.json", "figures", "report.html", "tables", "tables.txt",
+    ]  # fmt: skip
+    assert "a.mcap: verdict" in (report / "tables.txt").read_text()
+
+
+def test_options_without_effect_are_told(done):
+    assert done[0].stderr.startswith("Warning: --band concern")

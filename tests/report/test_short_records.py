@@ -1,0 +1,98 @@
+"""Records that were cut short, as a killed session leaves them: reported, or refused in words."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from typer.testing import CliRunner
+
+from analysis.cli import app
+from analysis.estimate import estimate_warnings
+from analysis.record import RecordError, load_record
+from analysis.report import style
+from analysis.report.document import document_text
+from analysis.report.folder import write_new
+from analysis.settings import WelchSettings
+from analysis.welch_route import analyse
+
+ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
+
+
+@pytest.fixture(scope="module")
+def cut(write_session, make_signals, tmp_path_factory):
+    """Make a session of which so many samples are left, of a sweep past the first mode."""
+    folder = tmp_path_factory.mktemp("cut")
+    whole = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
+
+    def make(samples):
+        path = folder / f"{samples}.mcap"
+        if not path.exists():
+            write_session(
+                path, replace(whole.decimated(slice(0, samples)), segments=whole.segments)
+            )
+        return path
+
+    return make
+
+
+@pytest.fixture
+def run_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        done = CliRunner().invoke(app, list(map(str, arguments)))
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return SimpleNamespace(code=done.exit_code, stdout=done.stdout, stderr=done.stderr)
+
+    return run
+
+
+def test_what_there_is_is_reported(cut, run_here, tmp_path):
+    """A record with fewer bins than tests have neighbours, figures stretches; none at a mode."""
+    result = run_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
+    assert (result.code, result.stderr) == (0, "")
+    content = json.loads((tmp_path / "r.json").read_text())
+    assert {fit["estimator"] for fit in content["fits"]} == {"welch", "record"}
+    assert "cut short" in " ".join(content["files"][0]["warnings"])
+    figures = {path.name for path in (tmp_path / "r" / "figures").glob("*.png")}
+    assert figures == {"record_frf.png", "loss_factor.png", "residual.png", "record_signals.png"}
+
+
+def test_too_short_for_the_whole_record_is_told(cut, run_here):
+    result = run_here(cut(1200), *ONE_FIT, "--report", "r")
+    assert result.code == 0
+    assert "1.2 s of record are too short for the band" in result.stderr
+    alone = run_here(cut(1200), "--method", "record", "--report", "alone")
+    assert alone.code == 1
+    assert alone.stderr.startswith("Error: ")
+    assert "1.2 s of record are too short for the band" in alone.stderr
+
+
+def test_a_transform_that_cannot_show_a_mode_is_told(cut):
+    settings = WelchSettings(estimator="fft", types=("I",), weightings=("const",))
+    (warning,) = (w for w in analyse(load_record(cut(390)), settings).warnings if "resolves" in w)
+    assert (
+        "A transform of 0.39 s resolves 2.56 Hz and cannot show the first mode, at 2.55" in warning
+    )
+    record = load_record(cut(2200))
+    response = analyse(record, settings).response
+    assert not [w for w in estimate_warnings(record, settings, response) if "resolves" in w]
+
+
+def test_a_record_too_short_for_any_mode_is_not_the_metadatas_fault_alone(
+    write_session, short_signals, tmp_path
+):
+    few = replace(short_signals.decimated(slice(0, 30)), segments={})
+    with pytest.raises(
+        RecordError, match=r"which 0\.03 s at 1000 Hz cannot show; record longer, or"
+    ):
+        load_record(write_session(tmp_path / "few.mcap", few))
+
+
+def test_a_file_name_that_is_no_text_is_no_obstacle(tmp_path):
+    name = "caf\udce9.mcap"
+    with style.styled():
+        style.save(style.new_figure(6.0, 4.0, name, "—"), tmp_path / "a.png")
+    write_new(tmp_path / "a.json", document_text({"file": name}))
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {"file": name}

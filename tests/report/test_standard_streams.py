@@ -1,0 +1,118 @@
+"""Streams as shells and other systems give them: of another encoding, unread, closed, full."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FULL = Path("/dev/full")
+needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs a disk that is always full")
+
+QUICK = ("--method", "welch", "--frf", "fft", "--types", "I", "--weights", "const")
+GREEK = """
+from analysis.commands.standard_streams import standard_streams
+with standard_streams():
+    for _ in range(20_000):
+        print("\\u03b6 = 1")
+    raise SystemExit(3)
+"""
+
+
+@pytest.fixture(scope="module")
+def short_file(write_session, make_signals, tmp_path_factory):
+    path = tmp_path_factory.mktemp("streams") / "short.mcap"
+    return write_session(path, make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3))
+
+
+def analyze(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "analysis", *map(str, arguments)],
+        stderr=subprocess.PIPE, encoding="cp1252", timeout=60, check=False, **options,
+    )  # fmt: skip
+
+
+def python(code, **options):
+    return subprocess.run(
+        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+        **options,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def unread():
+    """Writing end of a pipe whose reader has gone."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    yield writing
+    os.close(writing)
+
+
+def test_a_stream_that_is_not_utf_8_gets_question_marks_and_the_file_everything(
+    short_file, tmp_path
+):
+    environment = {**os.environ, "PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}
+    result = analyze(
+        short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json",
+        stdout=subprocess.PIPE, env=environment,
+    )  # fmt: skip
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "?" in result.stdout
+    assert "resonant peaks" in result.stdout
+    assert "ζ" in (tmp_path / "r" / "tables.txt").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "j.json").read_text(encoding="utf-8"))["fits"]
+
+
+@needs_full
+def test_a_full_disk_behind_a_stream_is_told_and_what_is_written_is_kept(short_file, tmp_path):
+    with FULL.open("w") as full:
+        result = analyze(
+            short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json",
+            stdout=full,
+        )  # fmt: skip
+    assert result.returncode == 1
+    assert result.stderr == "Error: the output cannot be written (No space left on device).\n"
+    assert json.loads((tmp_path / "r" / "analysis.json").read_text(encoding="utf-8"))["fits"]
+    assert json.loads((tmp_path / "j.json").read_text(encoding="utf-8"))["fits"]
+
+
+@needs_full
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_help_and_errors_on_a_full_disk_end_without_a_traceback(stream):
+    with FULL.open("w") as full:
+        both = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: full}
+        arguments = ["--help"] if stream == "stdout" else ["nosuch.mcap"]
+        result = subprocess.run(
+            [sys.executable, "-m", "analysis", *arguments],
+            **both, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert result.returncode == 1
+    if stream == "stdout":
+        assert result.stderr == "Error: the output cannot be written (No space left on device).\n"
+
+
+def test_the_work_is_done_and_counts_though_nobody_reads(short_file, tmp_path, unread):
+    result = analyze(
+        short_file, *QUICK, "--report", tmp_path / "r", "--json", tmp_path / "j.json",
+        stdout=unread,
+    )  # fmt: skip
+    assert (result.returncode, result.stderr) == (0, "")
+    assert json.loads((tmp_path / "j.json").read_text(encoding="utf-8"))["fits"]
+
+
+def test_the_exit_code_is_that_of_the_work(unread):
+    result = python(GREEK, stdout=unread)
+    assert (result.returncode, result.stderr) == (3, "")
+
+
+def test_everything_is_written_before_the_end():
+    result = python(GREEK, stdout=subprocess.PIPE, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+    assert (result.returncode, result.stdout) == (3, "? = 1\n" * 20_000)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell closes streams")
+def test_a_stream_that_is_closed_is_nothing_to_complain_of():
+    command = f'"{sys.executable}" -m analysis --help >&- 2>&-'
+    assert subprocess.run(command, shell=True, timeout=60, check=False).returncode == 0
