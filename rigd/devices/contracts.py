@@ -52,12 +52,16 @@ class LineHealth:
         Disturbed, damaged and missing messages.
     status
         Status word of the device; 0: all is well.
+    doubt
+        Why its readings may be older than they are said to be, for the operator; empty: they are
+        not.
     """
 
     bits: int | None = None
     bit_rate_bit_s: float | None = None
     errors: int | None = None
     status: int | None = None
+    doubt: str = ""
 
 
 class Drive(Protocol):

@@ -83,6 +83,8 @@ class Word(IntEnum):
     # Written by the live publisher
     LIVE_DROPPED = 15
     LIVE_BEAT = 16
+    LIVE_SEEN = 20
+    """Samples up to this one of the ring have been shown, or counted as dropped."""
 
 
 UNKNOWN = -1

@@ -6,6 +6,7 @@ operator's decision.
 """
 
 import gc
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 
@@ -26,6 +27,7 @@ from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine.reference import map_reference
 from rigd.engine.rest import AXES, Rest, observe_rest
 from rigd.engine.signals import StopRequest
+from rigd.engine.standstill import Standstill
 from rigd.engine.watch import make_watch
 from rigd.profile import Profile
 from rigd.safety import LOOK_EVERY
@@ -34,6 +36,9 @@ _SILENCE_S = 1.0
 """For which a device may be silent between sessions."""
 _STANDSTILL_POLL_S = 0.05
 _ZERO_S = 0.2
+_SIGN_OF_LIFE_S = 1.0
+_TAKE_UP_TICKS = 2
+"""After which it is known where the motor stands and that it does."""
 
 
 def main() -> None:
@@ -86,6 +91,7 @@ def attend(
         devices.drive.connect()
         attendance = _Attendance(profile, devices, clock, channels, parent, stop, obtained)
         channels.board[Word.PHASE] = Phase.OFF
+        attendance.take_up_standstill()
         parent.send(
             connected=True,
             calibration=devices.sensor.calibration(),
@@ -127,9 +133,24 @@ class _Attendance:
         self._obtained = obtained
         self._zero_rad = 0.0
         self._silent = 0
+        self._on_lines = devices.drive.health().bits is not None
         self._watch = make_watch(profile)
+        self._standstill = Standstill(profile)
         self._display = Display(channels.board, devices)
         self._cycle = self._make_cycle(profile)
+
+    def take_up_standstill(self) -> None:
+        """Read where the motor stands, unless that is known: virtual time stands still from now on.
+
+        Raises
+        ------
+        DeviceError, OSError
+            If a device failed.
+        """
+        for _ in range(_TAKE_UP_TICKS):
+            if not self._standstill.begun:
+                self._metronome.wait()
+                self._read_at_rest()
 
     def serve(self) -> None:
         """Do what the supervisor orders, until it is gone or a stop is asked for between sessions.
@@ -142,6 +163,7 @@ class _Attendance:
         while (message := self._await_order()) is not None:
             if "session" in message:
                 self._run_session(message["session"])
+                self.take_up_standstill()
                 gc.collect()  # the torque is off: the only time for it
             elif "tare" in message:
                 self._answer(self._tare)
@@ -151,8 +173,10 @@ class _Attendance:
     def _await_order(self) -> Message | None:
         """Observe with the torque off until there is something to do; None: nothing any more.
 
-        Virtual time stands still meanwhile.
+        Virtual time stands still meanwhile, but for a tick now and then where there are lines: at
+        their other end a host that is silent for long is taken for dead.
         """
+        seen_s = time.monotonic()
         while not self._stop.requested:
             self._show()
             try:
@@ -163,20 +187,29 @@ class _Attendance:
                 return message
             if not self._clock.virtual:
                 self._observe()
+            elif self._on_lines and time.monotonic() - seen_s > _SIGN_OF_LIFE_S:
+                seen_s = time.monotonic()
+                self._metronome.wait()
+                self._read_at_rest()
         return None
 
     def _observe(self) -> None:
         """Read the devices for some ticks, the torque off."""
-        cycle, metronome = self._cycle, self._metronome
+        cycle = self._cycle
         for _ in range(LOOK_EVERY):
-            metronome.wait()
-            cycle.observe(metronome.due_ns)
+            self._metronome.wait()
+            self._read_at_rest()
             self._silent = self._silent + 1 if cycle.stale else 0
         if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
             raise DeviceError(
                 f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; see whether the device "
                 "is on and connected."
             )
+
+    def _read_at_rest(self) -> None:
+        """Read the devices for one tick, the torque off."""
+        self._cycle.observe(self._metronome.due_ns)
+        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
 
     def _run_session(self, job: SessionJob) -> None:
         """Run one session to a disabled drive and a final message, whatever happens.
@@ -197,6 +230,7 @@ class _Attendance:
             cycle,
             self._clock,
             self._metronome,
+            self._standstill,
             self._channels,
             self._display,
             self._parent,
@@ -302,6 +336,7 @@ class _Attendance:
             self._show()
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")
+        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         silent = self._cycle.check_stale()
         if silent is not None:
             raise SessionEnd("fault", str(silent))

@@ -4,6 +4,7 @@ from math import inf
 
 from rigd.control import PidController
 from rigd.devices.contracts import Devices, Wrench
+from rigd.engine.standstill import Standstill
 from rigd.safety import LimitWatch, Violation
 from rigd.session.format import Status
 
@@ -134,6 +135,17 @@ class Cycle:
         """Name what did not come in the last tick."""
         names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
+
+    def check_encoder(self, standstill: Standstill, due_ns: int) -> None:
+        """Compare the angle just read with those before it, the torque being off.
+
+        Raises
+        ------
+        DeviceError
+            If the encoder jumped.
+        """
+        if not self.flags & _ANGLE_STALE:
+            standstill.check(self.angle_rad + self.zero_rad, due_ns)
 
     def check_stale(self) -> Violation | None:
         """Say whether a device has given nothing usable for too long, after a tick's reading."""

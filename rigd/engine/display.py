@@ -16,11 +16,17 @@ class Display:
         Where.
     devices
         Of whose lines it tells.
+
+    Attributes
+    ----------
+    doubts
+        About the age of the readings, as of the last call of `show`, for the operator.
     """
 
     def __init__(self, board: Board, devices: Devices) -> None:
         self._board = board
         self._devices = devices
+        self.doubts: list[str] = []
         self._before: tuple[int, tuple[int, ...]] | None = None
 
     def show(self, cycle: Cycle, now_ns: int) -> None:
@@ -43,6 +49,7 @@ class Display:
             if isfinite(value):
                 board[word] = round(value * 1e9)
         drive, sensor = self._devices.drive.health(), self._devices.sensor.health()
+        self.doubts = [line.doubt for line in (drive, sensor) if line.doubt]
         known = [line.errors for line in (drive, sensor) if line.errors is not None]
         board[Word.BUS_ERRORS] = sum(known) if known else UNKNOWN
         board[Word.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status

@@ -23,8 +23,10 @@ from rigd.engine.realtime import page_faults
 from rigd.engine.rest import Rest, observe_rest
 from rigd.engine.sample_log import SampleLog
 from rigd.engine.signals import StopRequest
+from rigd.engine.standstill import Standstill
 from rigd.profile import Profile
 from rigd.safety import LOOK_EVERY
+from rigd.safety.interlocks import BY_NAME
 
 _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002
@@ -64,6 +66,8 @@ class Procedure:
         Angle a tick, relative to the one at the start.
     cycle, clock, metronome
         What a tick does, and when.
+    standstill
+        Told of every angle that is read without torque.
     channels
         Where samples, the controller's terms and events go.
     display
@@ -81,6 +85,7 @@ class Procedure:
         cycle: Cycle,
         clock: Clock,
         metronome: Metronome,
+        standstill: Standstill,
         channels: Channels,
         display: Display,
         parent: Parent,
@@ -96,8 +101,10 @@ class Procedure:
         self._stop = stop
         self._rate_hz = profile.rig.rate_hz
         self._metronome = metronome
+        self._standstill = standstill
         self._suspends = SuspendWatch()
         self._page_faults = 0
+        self._doubts_told: set[str] = set()
         self._looks_unanswered = 0
         self._supervisor_beat = -1
         late_ns = int(profile.realtime.late_us * 1000)
@@ -188,6 +195,7 @@ class Procedure:
     def hold(self) -> None:
         """Hold the motor where it stands; the drive has just been enabled."""
         self._board[Word.PHASE] = Phase.SETTLING
+        self._standstill.forget()
         # The angle of the last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
         self._cycle.controller.reset(self._start_angle_rad)
@@ -275,6 +283,7 @@ class Procedure:
             end = self._stop_reason()
         if end is not None:
             cycle.torque_off()
+        self._show()
         self._take_stock(wall_ns, before_ns, last_ns - first_ns)
         if end is not None:
             raise end
@@ -329,7 +338,11 @@ class Procedure:
         except (DeviceError, OSError) as error:
             self._cycle.lose_readings()
             return SessionEnd("fault", str(error), device_failed=True)
-        return None if violation is None else SessionEnd("fault", str(violation))
+        if violation is None:
+            return None
+        # The zero is void then, and with it the limits of every further session.
+        slipped = violation.channel == BY_NAME["encoder jump"].channel
+        return SessionEnd("fault", str(violation), device_failed=slipped)
 
     def _observe_switched_off(self) -> None:
         """Switch off, and read once more for the last sample if the devices still answer."""
@@ -352,6 +365,7 @@ class Procedure:
 
     def _check_reading(self) -> None:
         self._check_stop()
+        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         silent = self._cycle.check_stale()
         if silent is not None:
             raise SessionEnd("fault", str(silent))
@@ -377,7 +391,7 @@ class Procedure:
 
     def _look(self) -> SessionEnd | None:
         """Show that this process is at work and what it reads; see whether the others are."""
-        self._display.show(self._cycle, self._metronome.due_ns)
+        self._show()
         violation = self._cycle.look(
             self._metronome.due_ns,
             # Under the virtual clock the loop waits for the recorder.
@@ -427,6 +441,14 @@ class Procedure:
         intervals = self.counts.scheduled - self.counts.missed - 1
         if executed_ns > 0:
             self.results["true_rate_hz"] = repr(intervals / (executed_ns * 1e-9))
+
+    def _show(self) -> None:
+        """Show what is read, and tell once why it may be older than it is said to be."""
+        self._display.show(self._cycle, self._metronome.due_ns)
+        for doubt in self._display.doubts:
+            if doubt not in self._doubts_told:
+                self._doubts_told.add(doubt)
+                self._say("warning", doubt)
 
     def _say_what_is_near(self) -> None:
         for notice in self._cycle.watch.take_notices():

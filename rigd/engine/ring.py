@@ -71,6 +71,14 @@ class Ring:
         """Records that the consumer has yet to take."""
         return self._counters[_WRITTEN] - self._counters[_READ]
 
+    @property
+    def oldest(self) -> int:
+        """Number of the oldest record that an observer reads, negative in a ring that is new.
+
+        Half the ring is left as a margin for records that are written during the copy.
+        """
+        return self._counters[_WRITTEN] - self.capacity // 2
+
     # Producer
 
     def slot(self) -> int:
@@ -135,8 +143,7 @@ class Observer:
     def take(self, most: int) -> bytes:
         """Copy out up to ``most`` of the records not yet seen, oldest first."""
         ring = self._ring
-        # Half the ring is left as a margin for records that are written during the copy.
-        oldest = ring.written - ring.capacity // 2
+        oldest = ring.oldest
         if self._cursor < oldest:
             self.dropped += oldest - self._cursor
             self._cursor = oldest

@@ -20,14 +20,16 @@ class Backlog:
 
     Attributes
     ----------
+    samples
+        Samples that wait.
     dropped
-        Samples that were.
+        Samples that were dropped.
     """
 
     def __init__(self, most_samples: int) -> None:
         self._most_samples = most_samples
         self._waiting: collections.deque[tuple[list[Drawing], int]] = collections.deque()
-        self._samples = 0
+        self.samples = 0
         self._owed: collections.deque[Drawing] = collections.deque(maxlen=_MOST_OWED)
         self.dropped = 0
 
@@ -38,10 +40,10 @@ class Backlog:
         """Add drawings that show so many samples; if need be, make room."""
         if drawings:
             self._waiting.append((drawings, samples))
-            self._samples += samples
-        while self._samples > self._most_samples and len(self._waiting) > 1:
+            self.samples += samples
+        while self.samples > self._most_samples and len(self._waiting) > 1:
             _, lost = self._waiting.popleft()
-            self._samples -= lost
+            self.samples -= lost
             self.dropped += lost
 
     def owe(self, drawings: "Iterable[Drawing]") -> None:
@@ -55,7 +57,7 @@ class Backlog:
     def take(self) -> "tuple[list[Drawing], int]":
         """Return everything, and how many samples it shows; nothing waits any more."""
         drawings = [*self._owed, *(draw for group, _ in self._waiting for draw in group)]
-        samples, self._samples = self._samples, 0
+        samples, self.samples = self.samples, 0
         self._owed.clear()
         self._waiting.clear()
         return drawings, samples

@@ -30,7 +30,7 @@ class Harvest:
     drawings
         Draw everything else.
     samples
-        How many samples those show.
+        How many samples those show that nobody has shown before.
     """
 
     notes: "list[Drawing]"
@@ -49,6 +49,9 @@ class Intake:
         To show.
     channels
         The memory of the rig's processes.
+    seen
+        Samples that another publisher showed before this one took over, counted as `begins` is:
+        what of them is there still is read again, for the picture is made of it.
 
     Attributes
     ----------
@@ -60,13 +63,14 @@ class Intake:
         For how much of the session were the samples that were read last.
     """
 
-    def __init__(self, session: LiveSession, channels: Channels) -> None:
+    def __init__(self, session: LiveSession, channels: Channels, seen: int = 0) -> None:
         self.picture = Picture(session.subject)
         self.t_ns = 0
         self.took_s = 0.0
         self._rate_hz = session.subject.rate_hz
+        self._seen = seen
         self._readers = {
-            topic: _Reader(ring, first)
+            topic: _Reader(ring, first, seen if topic is SAMPLE else 0)
             for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
             if topic.live
         }
@@ -75,6 +79,11 @@ class Intake:
     def dropped(self) -> int:
         """Samples that were overwritten before they were read."""
         return self._readers[SAMPLE].dropped
+
+    @property
+    def next(self) -> int:
+        """Number of the next sample, counted as `begins` is."""
+        return self._readers[SAMPLE].next
 
     @property
     def exhausted(self) -> bool:
@@ -92,7 +101,7 @@ class Intake:
         picture, readers = self.picture, self._readers
         notes: list[Drawing] = []
         drawings: list[Drawing] = []
-        count = 0
+        count = fresh = 0
         for events in readers[EVENT].records(read_events):
             notes += picture.events([Note(e.t_ns, e.level, e.message) for e in events])
         for timings in readers[TIMING].records(decode_timings):
@@ -101,22 +110,28 @@ class Intake:
             drawings += picture.samples(samples)
             self.t_ns = int(samples["t_ns"][-1])
             count += len(samples)
+            fresh += min(len(samples), max(0, self.next - self._seen))
         self.took_s = count / self._rate_hz
-        return Harvest(notes, drawings, count)
+        return Harvest(notes, drawings, fresh)
 
 
 class _Reader:
     """The part of one ring that a session wrote."""
 
-    def __init__(self, ring: Ring, first: int) -> None:
+    def __init__(self, ring: Ring, first: int, seen: int) -> None:
         self._ring = ring
-        self._observer = Observer(ring, first)
+        # What was seen and has been overwritten since is not dropped.
+        self._observer = Observer(ring, max(first, min(seen, ring.oldest)))
         self._damaged = 0
         self.end: int | None = None
 
     @property
     def dropped(self) -> int:
         return self._observer.dropped + self._damaged
+
+    @property
+    def next(self) -> int:
+        return self._observer.next
 
     @property
     def exhausted(self) -> bool:

@@ -15,6 +15,7 @@ from rigd.engine import signals
 from rigd.engine.board import Word
 from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.process import Message, Parent
+from rigd.engine.topics import SAMPLE, TOPICS
 from rigd.live.backlog import Backlog
 from rigd.live.feed import Feed
 from rigd.live.intake import Intake
@@ -145,17 +146,21 @@ class _Shown:
     """The session that is shown, or was last."""
 
     def __init__(self, session: "LiveSession", channels: Channels) -> None:
-        self.intake = Intake(session, channels)
+        board = self._board = channels.board
+        begin, seen = session.begins[TOPICS.index(SAMPLE)], board[Word.LIVE_SEEN]
+        # Of a session that another publisher showed up to there, the count goes on.
+        self._dropped_before = board[Word.LIVE_DROPPED] if seen > begin else 0
+        self.intake = Intake(session, channels, seen)
         self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
         self.over = False
-        self._board = channels.board
         self._vitals = Vitals(channels)
         self._unsent = 0
 
     @property
     def dropped(self) -> int:
         """Samples that could not be shown."""
-        return self.intake.dropped + self.backlog.dropped + self._unsent
+        here = self.intake.dropped + self.backlog.dropped + self._unsent
+        return self._dropped_before + here
 
     def gather(self) -> None:
         """Take what has come, while the session lasts."""
@@ -169,7 +174,14 @@ class _Shown:
             drawings += self.intake.picture.health(self.intake.t_ns, health)
         self.backlog.owe(harvest.notes)
         self.backlog.put(drawings, harvest.samples)
-        self._board[Word.LIVE_DROPPED] = self.dropped
+        self._tell()
+
+    def _tell(self) -> None:
+        """Put on the board what another publisher, if it takes over, has to know."""
+        board = self._board
+        board[Word.LIVE_DROPPED] = self.dropped
+        shown = self.intake.next - self.backlog.samples
+        board[Word.LIVE_SEEN] = max(board[Word.LIVE_SEEN], shown)
 
     def finish(self, end: LiveEnd) -> None:
         """Take the rest of it, and what can only be known at its end."""
@@ -190,6 +202,8 @@ class _Shown:
             drawings, samples = self.backlog.take()
             if not feed.send(drawings):
                 self._unsent += samples
+            if not self.over:
+                self._tell()
 
 
 def _arm_watchdog() -> None:

@@ -55,7 +55,13 @@ _DEAF_S = 1.5
 """Without a look for so long the event loop is stuck, and hears no stop."""
 _RATE_LOOKS = 10
 """Over as many of them a rate is measured."""
-_TOLD_LEVELS = ("info", "warning", "error", "fatal")
+_LOGGED = {
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+    "fatal": logging.CRITICAL,
+}
+"""Levels of events that are told, and as what they are logged."""
 
 _SHUTTING_DOWN = "The daemon is being shut down."
 
@@ -194,6 +200,8 @@ class Service:
         self._live = live
         self._states = StateMachine(self._tell_transition)
         self._began_utc_ns = time.time_ns()
+        self._fault = ""
+        """Why it went into fault last, but for what failed in resetting it."""
         self._doing = ""
         self._closing = False
         self._series: Series | None = None
@@ -252,9 +260,19 @@ class Service:
         CommandError
             If it is refused, or fails.
         """
+        if not (request.controlling or isinstance(request, messages.Stop)):
+            return self.status() if isinstance(request, messages.Status) else {}
+        _log.info("%s: asked by %s", request.command, peer)
+        try:
+            return await self._obey(request, peer)
+        except CommandError as error:
+            _log.warning("%s: refused: %s", request.command, error)
+            raise
+
+    async def _obey(self, request: messages.AnyRequest, peer: Peer) -> Document:
+        """Obey a request that may change something."""
         if request.controlling:
             self._take_control(peer)
-            _log.info("%s: asked by %s", request.command, peer)
         if isinstance(request, messages.Start):
             return await self._start(request)
         if isinstance(request, messages.Stop):
@@ -263,9 +281,7 @@ class Service:
             return await self._measure("tare", self._rig.tare)
         if isinstance(request, messages.Zero):
             return await self._measure("zero", self._rig.zero)
-        if isinstance(request, messages.Reset):
-            return await self._reset()
-        return self.status() if isinstance(request, messages.Status) else {}
+        return await self._reset()
 
     def status(self) -> Document:
         """Tell everything there is to tell."""
@@ -353,6 +369,7 @@ class Service:
                 "the motor to its middle and run rigd zero."
             )
         self._count += 1
+        last = self._series
         series = self._series = Series(self._count, request, running=True)
         self._doing = "planning"
         try:
@@ -362,11 +379,13 @@ class Service:
             refusal = self._states.refusal("start")
             if refusal:
                 raise CommandError(refusal)
-        except Exception as error:
-            series.running, series.failed, series.reason = False, True, str(error)
+        except Exception:
+            self._series = last
             raise
         finally:
             self._doing = ""
+        for warning in plan.warnings:
+            _log.warning("series %d: %s", series.number, warning)
         series.ticks = excitation.reference_rad.size
         times = f", {request.repeat} sessions" if request.repeat > 1 else ""
         self._states.move(State.RUNNING, f"{request.excitation} was started{times}")
@@ -400,13 +419,15 @@ class Service:
                     return {"zero_lost": self._rig.zero_lost}
             if self._closing:
                 raise CommandError(_SHUTTING_DOWN)
+            fault = self._fault
             self._states.move(State.IDLE, "reset by the operator")
-            await self._connect(reset_fault=True)
+            await self._connect(reset_fault=True, fault=fault)
         finally:
             self._doing = ""
         return {"zero_lost": self._rig.zero_lost}
 
-    async def _connect(self, *, reset_fault: bool) -> None:
+    async def _connect(self, *, reset_fault: bool, fault: str = "") -> None:
+        """Connect the rig; if that fails, the `fault` that was to be reset is told still."""
         try:
             moving = self._moving()
             if moving is not self._began_moving:
@@ -417,18 +438,24 @@ class Service:
                 )
             await self._call(partial(self._rig.connect, moving, reset_fault=reset_fault))
         except RigError as error:
-            self._states.move(State.FAULT, str(error))
+            self._fail_again(str(error), fault)
             raise CommandError(str(error)) from None
         except Exception as error:
             _log.exception("the rig could not be connected, in a way that was not foreseen")
             await self._let_go()
             reason = f"The rig could not be connected, in an unforeseen way ({error!r})."
-            self._states.move(State.FAULT, reason)
+            self._fail_again(reason, fault)
             raise CommandError(reason) from None
         if self._closing:
             await self._call(self._rig.disconnect)
             raise CommandError(_SHUTTING_DOWN)
         self._states.move(State.READY, f"{moving.value} is connected")
+
+    def _fail_again(self, reason: str, fault: str) -> None:
+        """Go into fault, with what came before it if that could not be reset."""
+        same = not fault or fault == reason
+        self._states.move(State.FAULT, reason if same else f"{reason} Not reset: {fault}")
+        self._fault = fault or reason
 
     # Series
 
@@ -492,11 +519,12 @@ class Service:
             loop.call_soon_threadsafe(self._publish, event)
 
         def tell(level: str, text: str) -> None:
+            _log.log(_LOGGED[level], "series %d: %s", series.number, text)
             publish({"event": "message", "level": level, "text": text})
 
         def watcher(_: SessionProgress, events: list[Event]) -> None:
             for event in events:
-                if event.level in _TOLD_LEVELS:
+                if event.level in _LOGGED:
                     tell(event.level, event.message)
 
         request = series.request
@@ -517,6 +545,7 @@ class Service:
                 tell("info", self._rig.show(order, series.stop))
             result = self._rig.run(order, series.stop, watcher, self._listens)
             series.results.append(result)
+            _log_result(series, result)
             publish({"event": "session", "number": number, **result.as_dict()})
             if not result.went_well:
                 return
@@ -549,6 +578,8 @@ class Service:
         }
 
     def _tell_transition(self, transition: Transition) -> None:
+        if transition.after is State.FAULT:
+            self._fault = transition.reason
         level = logging.ERROR if transition.after is State.FAULT else logging.INFO
         _log.log(
             level, "state: %s -> %s: %s", transition.before, transition.after, transition.reason
@@ -557,6 +588,26 @@ class Service:
 
     async def _call(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
+
+
+def _log_result(series: Series, result: SessionResult) -> None:
+    _log.log(
+        logging.INFO if result.went_well else logging.WARNING,
+        "series %d: session %d of %d: %s, %s: %d ticks scheduled, %d recorded, %d missed, %d late, "
+        "%d lost, %d not shown live%s",
+        series.number,
+        series.session,
+        series.request.repeat,
+        result.path or "no file",
+        result.outcome,
+        result.scheduled,
+        result.recorded,
+        result.missed,
+        result.late,
+        result.lost,
+        result.live_dropped,
+        f": {result.reason}" if result.reason else "",
+    )
 
 
 def _after(series: Series, fault: str) -> tuple[State, str]:

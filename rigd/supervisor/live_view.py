@@ -16,7 +16,9 @@ from rigd.supervisor.orders import Order
 from rigd.view.subject import Subject
 
 _PATIENCE_S = 10.0
-"""It takes its time to start."""
+"""It takes its time to start: a session waits so long for it."""
+_START_PATIENCE_S = 60.0
+"""On a computer that is busy, before one that only starts counts as hung."""
 _BEGIN_PATIENCE_S = 1.0
 _MOST_RESTARTS = 3
 """In one session: what dies again and again is not worth the processor time."""
@@ -155,7 +157,7 @@ class LiveView:
 
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None
-        patience_s = LIVE.hung_after_s if self._heard else _PATIENCE_S
+        patience_s = LIVE.hung_after_s if self._heard else _START_PATIENCE_S
         beat = self._crew.channels.board[Word.LIVE_BEAT]
         if self._pulse.look(beat, time.monotonic()) > patience_s:
             self._restart(f"The live process has not moved for {patience_s:g} s and was killed.")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.devices.contracts import DeviceError
+from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine.board import Phase, Word
 from rigd.engine.clocks import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
@@ -232,3 +232,122 @@ def test_the_board_shows_what_is_read_and_that_somebody_reads(make_session):
     assert beats == sorted(set(beats))
     assert session.board[Word.ANGLE_NRAD] == pytest.approx(0.25e9, abs=3e5)
     assert session.board[Word.TORQUE_COMMAND_NNM] == 0
+
+
+def jump_between(session, n, counts=8000):
+    """Have the encoder slip while the rig is ready, after the `n`-th order."""
+    give, given = session.parent.poll, []
+
+    def poll(timeout_s):
+        given.append(1)
+        if len(given) == n + 1:
+            slip_rad = counts * session.profile.rig.encoder.resolution_rad
+            session.drive.fault_at, session.drive.fault = 1, lambda angle_rad: angle_rad + slip_rad
+        return give(timeout_s)
+
+    session.parent.poll = poll
+
+
+@pytest.mark.parametrize("clock", [VirtualClock, FakeRealClock])
+@pytest.mark.parametrize(
+    ("first", "then", "counts"),
+    [
+        ("zero", "session", 8000),
+        ("session", "session", -80),
+        ("session", "zero", 80),
+        ("tare", "tare", -8000),
+        (None, "session", 80),
+    ],
+)
+def test_an_encoder_that_slips_between_two_orders_is_noticed(
+    make_session, clock, first, then, counts
+):
+    session = make_session(clock=clock())
+
+    def order(name):
+        return short(session) if name == "session" else {name: True}
+
+    orders = [order(name) for name in (first, then) if name is not None]
+    jump_between(session, len(orders) - 1, counts)
+    session.obey(*orders)
+    (ended,) = session.parent.said("ended")
+    assert "The encoder jumped by " in ended["ended"]
+    assert f"{counts * 7e-5:.2g}"[:-1] in ended["ended"]
+    assert "set the zero again" in ended["ended"]
+    told = session.parent.said("finished")
+    if then == "session" and clock is VirtualClock:
+        assert told[-1]["finished"] == "fault"
+        assert told[-1]["device_failed"] is True
+        assert told[-1]["counts"]["scheduled"] == 0
+    assert session.parent.said("refused") == []
+    session.assert_safe()
+
+
+def test_an_encoder_that_slips_in_the_pause_before_the_tare_is_noticed(make_session):
+    """Within the readings of the tare as well, where it looked like a motor that moves."""
+    session = make_session()
+    session.drive.fault_at, session.drive.fault = 500, lambda angle_rad: angle_rad + 0.56
+    session.obey(short(session))
+    (finished,) = session.parent.said("finished")
+    assert finished["device_failed"] is True
+    assert "The encoder jumped by 0.56 rad within one tick" in finished["reason"]
+
+
+def test_an_encoder_that_slips_in_a_session_loses_the_connection_and_so_the_zero(make_session):
+    session = make_session()
+    session.drive.fault_at, session.drive.fault = 2000, lambda angle_rad: angle_rad + 0.05
+    session.obey({"zero": True}, short(session), short(session))
+    (finished,) = session.parent.said("finished")
+    assert "encoder's jump of" in finished["reason"]
+    assert finished["device_failed"] is True
+    assert len(session.parent.said("ended")) == 1
+    session.assert_safe()
+
+
+@pytest.mark.parametrize("speed_rad_s", [0.1, 1.0, 3.0])
+def test_a_hand_may_turn_the_motor_between_sessions(make_session, speed_rad_s):
+    """Up to a speed and back to rest within a tenth of a second each, and a quarter of a turn."""
+    session = make_session(clock=FakeRealClock())
+    rate_hz = session.profile.rig.rate_hz
+    speeds = np.interp(np.arange(1000), [200, 300, 600, 700], [0.0, speed_rad_s, speed_rad_s, 0.0])
+    turned = np.cumsum(speeds) / rate_hz
+
+    def hand(angle_rad):
+        return angle_rad + float(turned[min(session.drive.reads, len(turned) - 1)])
+
+    session.drive.fault_at, session.drive.fault = 1, hand
+    looks = [None] * 20
+    session.parent.poll = lambda timeout_s: looks.pop() if looks else {"zero": True}
+    done = session.parent.send
+
+    def send(**message):
+        done(**message)
+        if "done" in message:
+            session.stop.request()
+
+    session.parent.send = send
+    session.obey()
+    assert session.parent.said("ended") == [{"ended": ""}]
+    (zeroed,) = session.parent.said("done")
+    assert zeroed["done"]["moved_rad"] == pytest.approx(turned[-1], abs=1e-3)
+
+
+@pytest.mark.parametrize("bits", [None, 0])
+def test_virtual_time_goes_on_slowly_where_a_device_waits_for_signs_of_life(
+    make_session, monkeypatch, bits
+):
+    """On a line, that is: it stands still for a rig that is simulated in this process."""
+    monkeypatch.setattr("rigd.engine.control._SIGN_OF_LIFE_S", 0.0)
+    session = make_session()
+    session.drive.health = lambda: LineHealth(bits)
+    reads = []
+
+    def poll(timeout_s):
+        reads.append(session.drive.reads)
+        if len(reads) > 5:
+            raise EOFError
+
+    session.parent.poll = poll
+    session.obey()
+    per_look = 0 if bits is None else 1
+    assert np.diff(reads).tolist() == [per_look] * 5

@@ -71,6 +71,13 @@ class Producer(threading.Thread):
         self._halt.set()
         self.join()
 
+    def go_on(self, ticks: int) -> None:
+        """Write more once it has been stopped."""
+        for _ in range(ticks):
+            self._write()
+            self.channels.samples.discard()
+            self.channels.timings.discard()
+
     def close(self) -> None:
         self.stop()
         self.channels.close()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from processes import eventually, has_ended, listeners, sockets
 
+from rigd.engine.board import Word
 from rigd.live.address import find
 from rigd.live.job import LiveJob
 
@@ -235,6 +236,23 @@ def test_what_was_overwritten_before_it_was_seen_is_counted(start_producer, star
     assert eventually(lambda: publisher.dropped > 0)
     assert publisher.dropped <= producer.tick
     assert producer.refused == 0
+
+
+def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, start_publisher):
+    producer = start_producer(capacity=4000)
+    first = start_publisher(producer)
+    board = producer.channels.board
+    assert eventually(lambda: producer.tick > 5000)
+    producer.stop()
+    assert eventually(lambda: board[Word.LIVE_SEEN] == producer.tick)
+    before = producer.dropped
+    first.process.kill()
+    first.process.wait()
+    producer.go_on(3000)
+    second = start_publisher(producer)
+    assert eventually(lambda: board[Word.LIVE_SEEN] == producer.tick)
+    # An observer reads half of what a ring has; the half before it is gone.
+    assert second.dropped == before + 3000 - 4000 // 2
 
 
 @pytest.mark.parametrize(

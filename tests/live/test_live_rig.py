@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -165,3 +166,33 @@ def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig
     assert result.recorded == result.scheduled > given_up_at + 5000
     _, told = run("next")
     assert told[0].startswith("Live view: "), "a new session is a new chance"
+
+
+class StillCrew:
+    """A crew whose publisher is there and says and does nothing."""
+
+    def __init__(self):
+        board = {Word.LIVE_BEAT: 0}
+        self.channels = SimpleNamespace(specs=None, board=board, rings=())
+        self.started = 0
+
+    def fresh(self, process):
+        self.started += 1
+
+    def __getitem__(self, process):
+        return SimpleNamespace(
+            poll=lambda timeout_s: None, kill=lambda: None, send_object=lambda name, value: None
+        )
+
+
+@pytest.mark.parametrize(("heard", "patience_s"), [(False, 60.0), (True, 5.0)])
+def test_one_that_is_only_starting_has_time_on_a_busy_computer(monkeypatch, heard, patience_s):
+    now_s = [0.0]
+    monkeypatch.setattr(live_view.time, "monotonic", lambda: now_s[0])
+    crew = StillCrew()
+    view = live_view.LiveView(crew, "rig")
+    view._heard = heard
+    while crew.started == 1:
+        now_s[0] += 0.1
+        view.look()
+    assert now_s[0] == pytest.approx(patience_s, abs=0.5)

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from rigd.devices.contracts import DeviceError
+from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.registry import Reality
 from rigd.engine.board import Word
 from rigd.engine.process import ChildError
@@ -22,6 +22,10 @@ OTHER = Peer(2, 200, 0)
 
 def fail(drive):
     raise DeviceError("The drive is gone.")
+
+
+def fall_silent(drive):
+    drive.inner.angle_stale = True
 
 
 def transitions(operated):
@@ -134,19 +138,49 @@ def test_only_reset_leaves_a_fault(operated):
 
 
 def test_a_limit_that_ends_a_session_is_a_fault_and_the_zero_survives_its_reset(operated):
-    def jump(drive):
-        drive.offset_rad = 0.4
-
     operated.ask("zero")
-    operated.world.countdown, operated.world.then = 1200, jump
+    operated.world.countdown, operated.world.then = 1200, fall_silent
     operated.ask("start", **SHORT)
     assert operated.state is State.FAULT
     assert operated.rig.connected
-    operated.world.drives[0].offset_rad = 0.0
+    operated.world.drives[0].inner.angle_stale = False
     assert operated.ask("reset") == {"zero_lost": False}
     assert transitions(operated)[-1] == ("fault", "ready")
     operated.ask("start", **SHORT)
     assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def slip(drive):
+    drive.offset_rad = 8000 * 7e-5
+
+
+@pytest.mark.parametrize("when", ["ready", "session"])
+def test_an_encoder_that_jumps_makes_the_zero_void(operated, when):
+    """And the limits with it: nothing is started until there is another zero."""
+    operated.ask("zero")
+    if when == "ready":  # no time passes under the virtual clock until something is asked for
+        slip(operated.world.drives[0])
+    else:
+        operated.world.countdown, operated.world.then = 1900, slip
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert "encoder" in operated.last["reason"]
+    assert "0.56 rad" in operated.last["reason"]
+    assert "the zero" in operated.last["reason"]
+    assert "rigd reset" in str(operated.ask("start", **SHORT))
+    assert operated.ask("reset") == {"zero_lost": True}
+    refusal = operated.ask("start", **SHORT)
+    assert isinstance(refusal, CommandError)
+    assert "rigd zero" in str(refusal)
+    operated.ask("zero")
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_an_encoder_that_jumps_before_the_zero_is_set_is_told(operated):
+    slip(operated.world.drives[0])
+    assert "The encoder jumped by 0.56 rad" in str(operated.ask("zero"))
+    assert operated.state is State.FAULT
 
 
 def test_a_zero_that_was_lost_has_to_be_set_before_the_next_session(operated):
@@ -202,7 +236,7 @@ def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
     assert operated.last["stopped"]
     assert operated.last["failed"]
     assert operated.state is State.FAULT
-    assert operated.rig.connected  # it is not that which makes it a fault
+    assert operated.last["sessions"][0]["outcome"] == "fault"
 
 
 def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
@@ -371,3 +405,65 @@ def test_status_tells_of_progress_processes_and_topics(operated):
         ("idle", "ready"), ("ready", "running"),
     ]  # fmt: skip
     assert any(event["event"] == "progress" for event in operated.events)
+
+
+def test_a_refused_start_leaves_the_last_series_as_it_was(operated):
+    assert operated.service.status()["series"] is None
+    assert isinstance(operated.ask("start", **TOO_FAR), CommandError)
+    assert operated.service.status()["series"] is None
+    operated.ask("start", **SHORT, repeat=2)
+    last = operated.service.status()["series"]
+    assert len(last["sessions"]) == 2
+    assert isinstance(operated.ask("start", **TOO_FAR), CommandError)
+    assert operated.service.status()["series"] == last
+
+
+TOO_FAR = {"excitation": "chirp", "parameters": {"amplitude_rad": 9.0}}
+
+
+def test_the_log_tells_of_refusals_and_results(operated, caplog):
+    caplog.set_level("INFO", "rigd.serve")
+    operated.ask("start", **TOO_FAR)
+    operated.ask("reset")
+    operated.ask("tare", peer=OTHER)
+    operated.ask("start", **SHORT)
+    told = [record.getMessage() for record in caplog.records]
+    refused = [line for line in told if ": refused: " in line]
+    assert [line.partition(":")[0] for line in refused] == ["start", "reset", "tare"]
+    assert "amplitude_rad = 9" in refused[0]
+    assert "is controlled by" in refused[2]
+    (result,) = [line for line in told if "scheduled" in line]
+    path = operated.last["sessions"][0]["path"]
+    assert result == (
+        f"series 2: session 1 of 1: {path}, complete: 300 ticks scheduled, 300 recorded, 0 missed, "
+        "0 late, 0 lost, 0 not shown live"
+    )
+
+
+def test_the_log_tells_of_warnings(operated, caplog):
+    caplog.set_level("INFO", "rigd.serve")
+
+    def doubt(drive):
+        drive.health = lambda: LineHealth(doubt="Angles are old.")
+
+    operated.world.countdown, operated.world.then = 1200, doubt
+    operated.ask("start", **SHORT)
+    (told,) = [r for r in caplog.records if r.getMessage() == "series 1: Angles are old."]
+    assert told.levelname == "WARNING"
+
+
+def test_a_reset_that_fails_does_not_lose_what_was_to_be_reset(operated, caplog):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    first = operated.service.status()["reason"]
+    operated.world.absent = True
+    for _ in range(2):  # not longer each time
+        assert str(operated.ask("reset")) == "The drive does not answer."
+        assert operated.service.status()["reason"] == (
+            f"The drive does not answer. Not reset: {first}"
+        )
+    operated.world.absent = False
+    operated.ask("reset")
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.service.status()["reason"] == first

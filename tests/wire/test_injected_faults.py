@@ -140,3 +140,30 @@ def test_passing_faults_are_flagged_and_borne(
             assert not (here & ~int(flag)).any(), row.name
         else:
             assert not here.any(), row.name
+
+
+@pytest.mark.parametrize(
+    ("name", "sender", "ms"),
+    [("antenna_can", "drive,id=0x181", 1), ("antenna_serial", "sensor", 3)],
+)
+def test_readings_that_stay_late_are_warned_of_where_nothing_can_tell_them_from_lost_ones(
+    name, sender, ms, quiet_profile, start_simulator, run_order, load
+):
+    profile = quiet_profile(name)
+    start_simulator(profile, "--lock-step")
+    fault = f"delay,from={sender},ms={ms},frames=1000000"
+    result = run_order(load(profile), "session", fast=True, faults=[fault], **CHIRP)
+    assert result.outcome == "complete"
+    (told,) = [e for e in read_session(result.path).events if "all come later by" in e.message]
+    assert (told.level, told.t_ns > 0) == ("warning", True)
+
+
+def test_polls_that_are_answered_late_for_good_end_the_session(
+    quiet_profile, start_simulator, run_order, load
+):
+    profile = quiet_profile("antenna_can", {"limits.stale_ticks_in_a_row": "6"})
+    start_simulator(profile, "--lock-step")
+    fault = "delay,from=sensor,ms=2,frames=1000000"
+    result = run_order(load(profile), "session", fast=True, faults=[fault], **CHIRP)
+    assert result.outcome == "fault"
+    assert re.search(r"wrench.*6 ticks", result.reason), result.reason

@@ -1,12 +1,18 @@
 """Through the wires, one period a SYNC, the samples are those of the direct simulation."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rigd.devices.parameters import Selection
+from rigd.engine.signals import StopRequest
+from rigd.excitation import hold
 from rigd.session import read_session
+from rigd.sim.wire.simulate import inject
+from rigd.supervisor.orders import Order
+from rigd.supervisor.rig import Rig
 
 
 @pytest.mark.parametrize(
@@ -62,3 +68,34 @@ def test_samples_equal_those_of_the_direct_simulation(
     # The controller amplifies an encoder step: compare what the torque does on the whole.
     command = ours["torque_command_nm"] - theirs["torque_command_nm"]
     assert command.std() < 0.05 * theirs["torque_command_nm"].std()
+
+
+def test_a_rig_may_be_left_alone_between_sessions(quiet_profile, start_simulator, load, tmp_path):
+    """For longer than the simulated drive waits for a host, which is 5 s; then its STO is told."""
+    profile = load(quiet_profile("antenna_can", {"cia402.enable_timeout_s": "0.1"}))
+    start_simulator(profile.path, "--lock-step")
+    excitation = hold(rate_hz=1000.0, duration_s=0.1, rest_s=0.0, ring_down_s=0.0)
+    rig = Rig(profile, fast=True)
+
+    def run(name):
+        order = Order(profile, excitation, tmp_path / f"{name}.mcap")
+        return rig.run(order, StopRequest(), lambda *_: None)
+
+    def leave_alone(duration_s):
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s:
+            rig.watch()
+            time.sleep(0.2)
+
+    try:
+        rig.connect()
+        assert run("first").went_well
+        leave_alone(5.5)
+        assert run("second").went_well
+        inject(profile.name, ["sto"])
+        leave_alone(1.5)
+        refused = run("third")
+        assert refused.outcome == "fault"
+        assert "look at STO" in refused.reason
+    finally:
+        rig.disconnect()

@@ -37,9 +37,7 @@ class AtiCanSensor:
     wrench_stale, wrench_saturated, wrench_time_ns
         Of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
     polls : GaugePolls
-        With the last turn-round time and the count of frames that fitted nowhere.
-    missing_replies : int
-        Polls without a reply by the next tick, which then sent none.
+        With the last turn-round time and the count of lost replies.
     late_replies : int
         Replies that came after the deadline, but before the next tick.
     bus_errors : int
@@ -83,7 +81,6 @@ class AtiCanSensor:
         self.wrench_stale = True
         self.wrench_saturated = False
         self.wrench_time_ns = 0
-        self.missing_replies = 0
         self.late_replies = 0
         self.bus_errors = 0
 
@@ -143,21 +140,17 @@ class AtiCanSensor:
         }
 
     def request(self, due_ns: int) -> None:  # noqa: ARG002
-        """Poll the sensor, unless the reply to the last poll is still on its way."""
+        """Poll the sensor, unless it is in doubt which reply is whose."""
         polls = self.polls
         if self._lock_step and not self._waits:
             # No time passes between two ticks: the reply to the last poll is still being made.
             polls.wait(time.monotonic_ns() + self._deadline_ns)
-        if not polls.settle():
-            polls.forget()
-            self._previous = None
-            self.missing_replies += 1
-            return
-        if self._waits:
-            self.late_replies += self._given_up and polls.answer is not None
-        else:
-            self._previous, self._previous_ns = polls.answer, polls.sent_ns
-        polls.send()
+        polls.drain()
+        if not self._waits:
+            self._previous, self._previous_ns = polls.settle(), polls.sent_ns
+        elif self._given_up:
+            self.late_replies += polls.settle() is not None
+        polls.send_or_pause()
         self._give_up_ns = polls.sent_ns + self._deadline_ns
 
     def read_wrench(self) -> Wrench:
@@ -172,7 +165,6 @@ class AtiCanSensor:
             answer, sent_ns = self.polls.wait(self._give_up_ns), self.polls.sent_ns
             self._given_up = answer is None
         else:
-            # Since the request this is settled: whatever comes now answers this tick's poll.
             answer, sent_ns = self._previous, self._previous_ns
         if answer is None:
             self.wrench_stale = True
@@ -183,7 +175,7 @@ class AtiCanSensor:
 
     def health(self) -> LineHealth:
         """Tell what went wrong between this computer and the sensor, and its status word."""
-        errors = self.missing_replies + self.bus_errors
+        errors = self.polls.lost + self.bus_errors
         return LineHealth(errors=errors, status=self._status_word)
 
     def measure(self, duration_s: float) -> dict[str, float]:
@@ -232,8 +224,9 @@ class AtiCanSensor:
     def _subscribe(self, exchange: CanExchange) -> None:
         if exchange is not self._subscribed_to:
             base = self._settings.base_id
-            exchange.subscribe(identifier(base, netcanoem.GAUGES), self.polls.take_first)
-            exchange.subscribe(identifier(base, netcanoem.GAUGES_REST), self.polls.take_second)
+            self.polls.subscribe(
+                identifier(base, netcanoem.GAUGES), identifier(base, netcanoem.GAUGES_REST)
+            )
             for opcode in REPLY_LENGTHS:
                 if opcode not in (netcanoem.GAUGES, netcanoem.GAUGES_REST):
                     store = partial(self._inbox.__setitem__, opcode)
@@ -271,8 +264,8 @@ class AtiCanSensor:
     def _poll(self, timeout_s: float) -> Answer | None:
         """Poll outside the cycle."""
         polls = self.polls
+        polls.drain()
         polls.forget()
-        polls.settle()
         polls.send()
         return polls.wait(polls.sent_ns + int(timeout_s * 1e9))
 

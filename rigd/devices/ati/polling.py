@@ -1,25 +1,39 @@
 """Polls of a NETCANOEM box, and the two frames of each reply brought together.
 
-The protocol has no counter: nothing in a reply says to which poll it belongs. Hence only one poll
-is on its way at a time. One that is given up leaves its reply a period to come and be dropped; a
-reply that is later than that cannot be told from the reply to a newer poll.
+The protocol has no counter: nothing in a reply says to which poll it belongs. So both frames are
+counted (:mod:`rigd.devices.canbus.pairing`), each for itself, for either may be lost or late; where
+it is in doubt whose they are, a tick is left without a poll.
 """
 
 import time
 
 from rigd.devices.ati.netcanoem import GAUGES, GAUGES_REST, REPLY_LENGTHS
 from rigd.devices.canbus import CanExchange
+from rigd.devices.canbus.pairing import ReplyPairing
 from rigd.devices.contracts import DeviceError
 
 Answer = tuple[bytes, bytes]
 """The data of both frames of a reading."""
 
-_FIRST_LENGTH = REPLY_LENGTHS[GAUGES]
-_SECOND_LENGTH = REPLY_LENGTHS[GAUGES_REST]
+
+class _Frames:
+    """One of the two frames of the replies: the last that came, and how many did."""
+
+    __slots__ = ("_length", "data", "replies")
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+        self.data = b""
+        self.replies = 0
+
+    def take(self, data: bytes) -> None:
+        """Take a frame; one of the wrong length is empty."""
+        self.replies += 1
+        self.data = data if len(data) == self._length else b""
 
 
 class GaugePolls:
-    """The poll on its way, and what came of it.
+    """The polls, and what came of them.
 
     Parameters
     ----------
@@ -31,37 +45,35 @@ class GaugePolls:
     Attributes
     ----------
     answer : tuple of bytes, or None
-        To the last poll.
-    expected : bool
-        The last poll has no answer yet and has not been given up.
+        To the last poll, as of the last `settle`.
     sent_ns, turnaround_ns : int
         When the last poll was sent (``time.monotonic_ns``); from a poll to its answer.
-    surplus_frames : int
-        Frames that belonged to no poll, lacked their other half or had the wrong length.
     """
 
     __slots__ = (
         "_exchange",
         "_first",
+        "_firsts",
         "_frame",
         "_name",
+        "_second",
+        "_seconds",
         "answer",
-        "expected",
         "sent_ns",
-        "surplus_frames",
         "turnaround_ns",
     )
 
     def __init__(self, frame: bytes, name: str) -> None:
         self._frame = frame
         self._name = name
-        self.surplus_frames = 0
         self.turnaround_ns = 0
         self.sent_ns = 0
         self._exchange: CanExchange | None = None
-        self._first: bytes | None = None
+        self._first = _Frames(REPLY_LENGTHS[GAUGES])
+        self._second = _Frames(REPLY_LENGTHS[GAUGES_REST])
+        self._firsts = ReplyPairing(self._first)
+        self._seconds = ReplyPairing(self._second)
         self.answer: Answer | None = None
-        self.expected = False
 
     def open(self, exchange: CanExchange) -> None:
         """Use this exchange from now on."""
@@ -86,48 +98,59 @@ class GaugePolls:
             raise DeviceError(f"{self._name}: it is not connected.")
         return self._exchange
 
-    def settle(self) -> bool:
-        """Take or drop all that has come; say whether no poll is without an answer."""
+    @property
+    def lost(self) -> int:
+        """Replies that have been lost, as far as it is known."""
+        return max(self._firsts.lost, self._seconds.lost)
+
+    def subscribe(self, first_id: int, second_id: int) -> None:
+        """Have the frames of these identifiers delivered here."""
+        self.exchange.subscribe(first_id, self._first.take)
+        self.exchange.subscribe(second_id, self._second.take)
+
+    def drain(self) -> None:
+        """Take all that has come."""
         self.exchange.drain()
-        return not self.expected
 
     def send(self) -> None:
         """Poll the sensor."""
-        self._first = None
+        self._firsts.ask()
+        self._seconds.ask()
         self.answer = None
-        self.expected = True
         self.sent_ns = time.monotonic_ns()
         self.exchange.send(self._frame)
 
+    def send_or_pause(self) -> None:
+        """Poll as every tick does, but for one that is left out to see which reply is whose."""
+        firsts, seconds = self._firsts, self._seconds
+        if (firsts.owed or seconds.owed) and firsts.wants_pause() | seconds.wants_pause():
+            firsts.pause()
+            seconds.pause()
+            self.answer = None
+            self.sent_ns = time.monotonic_ns()
+        else:
+            self.send()
+
     def wait(self, deadline_ns: int) -> Answer | None:
         """Return the answer to the last poll as soon as it has come, or None at the deadline."""
-        if self.expected:
-            self.exchange.wait_until(self._has_answer, deadline_ns)
+        if self.answer is None:
+            self.exchange.wait_until(self._have_caught_up, deadline_ns)
+        return self.settle()
+
+    def settle(self) -> Answer | None:
+        """Return the answer to the last poll if it has been delivered, else None."""
+        if self._firsts.settle() & self._seconds.settle():
+            first, second = self._first.data, self._second.data
+            if first and second:
+                self.answer = (first, second)
+                self.turnaround_ns = time.monotonic_ns() - self.sent_ns
         return self.answer
 
     def forget(self) -> None:
-        """Give the last poll up; what still comes is dropped."""
-        self._first = None
+        """Begin anew: nothing is on its way any more."""
+        self._firsts.start()
+        self._seconds.start()
         self.answer = None
-        self.expected = False
 
-    def take_first(self, data: bytes) -> None:
-        """Take the first frame of a reply; it replaces one whose second frame was lost."""
-        if self.expected and len(data) == _FIRST_LENGTH:
-            self._first = data
-        else:
-            self.surplus_frames += 1
-
-    def take_second(self, data: bytes) -> None:
-        """Take the second frame of a reply."""
-        first = self._first
-        if first is None or len(data) != _SECOND_LENGTH:
-            self.surplus_frames += 1
-            return
-        self.answer = (first, data)
-        self._first = None
-        self.expected = False
-        self.turnaround_ns = time.monotonic_ns() - self.sent_ns
-
-    def _has_answer(self) -> bool:
-        return self.answer is not None
+    def _have_caught_up(self) -> bool:
+        return self._firsts.has_caught_up() and self._seconds.has_caught_up()

@@ -98,6 +98,8 @@ class AtiSerialSensor:
         self._due = 0
         self._tick_ns: int | None = None
         self._steady_ticks = 0
+        self._damages = 0
+        self._missing_records = 0
         self._asked_ns = 0
         self._looked_ns = 0
         self._wrench: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -199,8 +201,9 @@ class AtiSerialSensor:
         """Whether the newest record is a tick or more behind, with `new` bytes of records now.
 
         Records that are late catch up. Lost ones do not: where each of some ticks brings its own
-        and the gap stays, they count as lost. Less than a tick is the drift between two clocks, or
-        the sensor's phase.
+        and the gap stays, they count as lost. But nothing counts records: unless what was lost
+        has left a torn one behind, they may all be late by as much from then on, and that is said.
+        Less than a tick is the drift between two clocks, or the sensor's phase.
         """
         complete = self._arrived - self.stream.pending
         if self._due - complete >= self._bytes_per_tick:
@@ -208,6 +211,9 @@ class AtiSerialSensor:
             self._steady_ticks = self._steady_ticks + 1 if in_step else 0
             if self._steady_ticks < _STEADY_TICKS:
                 return True
+            if self.stream.checksum_errors == self._damages:
+                self._missing_records += (self._due - complete) // RECORD_SIZE
+        self._damages = self.stream.checksum_errors
         self._steady_ticks = 0
         self._due = complete
         return False
@@ -219,6 +225,19 @@ class AtiSerialSensor:
             bit_rate_bit_s=self._settings.baud,
             errors=self.stream.checksum_errors,
             status=self._status_word,
+            doubt=self._doubt(),
+        )
+
+    def _doubt(self) -> str:
+        missing = self._missing_records
+        if not missing:
+            return ""
+        late_ms = 1e3 * missing / self._settings.stream_hz
+        return (
+            f"{self._name}: {missing} records did not come, or all come later by {late_ms:.2g} ms "
+            "since, and nothing on the line tells which: the wrench may be older than the file "
+            "states. Look at cable and adapter; connecting anew (rigd reset, or another rigd run) "
+            "ends it."
         )
 
     def measure(self, duration_s: float) -> dict[str, float]:
@@ -371,3 +390,5 @@ class AtiSerialSensor:
         self._due = self._arrived - self.stream.pending
         self._tick_ns = None
         self._steady_ticks = 0
+        self._damages = self.stream.checksum_errors
+        self._missing_records = 0

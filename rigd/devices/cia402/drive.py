@@ -1,8 +1,8 @@
 """The drive on its bus: set-up, the exchange of every tick, its guards, enabling and disabling.
 
-A TPDO does not say which SYNC it answers: :mod:`rigd.devices.cia402.pairing` counts both. Replies
-that are all late by the same whole number of periods it cannot tell; that is why
-:meth:`Cia402Drive.connect` measures the delay of a reply to the first SYNC, which is alone.
+A TPDO does not say which SYNC it answers: :mod:`rigd.devices.canbus.pairing` counts both, and
+where that is in doubt a SYNC is left out. A drive that takes more than a period for its answer is
+refused by :meth:`Cia402Drive.connect` already.
 """
 
 from math import isnan
@@ -164,7 +164,7 @@ class Cia402Drive:
         node.resume()
 
     def latch(self, due_ns: int) -> None:
-        """Send SYNC, on which the drive latches its angle.
+        """Send SYNC, on which the drive latches its angle, unless one has to be left out.
 
         Parameters
         ----------
@@ -179,7 +179,7 @@ class Cia402Drive:
         node = self._connected()
         if not self._same_tick:
             self._settle_previous(node)
-        node.send_sync()
+        node.send_sync_or_pause()
         self._awaiting = True
         node.now_ns = node.now_ns + node.period_ns if node.lock_step else due_ns
 
@@ -249,7 +249,17 @@ class Cia402Drive:
         if self._node is None:
             return LineHealth()
         exchange = self._node.exchange
-        return LineHealth(exchange.bits, self._bit_rate_bit_s, exchange.error_frames)
+        pairing = self._node.pairing
+        unproven = pairing.unproven
+        doubt = (
+            f"{self._name}: {unproven} of its TPDOs did not come, or all come later by as many "
+            "periods since, which cannot be told in lock-step: angles may be older than the file "
+            "states."
+            if unproven
+            else ""
+        )
+        errors = exchange.error_frames + pairing.lost
+        return LineHealth(exchange.bits, self._bit_rate_bit_s, errors, doubt=doubt)
 
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises.
@@ -340,7 +350,7 @@ class Cia402Drive:
 
     def _settle(self, node: Node) -> None:
         """Take the position if it is the reply to the last SYNC."""
-        fresh = node.pairing.settle()
+        fresh = node.pairing.settle() and self._inbox.legible
         self.angle_stale = not fresh
         if self._enabled and fresh:
             self._following.compare(self._inbox.torque)

@@ -5,9 +5,9 @@ from contextlib import suppress
 from math import ceil
 
 from rigd.devices.canbus import CanExchange
+from rigd.devices.canbus.pairing import ReplyPairing
 from rigd.devices.cia402.frames import OPERATIONAL, NodeFrames, is_written, read_statusword
 from rigd.devices.cia402.inbox import Inbox
-from rigd.devices.cia402.pairing import ReplyPairing
 from rigd.devices.cia402.states import OFF, DriveState, state_of
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
@@ -57,12 +57,12 @@ class Node:
         self.exchange = exchange
         self.frames = frames
         self.inbox = inbox
-        self.pairing = ReplyPairing(inbox)
         self.settings = rig.cia402
         self.rate_hz = rig.rate_hz
         self.period_ns = round(1e9 / rig.rate_hz)
         self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
         self.lock_step = self.deadline_ns > self.period_ns
+        self.pairing = ReplyPairing(inbox, pauses=not self.lock_step)
         self.sync_ns = 0
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
@@ -135,6 +135,15 @@ class Node:
         self.pairing.ask()
         self.sync_ns = time.monotonic_ns()
         self.exchange.send(self.frames.sync)
+
+    def send_sync_or_pause(self) -> None:
+        """Send SYNC, or leave it out for a tick to see which reply is whose."""
+        if self.pairing.owed:
+            self.exchange.drain()
+            if self.pairing.wants_pause():
+                self.pairing.pause()
+                return
+        self.send_sync()
 
     def send_heartbeat(self) -> None:
         """Send this computer's heartbeat if it is due."""

@@ -183,8 +183,8 @@ def fuzz_can(n, seed, mode="same_tick"):
             assert wrench == (float(wanted % 30000),) * 6, (wrench, wanted)
         before_last = fake.polls
     assert fresh > 0.2 * n
-    return {"ticks": n, "fresh": fresh, "stale": stale, "missing": sensor.missing_replies,
-            "late": sensor.late_replies, "surplus": sensor.polls.surplus_frames}  # fmt: skip
+    return {"ticks": n, "fresh": fresh, "stale": stale, "lost": sensor.polls.lost,
+            "late": sensor.late_replies}  # fmt: skip
 
 
 def fuzz_can_setup(n, seed):

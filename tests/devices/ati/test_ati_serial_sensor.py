@@ -221,9 +221,12 @@ PERIOD_NS = 1_000_000
 
 @pytest.fixture
 def follow(open_sensor, digital_ft, fakes, settled):
-    """Run ticks on which so many records arrive; returns what each shows: number, or stale."""
+    """Run ticks on which so many records arrive; returns what each shows: number, or stale.
 
-    def run(counts, lost=(), due_ns=lambda tick: tick * PERIOD_NS):
+    A record that is `torn` loses a byte.
+    """
+
+    def run(counts, lost=(), due_ns=lambda tick: tick * PERIOD_NS, torn=()):
         sensor = open_sensor(deadline_us=3000.0)
         sensor.connect()
         settled(sensor)
@@ -234,9 +237,12 @@ def follow(open_sensor, digital_ft, fakes, settled):
                 number += 7
             emitted(fakes, digital_ft, [(number + k, 0, 0, 0, 0, 0) for k in range(count)])
             number += count
+            if index in torn:
+                digital_ft.emit(fakes.record_of((1, 2, 3, 4, 5, 6))[1:])
             wrench = sensor.read_wrench()
             newest = wrench[0] / wrench_of(fakes, (1, 0, 0, 0, 0, 0))[0] + 3
             shown.append("stale" if sensor.wrench_stale else round(newest))
+        run.doubt = sensor.health().doubt
         return shown
 
     return run
@@ -245,6 +251,20 @@ def follow(open_sensor, digital_ft, fakes, settled):
 def test_records_that_are_late_are_not_taken_for_those_of_the_tick(follow):
     # The adapter held a tick's records back once; then each tick finds the ones before its own.
     assert follow([7, 0, 7, 7, 14, 7]) == [6, "stale", "stale", "stale", 34, 41]
+    assert follow.doubt == ""
+
+
+def test_records_that_stay_late_cannot_be_told_from_lost_ones_and_that_is_said(follow):
+    shown = follow([7, 0, 0, 0, 7, 7, 7, 7])
+    assert shown[1:6] == ["stale"] * 5
+    assert "21 records did not come, or all come later by 3 ms since" in follow.doubt
+
+
+def test_what_was_lost_with_a_torn_record_is_no_doubt(follow):
+    shown = follow([7, 7, 0, 7, 7, 7, 7, 7], lost={2}, torn={1})
+    assert "stale" in shown
+    assert shown[-1] != "stale"
+    assert follow.doubt == ""
 
 
 def test_lost_records_are_given_up_after_some_ticks(follow):

@@ -145,7 +145,36 @@ def test_a_late_reply_is_never_taken_for_the_next_ticks(make_drive, rig, scripte
         scripted.position = 1000 + step
         angle = ticks()[0]
         got.append((drive.angle_stale, round(angle / STEP_RAD)))
-    assert got == [(True, 0), (False, 2), (False, 3), (False, 4)]
+    assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
+
+
+def test_after_a_lost_reply_one_sync_is_left_out_to_see_which_is_whose(make_drive, rig, scripted):
+    slow = replace(rig, rate_hz=10.0, acquisition=Acquisition("same_tick", 5e4))
+    drive = make_drive(slow)
+    drive.connect()
+    ticks = Ticks(drive)
+    ticks(3)
+    scripted.drop, syncs = 1, scripted.syncs
+    stale = []
+    for _ in range(5):
+        ticks()
+        stale.append(drive.angle_stale)
+    assert stale == [True, True, True, False, False]
+    assert scripted.syncs == syncs + 4
+    assert drive.health().errors == 1
+    assert drive.health().doubt == ""
+
+
+def test_in_lock_step_a_lost_reply_leaves_a_doubt(make_drive, rig, scripted):
+    drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e4)))
+    drive.connect()
+    ticks = Ticks(drive)
+    ticks(3)
+    assert drive.health().doubt == ""
+    scripted.drop = 1
+    ticks(6)
+    assert not drive.angle_stale
+    assert "1 of its TPDOs did not come, or all come later" in drive.health().doubt
 
 
 def test_a_reply_that_comes_between_the_ticks_does_not_count(make_drive, rig, scripted):

@@ -1,0 +1,142 @@
+"""Which request a reply answers: a reading counts as fresh only if it is that of the last one."""
+
+from collections import deque
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigd.devices.canbus.pairing import ReplyPairing
+
+
+class Box:
+    """What has come: how many replies, and the number of the request that the last one answers."""
+
+    def __init__(self):
+        self.replies = 0
+        self.number = 0
+
+
+class Line:
+    """A device that answers with the number of the request, and a line that loses or holds."""
+
+    def __init__(self, *, pauses=True):
+        self.inbox = Box()
+        self.pairing = ReplyPairing(self.inbox, pauses=pauses)
+        self.waiting = deque()
+        self.period = 0
+        self.number = 0
+        self.paused = 0
+
+    def deliver(self, until=None):
+        """Let replies through that are due, all of them if no period is given."""
+        while self.waiting and (until is None or self.waiting[0][0] <= until):
+            self.inbox.number = self.waiting.popleft()[1]
+            self.inbox.replies += 1
+
+    def tick(self, event="whole", *, late=0, before=False):
+        """One period; returns whether the reading counts as fresh.
+
+        The reply is "lost", "held" until a later tick is "whole", or `late` by whole periods.
+        """
+        if before:
+            self.deliver()  # between the last reading and this request
+        self.period += 1
+        if self.pairing.wants_pause():
+            self.pairing.pause()
+            self.paused += 1
+        else:
+            self.pairing.ask()
+            self.number += 1
+            if event != "lost":
+                self.waiting.append((self.period + late, self.number))
+        if event != "held":
+            self.deliver(self.period)
+        return self.pairing.settle()
+
+    def right(self):
+        return self.inbox.number == self.number
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["whole"] * 3 + ["held", "lost"]), st.booleans()), max_size=60
+    )
+)
+def test_no_old_reading_counts_as_fresh_while_late_replies_catch_up(events):
+    line = Line()
+    for event, before in events:
+        if line.tick(event, before=before):
+            assert line.right()
+
+
+@settings(max_examples=300)
+@given(
+    late=st.integers(1, 8),
+    before=st.lists(st.sampled_from(["whole"] * 5 + ["lost"]), max_size=20),
+)
+def test_replies_that_are_late_for_good_never_count(late, before):
+    """From some tick on, whatever was lost before: not when the delay sets in, nor ever after."""
+    line = Line()
+    for event in before:
+        if line.tick(event):
+            assert line.right()
+    for _ in range(100):
+        assert not line.tick(late=late)
+
+
+@given(late=st.integers(1, 8), ticks=st.integers(1, 30))
+def test_replies_that_were_late_for_a_while_count_again(late, ticks):
+    line = Line()
+    line.tick()
+    for _ in range(ticks):
+        assert not line.tick(late=late)
+    fresh = [line.tick() for _ in range(late + 6)]
+    assert fresh[-1]
+    assert line.right()
+    assert line.pairing.lost == 0
+
+
+@pytest.mark.parametrize("losses", [1, 2, 3, 7])
+def test_after_a_loss_one_tick_without_a_request_tells(losses):
+    line = Line()
+    line.tick()
+    assert not any(line.tick("lost") for _ in range(losses))
+    assert [line.tick() for _ in range(4)] == [False, False, True, True]
+    assert (line.paused, line.pairing.lost, line.pairing.unproven) == (1, losses, 0)
+    assert line.right()
+
+
+def test_without_trouble_every_reading_is_fresh_and_no_request_left_out():
+    line = Line()
+    assert all(line.tick() for _ in range(100))
+    assert line.paused == 0
+
+
+def test_replies_that_are_read_too_late_are_not_taken_for_those_of_the_next_tick():
+    # The host was slow once: from then on each reply would be found a tick later.
+    line = Line()
+    line.tick()
+    assert not line.tick("held")
+    for _ in range(20):
+        assert not line.tick("held", before=True)
+    assert line.tick(before=True)
+    assert line.right()
+
+
+def test_several_periods_of_replies_at_once():
+    line = Line()
+    line.tick()
+    assert [line.tick("held") for _ in range(3)] == [False] * 3
+    assert not line.tick(), "which of them came last is not sure"
+    assert line.tick()
+    assert line.right()
+
+
+def test_where_time_passes_with_the_requests_a_loss_stays_unproven():
+    line = Line(pauses=False)
+    line.tick()
+    fresh = [line.tick(event) for event in ("lost", "lost", *["whole"] * 5)]
+    assert fresh == [False] * 2 + [False] * 3 + [True] * 2
+    assert (line.paused, line.pairing.lost, line.pairing.unproven) == (0, 2, 2)
