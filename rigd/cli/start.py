@@ -142,6 +142,8 @@ def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
 
 def _result_text(session: dict[str, Any]) -> str:
     reason = f" {session['reason']}" if session["reason"] else ""
+    if session["part"] is not None:
+        return f"{session['outcome']}: no whole record, but {session['part']}.{reason}"
     if session["path"] is None:
         return f"{session['outcome']}: no record.{reason}"
     return (

@@ -543,10 +543,12 @@ class Service:
             order = Order(self._profile, excitation, path, tuple(notes.items()))
             if self._live:
                 tell("info", self._rig.show(order, series.stop))
-            result = self._rig.run(order, series.stop, watcher, self._listens)
-            series.results.append(result)
-            _log_result(series, result)
-            publish({"event": "session", "number": number, **result.as_dict()})
+            try:
+                result = self._rig.run(order, series.stop, watcher, self._listens)
+            except SessionFailedError as error:
+                _note_end(series, error.result(), publish)
+                raise
+            _note_end(series, result, publish)
             if not result.went_well:
                 return
 
@@ -590,24 +592,29 @@ class Service:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
 
 
-def _log_result(series: Series, result: SessionResult) -> None:
+def _note_end(series: Series, result: SessionResult, publish: Publish) -> None:
+    """Keep, log and tell how a session ended."""
+    series.results.append(result)
+    counts = {
+        "ticks scheduled": result.scheduled,
+        "recorded": result.recorded,
+        "missed": result.missed,
+        "late": result.late,
+        "lost": result.lost,
+        "not shown live": result.live_dropped,
+    }
     _log.log(
         logging.INFO if result.went_well else logging.WARNING,
-        "series %d: session %d of %d: %s, %s: %d ticks scheduled, %d recorded, %d missed, %d late, "
-        "%d lost, %d not shown live%s",
+        "series %d: session %d of %d: %s, %s: %s%s",
         series.number,
         series.session,
         series.request.repeat,
-        result.path or "no file",
+        result.path or result.part or "no file",
         result.outcome,
-        result.scheduled,
-        result.recorded,
-        result.missed,
-        result.late,
-        result.lost,
-        result.live_dropped,
+        ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
         f": {result.reason}" if result.reason else "",
     )
+    publish({"event": "session", "number": series.session, **result.as_dict()})
 
 
 def _after(series: Series, fault: str) -> tuple[State, str]:

@@ -246,6 +246,12 @@ def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
     assert operated.state is State.FAULT
     for words in ("killed by signal 9", "drive is disabled", "rigd recover"):
         assert words in operated.last["reason"]
+    (session,) = operated.last["sessions"]
+    assert (session["outcome"], session["path"], session["recorded"]) == ("fault", None, None)
+    assert session["part"].endswith(".mcap.part")
+    assert session["scheduled"] > 0
+    (told,) = (event for event in operated.events if event["event"] == "session")
+    assert told.items() >= session.items()
 
 
 def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
