@@ -240,10 +240,11 @@ def environment() -> dict[str, str]:
 
 def test_the_commands_of_the_page_show_plots_in_rerun(session, look):
     (block,) = (block for block in blocks("sh") if "mcap convert" in block)
-    convert, show = block.splitlines()
+    *prepare, show = block.splitlines()
     done = subprocess.run(
-        ["bash", "-ec", convert], cwd=session, env=environment(), capture_output=True, check=False
-    )
+        ["bash", "-ec", "\n".join(prepare)],
+        cwd=session, env=environment(), capture_output=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     words = show.split()
     assert words[:3] == ["rerun", "--bind", "127.0.0.1"]
