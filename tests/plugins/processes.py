@@ -14,12 +14,21 @@ LISTENING = "0A"
 """State of a socket, as /proc/net/tcp writes it."""
 
 
-def eventually(condition: Callable[[], Met], within_s: float = 60.0, every_s: float = 0.02) -> Met:
-    """Whether a condition comes true: its last answer. The limit only ends a test that fails."""
+def eventually(
+    condition: Callable[[], Met], within_s: float = 60.0, every_s: float = 0.02
+) -> Met | None:
+    """Whether a condition comes true: its last answer. The limit only ends a test that fails.
+
+    Whoever is asked for it may be too busy to answer: that is no answer yet.
+    """
     deadline = time.monotonic() + within_s
-    while not (met := condition()) and time.monotonic() < deadline:
+    while True:
+        met = None
+        with contextlib.suppress(TimeoutError):
+            met = condition()
+        if met or time.monotonic() > deadline:
+            return met
         time.sleep(every_s)
-    return met
 
 
 def children(pid: int) -> list[int]:
