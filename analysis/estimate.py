@@ -165,17 +165,15 @@ def estimate_warnings(
 ) -> tuple[str, ...]:
     """Sentences on what makes an estimate doubtful."""
     found = []
-    if settings.estimator != "fft" and response.segments < PAPER_SEGMENTS:
-        length = settings.segmentation(record.rate_hz).segment_length
+    is_welch = settings.estimator != "fft"
+    length = (
+        settings.segmentation(record.rate_hz).segment_length if is_welch else len(record.time_s)
+    )
+    if is_welch and response.segments < PAPER_SEGMENTS:
         found.append(
             f"Only {response.segments} Welch segment(s) of {length} samples fit "
             f"the sweep of {record.sweep_samples}{_remedy(record.sweep_samples)}"
         )
-    length = (
-        len(record.time_s)
-        if settings.estimator == "fft"
-        else settings.segmentation(record.rate_hz).segment_length
-    )
     resolution_hz = record.rate_hz / length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
     if resolution_hz > first_mode_hz:

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -180,8 +181,6 @@ class Done:
 @pytest.fixture
 def rigd_here(tmp_path, monkeypatch):
     """Run `rigd` in this process, as far as it comes without any other."""
-    from typer.testing import CliRunner
-
     from rigd.cli.app import app
     from rigd.engine.signals import StopRequest
 
@@ -192,12 +191,24 @@ def rigd_here(tmp_path, monkeypatch):
         monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
     monkeypatch.setattr("rigd.engine.signals.ignore", lambda **_: None)  # of the test runner
 
-    def run(*arguments):
-        done = CliRunner().invoke(app, list(map(str, arguments)))
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return Done(done.exit_code, done.stdout, done.stderr)
+    return partial(run_here, app)
 
-    return run
+
+@pytest.fixture
+def analyze_here(tmp_path, monkeypatch):
+    """Run `analyze` in this process, which has imported what takes long."""
+    from analysis.cli import app
+
+    monkeypatch.chdir(tmp_path)
+    return partial(run_here, app)
+
+
+def run_here(app, *arguments) -> Done:
+    from typer.testing import CliRunner
+
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return Done(done.exit_code, done.stdout, done.stderr)
 
 
 @pytest.fixture

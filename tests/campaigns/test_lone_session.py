@@ -5,15 +5,12 @@ import math
 import shutil
 import sys
 from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from analysis.campaigns.pooled import pooled_bic
 from analysis.campaigns.ranking import ranked_structures
-from analysis.cli import app
 
 QUICK = (
     "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50"
@@ -28,20 +25,13 @@ class Here:
 
 
 @pytest.fixture
-def run_here(monkeypatch, tmp_path):
+def run_here(monkeypatch, analyze_here):
     @contextmanager
     def here(_count):
         yield Here()
 
     monkeypatch.setattr(sys.modules["analysis.campaigns.campaign"], "process_pool", here)
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        done = CliRunner().invoke(app, [*arguments, *QUICK])
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return SimpleNamespace(code=done.exit_code, stdout=done.stdout, stderr=done.stderr)
-
-    return run
+    return lambda *arguments: analyze_here(*arguments, *QUICK)
 
 
 def errors(result):
@@ -53,7 +43,7 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
 ):
     shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
     result = run_here("ok.mcap", "nosuch.mcap", "--json", "all.json")
-    assert result.code == 1
+    assert result.returncode == 1
     (error,) = errors(result)
     assert "nosuch.mcap cannot be read: No such file" in error
     assert "ok.mcap is reported by itself" in result.stderr
@@ -71,7 +61,7 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
 def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
     shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
     result = run_here("ok.mcap", "./ok.mcap", "--method", "welch", "--report", "r")
-    assert result.code == 1
+    assert result.returncode == 1
     assert errors(result) == ["Error: ok.mcap: the file is given more than once, and counts once."]
     assert (tmp_path / "r" / "frf.png").exists()
 

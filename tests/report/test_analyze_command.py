@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,21 +24,6 @@ def run(*arguments, cwd):
         [sys.executable, "-m", "analysis", *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-
-
-@pytest.fixture
-def run_here(tmp_path, monkeypatch):
-    """Run in this process, which has imported what takes long; streams and code are the same."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        done = CliRunner().invoke(app, list(map(str, arguments)))
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return SimpleNamespace(
-            returncode=done.exit_code, stdout=done.stdout, stderr=done.stderr
-        )  # fmt: skip
-
-    return run
 
 
 def refused(result, code, *words):
@@ -106,12 +90,12 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     assert (tmp_path / "out" / "signals.png").exists()
 
 
-def test_several_files_with_one_that_fails(session, tmp_path, run_here):
+def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
     shutil.copy(session, tmp_path / "other.mcap")
     before = tmp_path / "session.report"
     before.mkdir()
     (before / "frf.png").write_text("mine")
-    result = run_here(
+    result = analyze_here(
         "session.mcap", "missing.mcap", "other.mcap", "--each", "--json", "all.json", *QUICK
     )
     assert result.returncode == 1
@@ -155,33 +139,33 @@ def broken_file(kind, path, good):
 @pytest.mark.parametrize(
     "kind", ["missing", "empty", "no container", "truncated", "magic only", "foreign", "a folder"]
 )
-def test_a_file_that_is_no_session_is_refused(paper_file, tmp_path, run_here, kind):
+def test_a_file_that_is_no_session_is_refused(paper_file, tmp_path, analyze_here, kind):
     path = tmp_path / "bad.mcap"
     broken_file(kind, path, paper_file)
     before = sorted(tmp_path.iterdir())
-    refused(run_here("bad.mcap", "--json", "fits.json"), 1, "bad.mcap")
+    refused(analyze_here("bad.mcap", "--json", "fits.json"), 1, "bad.mcap")
     assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("folder", [".", "/", ""])
-def test_a_folder_in_place_of_a_file_is_refused(tmp_path, run_here, folder):
-    refused(run_here(folder), 1, folder)
+def test_a_folder_in_place_of_a_file_is_refused(tmp_path, analyze_here, folder):
+    refused(analyze_here(folder), 1, folder)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_session_too_short_for_the_segments_says_what_fits(
-    write_session, short_signals, tmp_path, run_here
+    write_session, short_signals, tmp_path, analyze_here
 ):
     write_session(tmp_path / "a.mcap", short_signals)
-    refused(run_here("a.mcap"), 1, "4000 samples", "17266", "--segment 575 --overlap 86")
+    refused(analyze_here("a.mcap"), 1, "4000 samples", "17266", "--segment 575 --overlap 86")
 
 
 @pytest.mark.parametrize("field", ["angle_rad", "torque_nm"])
-def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, run_here, field):
+def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, analyze_here, field):
     values = getattr(short_signals, field).copy()
     values[77] = np.nan
     write_session(tmp_path / "a.mcap", replace(short_signals, **{field: values}))
-    refused(run_here("a.mcap"), 1, "a.mcap", field, "tick 77")
+    refused(analyze_here("a.mcap"), 1, "a.mcap", field, "tick 77")
 
 
 @pytest.mark.parametrize(
@@ -221,9 +205,9 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, ru
         (("--method", "welch", "--fix", "delay_s"), ("--fix", "--method all")),
     ],
 )
-def test_wrong_options_are_refused(session, tmp_path, run_here, options, words):
+def test_wrong_options_are_refused(session, tmp_path, analyze_here, options, words):
     before = sorted(tmp_path.iterdir())
-    refused(run_here(session, *options), 2, *words)
+    refused(analyze_here(session, *options), 2, *words)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -231,20 +215,20 @@ def test_no_file_is_wrong_use(tmp_path):
     refused(run(cwd=tmp_path), 2, "FILE")
 
 
-def test_nothing_that_exists_is_overwritten(session, tmp_path, run_here):
+def test_nothing_that_exists_is_overwritten(session, tmp_path, analyze_here):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "frf.png").write_text("mine")
     (tmp_path / "fits.json").write_text("mine")
-    refused(run_here(session.name, "--report", "out"), 2, "--report out")
-    refused(run_here(session.name, "--json", "fits.json"), 2, "--json fits.json")
+    refused(analyze_here(session.name, "--report", "out"), 2, "--report out")
+    refused(analyze_here(session.name, "--json", "fits.json"), 2, "--json fits.json")
     assert (tmp_path / "out" / "frf.png").read_text() == "mine"
     assert (tmp_path / "fits.json").read_text() == "mine"
     assert not (tmp_path / "session.report").exists()
 
 
-def test_a_report_that_cannot_be_written_is_refused(session, tmp_path, run_here):
+def test_a_report_that_cannot_be_written_is_refused(session, tmp_path, analyze_here):
     (tmp_path / "file").write_text("")
-    refused(run_here(session.name, *QUICK, "--report", "file/out"), 1, "file/out")
+    refused(analyze_here(session.name, *QUICK, "--report", "file/out"), 1, "file/out")
 
 
 def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):

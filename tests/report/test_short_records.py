@@ -2,12 +2,9 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
-from typer.testing import CliRunner
 
-from analysis.cli import app
 from analysis.estimate import estimate_warnings
 from analysis.record import RecordError, load_record
 from analysis.report import style
@@ -36,22 +33,10 @@ def cut(write_session, make_signals, tmp_path_factory):
     return make
 
 
-@pytest.fixture
-def run_here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        done = CliRunner().invoke(app, list(map(str, arguments)))
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return SimpleNamespace(code=done.exit_code, stdout=done.stdout, stderr=done.stderr)
-
-    return run
-
-
-def test_what_there_is_is_reported(cut, run_here, tmp_path):
+def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
     """A record with fewer bins than tests have neighbours, figures stretches; none at a mode."""
-    result = run_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
-    assert (result.code, result.stderr) == (0, "")
+    result = analyze_here(cut(1700), *ONE_FIT, "--report", "r", "--json", "r.json")
+    assert (result.returncode, result.stderr) == (0, "")
     content = json.loads((tmp_path / "r.json").read_text())
     assert {fit["estimator"] for fit in content["fits"]} == {"welch", "record"}
     assert "cut short" in " ".join(content["files"][0]["warnings"])
@@ -59,12 +44,12 @@ def test_what_there_is_is_reported(cut, run_here, tmp_path):
     assert figures == {"record_frf.png", "loss_factor.png", "residual.png", "record_signals.png"}
 
 
-def test_too_short_for_the_whole_record_is_told(cut, run_here):
-    result = run_here(cut(1200), *ONE_FIT, "--report", "r")
-    assert result.code == 0
+def test_too_short_for_the_whole_record_is_told(cut, analyze_here):
+    result = analyze_here(cut(1200), *ONE_FIT, "--report", "r")
+    assert result.returncode == 0
     assert "1.2 s of record are too short for the band" in result.stderr
-    alone = run_here(cut(1200), "--method", "record", "--report", "alone")
-    assert alone.code == 1
+    alone = analyze_here(cut(1200), "--method", "record", "--report", "alone")
+    assert alone.returncode == 1
     assert alone.stderr.startswith("Error: ")
     assert "1.2 s of record are too short for the band" in alone.stderr
 
