@@ -64,15 +64,21 @@ class Node:
         self.period_ns = round(1e9 / rig.rate_hz)
         self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
         self.lock_step = self.deadline_ns > self.period_ns
-        self.pairing = ReplyPairing(inbox, pauses=not self.lock_step)
+        pauses = self.settings.sync_gaps and not self.lock_step
+        self.pairing = ReplyPairing(inbox, pauses=pauses)
         self.sync_ns = 0
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
         self._heartbeat_ns = round(self.settings.heartbeat_period_s * 1e9)
         self._next_heartbeat_ns = _LONG_AGO_NS
 
-    def go_operational(self) -> None:
+    def go_operational(self, *, beats: bool = True) -> None:
         """Start the node and wait for the heartbeat that says so.
+
+        Parameters
+        ----------
+        beats
+            The drive has a heartbeat; without one its first TPDO has to say it.
 
         Raises
         ------
@@ -82,6 +88,9 @@ class Node:
         inbox = self.inbox
         inbox.nmt_state = None
         self.exchange.send(self.frames.start)
+        if not beats:
+            inbox.watching = True
+            return
         period_s = self.settings.drive_heartbeat_period_s
         if self.lock_step:
             # Its time does not pass without SYNC, not even up to its next heartbeat.
