@@ -19,6 +19,8 @@ _NO_ACKNOWLEDGE = 0x20
 
 _FAILURES_SKIPPED = 10
 """Failures to receive that one drain bears in `regardless`: an adapter may have several queued."""
+_FAILURES_WAITED = 100
+"""Likewise of one wait."""
 _FAILURE_PAUSE_S = 0.001
 
 
@@ -106,7 +108,7 @@ class CanExchange:
         for _ in range(_FAILURES_SKIPPED):
             try:
                 self._deliver()
-            except DeviceError:
+            except Exception:  # an adapter's library may raise anything
                 continue
             return
 
@@ -129,6 +131,7 @@ class CanExchange:
         bool
             Whether it is ready.
         """
+        failures = 0
         self.drain()
         while not ready():
             left_ns = deadline_ns - time.monotonic_ns()
@@ -136,9 +139,12 @@ class CanExchange:
                 return False
             try:
                 self.port.wait(left_ns * 1e-9)
-            except DeviceError:
+            except Exception:
+                failures += 1
                 if not self._regardless:
                     raise
+                if failures > _FAILURES_WAITED:
+                    return False  # the adapter is gone
                 time.sleep(min(_FAILURE_PAUSE_S, left_ns * 1e-9))
             self.drain()
         return True

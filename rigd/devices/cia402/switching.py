@@ -77,11 +77,6 @@ def switch_off(node: Node) -> bool:
         Whether the drive has shown it in its statusword. If not, its node has been stopped, as far
         as it takes frames at all.
     """
-    with node.exchange.regardless():
-        return _switch_off_somehow(node)
-
-
-def _switch_off_somehow(node: Node) -> bool:
     if _switch_off_by_pdo(node):
         return True
     # That the drive has taken the command by SDO does not say that it has followed it.
