@@ -28,6 +28,8 @@ from rigd.devices.cia402.states import (
     FAULT_BIT,
     FOLLOWS_TARGET,
     STATE_BITS,
+    DriveState,
+    state_of,
 )
 from rigd.devices.cia402.switching import step_up, switch_off
 from rigd.devices.cia402.values import torque_limit_per_mille
@@ -93,7 +95,7 @@ class Cia402Drive:
         self._keeps_deadline = False
         self._enabled = False
         self._may_be_on = False
-        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        self._inbox.guard(FAULT_BIT, 0)
         self._awaiting = False
         self._heard_ns = 0
         self._position = 0
@@ -122,8 +124,8 @@ class Cia402Drive:
         exchange = self._open_link()
         self._node = None
         self._enabled = self._may_be_on = False
-        self._guard_mask, self._guard_value = FAULT_BIT, 0
         self._inbox.clear()
+        self._inbox.guard(FAULT_BIT, 0)
         outfit = self._outfit = set_up(exchange.port, self._rig, self._name)
         has_torque = outfit.has(ACTUAL_TORQUE)
         self._inbox.expect(with_torque=has_torque)
@@ -211,8 +213,7 @@ class Cia402Drive:
         self._enabled = True
         self._following.start()
         follows = FOLLOWS_TARGET if node.settings.follows_target_bit else 0
-        self._guard_mask = STATE_BITS | follows
-        self._guard_value = ENABLED | follows
+        self._inbox.guard(STATE_BITS | follows, ENABLED | follows)
         node.resume()
 
     def latch(self, due_ns: int) -> None:
@@ -263,7 +264,7 @@ class Cia402Drive:
             self._heard_ns = node.now_ns
         if (
             inbox.alarm
-            or inbox.statusword & self._guard_mask != self._guard_value
+            or inbox.strayed is not None
             or node.now_ns - self._heard_ns > self._silence_ns
         ):
             self._complain(node)
@@ -323,7 +324,7 @@ class Cia402Drive:
         and last the node is stopped.
         """
         self._enabled = False
-        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        self._inbox.guard(FAULT_BIT, 0)
         node = self._node
         if node is None:
             return
@@ -432,15 +433,16 @@ class Cia402Drive:
     def _complain(self, node: Node) -> None:
         """Say what is wrong with the drive."""
         node.refuse_alarm()
-        statusword = self._inbox.statusword
-        if statusword & self._guard_mask & STATE_BITS != self._guard_value & STATE_BITS:
+        statusword = self._inbox.strayed
+        if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:
             node.await_alarm()
             node.refuse_alarm()
             raise left_operation(self._name, statusword)
-        if statusword & self._guard_mask != self._guard_value:
+        if statusword is not None:
             raise DeviceError(
                 f"{self._name}: it ignores the target torque: bit 12 of its statusword "
-                f"0x{statusword:04X} is not set; look at its own diagnosis."
+                f"0x{statusword:04X} is not set; look at its own diagnosis, and if this drive has "
+                "no such bit: cia402.follows_target_bit = false."
             )
         silence_s = (node.now_ns - self._heard_ns) * 1e-9
         raise DeviceError(
