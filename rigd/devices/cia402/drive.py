@@ -5,6 +5,7 @@ where that is in doubt a SYNC is left out. A drive that takes more than a period
 refused by :meth:`Cia402Drive.connect` already.
 """
 
+from collections.abc import Callable
 from math import isnan
 
 from rigd.devices.canbus import CanExchange, CanLink
@@ -31,7 +32,7 @@ from rigd.devices.cia402.states import (
     DriveState,
     state_of,
 )
-from rigd.devices.cia402.switching import step_up, switch_off
+from rigd.devices.cia402.switching import StopAskedError, step_up, switch_off
 from rigd.devices.cia402.values import torque_limit_per_mille
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.parameters import RigParameters
@@ -190,10 +191,15 @@ class Cia402Drive:
                 told[key] = "; ".join(texts)
         return told
 
-    def enable(self) -> None:
+    def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Bring the drive to operation enabled, at zero torque.
 
         Sends SYNC, RPDO and heartbeat itself, once a period; meant to be called between two ticks.
+
+        Parameters
+        ----------
+        stop
+            Asked once a period: the drive is then disabled instead.
 
         Raises
         ------
@@ -206,7 +212,10 @@ class Cia402Drive:
         node.refuse_alarm()
         self._may_be_on = True
         try:
-            step_up(node)
+            step_up(node, stop)
+        except StopAskedError:
+            self.disable()
+            return
         except DeviceError:
             self.disable()
             raise
