@@ -344,9 +344,10 @@ def _default(entry: EdsEntry | None) -> int | None:
 
 def _takes(entry: EdsEntry, value: int) -> bool:
     """Whether a value is within the limits of an object, where it has any that make sense."""
-    low = value if entry.low is None else entry.low
-    high = value if entry.high is None else entry.high
-    return low > high or low <= value <= high
+    low, high = entry.low, entry.high
+    if low is not None and high is not None and low > high:
+        return True
+    return (low is None or low <= value) and (high is None or value <= high)
 
 
 def _shown(needed: Requirement, value: int) -> str:
