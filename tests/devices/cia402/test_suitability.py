@@ -150,7 +150,7 @@ def test_what_cannot_be_used_is_refused(judged, place, line, words):
     ("place", "line", "found"),
     [
         ("1005", "u32 const 0x80", "const, 0x80: it does"),
-        ("1800:1", "u32 ro $NODEID+0x40000180", "ro, 0x40000181: it does"),
+        ("1014", "u32 const $NODEID+0x80", "const, 0x81: it does"),
         ("60B2", "i16 ro 0 *", "ro, 0: it does"),
         ("1400:2", "u8 ro -", "ro: the drive will be asked"),
     ],
@@ -170,6 +170,10 @@ def test_pdos_that_are_mapped_as_needed_once_and_for_all(judged):
     judgement = judged(fixed)
     assert judgement.refusals == ()
     assert by_place(judgement)["1600"].found == "const, 2: it does"
+    always_on = fixed.replace("1400:1 u32 rw", "1400:1 u32 const")
+    assert by_place(judged(always_on))["1400:1"].found == "const, 0x201: it does"
+    (refusal,) = judged(changed("1400:1", "u32 const 0x201")).refusals
+    assert "1400:1 (COB-ID of RPDO1) is read-only" in refusal
     (refusal,) = judged(fixed.replace("0x60710010", "0x60FF0020")).refusals
     assert "1600 (Mapping of RPDO1) is read-only" in refusal
 
@@ -187,7 +191,7 @@ def test_no_watchdog_goes_missing_silently(judged, rig):
     (refusal,) = judged(bare, rig()).refusals
     assert "1016:1" in refusal
     assert 'cia402.accept_without = ["watchdog"]' in refusal
-    (refusal,) = judged(bare, rig(accept_without=("torque_limit",))).refusals
+    assert len(judged(bare, rig(accept_without=("torque_limit",))).refusals) == 1
     accepted = by_place(judged(bare, rig(accept_without=("watchdog",))))["watchdog"]
     assert accepted.grade is Grade.ACCEPTED
     for table, values, words in (
@@ -197,6 +201,10 @@ def test_no_watchdog_goes_missing_silently(judged, rig):
         stands = by_place(judged(table, rig(**values)))["watchdog"]
         assert stands.grade is Grade.STANDS_IN
         assert words in stands.found
+    # What the drive does on a lost connection is then its maker's choice anyway.
+    for values in ({"own_watchdog_s": 0.1}, {"accept_without": ("watchdog",)}):
+        assert judged(without("1016:1", "6007"), rig(**values)).refusals == ()
+    assert len(judged(without("6007"), rig()).refusals) == 1
     read_only = judged(changed("1016:1", "u32 ro 0"), rig())
     assert len(read_only.refusals) == 1
 
@@ -204,7 +212,7 @@ def test_no_watchdog_goes_missing_silently(judged, rig):
 @pytest.mark.parametrize(
     ("place", "key"), [("6080", "max_speed_rad_s"), ("6076", "rated_torque_unit_nm")]
 )
-def test_what_the_profile_asks_for_has_to_be_there(judged, rig, place, key):
+def test_what_the_profile_asks_for_must_be_there(judged, rig, place, key):
     assert judged(without(place)).refusals == ()
     (refusal,) = judged(without(place), rig()).refusals
     assert f"cia402.{key} = 0" in refusal
@@ -223,9 +231,14 @@ def test_a_file_of_another_drive(judged, rig):
     (refusal,) = judged(COMPLETE, rig(vendor_id=0xFB)).refusals
     assert "another drive" in refusal
     assert "cia402.vendor_id is 0x000000FB" in refusal
-    doubtful = judged(COMPLETE, rig(product_code=8))
-    assert doubtful.refusals == ()
-    assert by_place(doubtful)["product"].grade is Grade.DOUBT
+    (refusal,) = judged(COMPLETE, rig(product_code=8)).refusals
+    assert "cia402.product_code is 0x00000008" in refusal
+
+
+def test_what_a_lost_connection_is_to_do_can_be_set_only_where_it_is_there(judged, rig):
+    assert judged(without("1029:1"), rig()).refusals == ()
+    (refusal,) = judged(without("1029:1"), rig(communication_error_option=1)).refusals
+    assert "1029:1" in refusal
 
 
 def test_a_bit_rate_that_the_drive_has_not(judged, rig, shipped):
