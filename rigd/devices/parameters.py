@@ -11,6 +11,9 @@ from annotated_types import Ge, Gt, Le, MinLen
 
 from rigd.beam import Beam, Damping
 
+OPTIONAL = {"optional": True}
+"""Metadata of a field whose key a profile may leave out: its default is then what holds."""
+
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 
@@ -145,6 +148,35 @@ class ServoDrive:
     sto_error_code: Annotated[int, Ge(0), Le(0xFFFF)] = 0
     """Of the emergency message by which this drive says that its STO was dropped; 0: it only shows
     it in its statusword."""
+    eds: str = field(default="", metadata=OPTIONAL)
+    """The drive's EDS file; its types are used, and its identity has to be the drive's. Empty:
+    none."""
+    set_objects: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
+    """Objects of the maker's own to be written at the start, each ``"index:sub type value"``; see
+    :mod:`rigd.devices.cia402.assignments`."""
+    accept_without: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
+    """What this drive may lack, by names of :data:`rigd.devices.cia402.requirements.ACCEPTABLE`."""
+    own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
+    """After how long a watchdog of the maker's own takes the torque off when SYNC and RPDO stay
+    away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""
+    sync_gaps: bool = field(default=True, metadata=OPTIONAL)
+    """After a TPDO that did not come, a SYNC is left out to see whether it was lost or is late.
+    False: no SYNC is ever left out, and replies are told apart by counting alone."""
+    torque_response_s: Annotated[float, Ge(0), Le(1)] = field(default=0.0, metadata=OPTIONAL)
+    """Time constant with which the actual torque (6077) follows the commanded one; 0: at once."""
+    follows_target_bit: bool = field(default=True, metadata=OPTIONAL)
+    """Whether bit 12 of the statusword has to say that the drive follows the target torque."""
+
+    @property
+    def watchdog_s(self) -> float:
+        """The longest time for which the torque may stay on after this computer fell silent.
+
+        As far as the profile tells: which watchdog stands is known once the drive is connected.
+        Infinite where the profile accepts a drive without any.
+        """
+        if self.own_watchdog_s > 0:
+            return max(self.heartbeat_timeout_s, self.own_watchdog_s)
+        return math.inf if "watchdog" in self.accept_without else self.heartbeat_timeout_s
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,13 @@ class ResettableDrive(Protocol):
     """A drive that can be in fault; simulated ones in this process cannot."""
 
     def reset_fault(self) -> str | None:
-        """Reset a fault without enabling the drive; return what it was, or None."""
+        """Switch off, reset a fault, see that it would get ready; return the fault, or None.
+
+        Raises
+        ------
+        DeviceError
+            If the drive may still turn, the fault stands, or no session could be started.
+        """
 
 
 def reset_drive(rig: RigParameters, moving: Reality | None = None) -> str:
@@ -30,7 +36,8 @@ def reset_drive(rig: RigParameters, moving: Reality | None = None) -> str:
     Raises
     ------
     DeviceError
-        If the drive does not answer, or the fault stands.
+        If the drive does not answer, may still turn, the fault stands, or it does not get ready,
+        as with STO open.
     """
     drive = open_devices(rig, moving).drive
     if not isinstance(drive, ResettableDrive):
@@ -41,7 +48,10 @@ def reset_drive(rig: RigParameters, moving: Reality | None = None) -> str:
         drive.close()
     if fault is None:
         return (
-            "The drive is not in fault, so there is nothing to reset. It is disabled; the next "
-            "session can be started."
+            "The drive is not in fault, so there is nothing to reset. Its statusword shows it off "
+            "and it gets ready to switch on: the next session can be started."
         )
-    return f"The drive was in fault: {fault}. The fault is reset; the drive is disabled."
+    return (
+        f"The drive was in fault: {fault}. The fault is reset. Its statusword shows it off and it "
+        "gets ready to switch on: the next session can be started."
+    )

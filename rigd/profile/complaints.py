@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
-from rigd.profile.settings import SECTIONS, SOURCES, TEXTS, keys
+from rigd.profile.settings import SECTIONS, SOURCES, TEXTS, is_number, keys
 
 # Longest endings first: the first that fits is the key's unit.
 _UNITS = {
@@ -173,6 +173,7 @@ _KINDS = {
     "string_type": "text in quotes",
     "tuple_type": "an array of six numbers",
     "finite_number": "a finite number",
+    "bool_type": "true or false",
     "missing": "an array of six numbers",
     "too_long": "an array of six numbers",
     "string_too_short": "text",
@@ -199,6 +200,8 @@ def wrong(detail: ErrorDetails) -> str:
         remedy = f"must be {words} {detail['ctx'][name]:g}"
         if str(key).startswith("beam.damping."):
             remedy += ": a negative coefficient or an order of 2 or more is an unstable beam"
+    elif detail["type"] == "tuple_type" and not is_number(keys()[str(key)]):
+        remedy = "must be an array of texts in quotes"
     else:
         remedy = f"must be {_KINDS.get(detail['type'], detail['msg'])}"
     return f"{what} {remedy}."

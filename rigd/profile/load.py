@@ -21,8 +21,9 @@ from rigd.profile.settings import (
     SECTIONS,
     SOURCES,
     Profile,
+    defaults,
     fields_of,
-    is_text,
+    is_number,
     keys,
 )
 
@@ -65,6 +66,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
     values, sources = _flatten(document, problems)
     values = _validate(values, problems)
     if not problems:
+        problems.extend(_find_eds(path, values))
         problems.extend(complaints.contradictions(values))
         problems.extend(wiring.contradictions(values))
     if problems:
@@ -128,6 +130,20 @@ def _known_profiles() -> str:
     return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
 
 
+def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
+    """Make the path of the drive's EDS file a whole one; complain where there is no such file."""
+    given = values.get("cia402.eds")
+    if not given:
+        return
+    eds = path.resolve().parent / given
+    values["cia402.eds"] = str(eds)
+    if not eds.is_file():
+        yield (
+            f'cia402.eds = "{given}": there is no file {eds}; give its path, from the profile\'s '
+            "folder on, or remove the key."
+        )
+
+
 def _flatten(
     document: Mapping[str, Any], problems: list[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
@@ -155,7 +171,7 @@ def _flatten(
 
 def _is_number(key: str) -> bool:
     """Whether a key takes a number, or six; unknown keys take nothing."""
-    return key in keys() and not is_text(keys()[key])
+    return key in keys() and is_number(keys()[key])
 
 
 def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
@@ -196,7 +212,7 @@ def _validate(values: Mapping[str, Any], problems: list[str]) -> dict[str, Any]:
 def _schema(absent: frozenset[str]) -> type[BaseModel]:
     """One flat model for all keys: building one a section takes longer than all the rest."""
     definitions: dict[str, Any] = {
-        f"key_{index}": (annotation, Field(alias=key))
+        f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
         for index, (key, annotation) in enumerate(keys().items())
         if key.partition(".")[0] not in absent
     }

@@ -1,7 +1,7 @@
 """What a profile consists of: its sections, and the settings that no other module declares."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -102,9 +102,9 @@ SOURCES = ("paper", "datasheet", "measured", "assumed")
 
 @cache
 def keys() -> dict[str, Any]:
-    """Every key a profile must have, dotted, and the annotated type of its value.
+    """Every key of a profile, dotted, and the annotated type of its value.
 
-    Defaults of the dataclasses do not count: a delay that nobody states is not known to be zero.
+    A profile must have them all but those of :func:`defaults`.
     """
     types: dict[str, Any] = dict.fromkeys(TEXTS, Annotated[str, MinLen(1)])
     for section, cls in SECTIONS.items():
@@ -113,11 +113,28 @@ def keys() -> dict[str, Any]:
     return types
 
 
-def is_text(annotation: Any) -> bool:  # noqa: ANN401
-    """Whether a key of this type takes text, which has no source; all others take numbers."""
+@cache
+def defaults() -> dict[str, Any]:
+    """Keys that a profile may leave out, and what holds then.
+
+    Other defaults of the dataclasses do not count: a delay that nobody states is not known to be
+    zero.
+    """
+    return {
+        f"{section}.{each.name}": each.default
+        for section, cls in SECTIONS.items()
+        for each in fields(cls)
+        if each.metadata.get("optional") and each.default is not MISSING
+    }
+
+
+def is_number(annotation: Any) -> bool:  # noqa: ANN401
+    """Whether a key of this type takes a number, or six, which have a source; no text has one."""
     if get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
-    return annotation is str or get_origin(annotation) is Literal
+    if get_origin(annotation) is tuple:
+        return str not in get_args(annotation)
+    return annotation not in (str, bool) and get_origin(annotation) is not Literal
 
 
 def fields_of(section: str) -> list[tuple[str, str]]:

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rigd.devices.ati.stream import RECORD_BITS
+from rigd.devices.cia402.assignments import parse_assignment
+from rigd.devices.cia402.requirements import ACCEPTABLE
 from rigd.devices.parameters import AtiSerial
 from rigd.profile.settings import WIRING, fields_of
 
@@ -89,6 +91,18 @@ def _drive(values: Mapping[str, Any]) -> Iterator[str]:
             yield (
                 f"{timeout} = {values[timeout]:g} s is below twice {period} = "
                 f"{values[period]:g} s; a single late heartbeat would end a session."
+            )
+
+    for number, text in enumerate(values["cia402.set_objects"]):
+        try:
+            parse_assignment(text)
+        except ValueError as error:
+            yield f'cia402.set_objects[{number}] = "{text}" {error}.'
+    for number, name in enumerate(values["cia402.accept_without"]):
+        if name not in ACCEPTABLE:
+            yield (
+                f'cia402.accept_without[{number}] = "{name}" is nothing that a profile can accept '
+                f"the absence of; choose {', '.join(ACCEPTABLE)}."
             )
 
 

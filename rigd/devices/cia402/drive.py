@@ -14,7 +14,8 @@ from rigd.devices.cia402.frames import NodeFrames
 from rigd.devices.cia402.inbox import Inbox
 from rigd.devices.cia402.node import Node
 from rigd.devices.cia402.objects import HEARTBEAT_CONSUMER
-from rigd.devices.cia402.setup import reset_fault, set_up
+from rigd.devices.cia402.setup import set_up
+from rigd.devices.cia402.standing import reset_fault
 from rigd.devices.cia402.states import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
@@ -288,17 +289,19 @@ class Cia402Drive:
         node.resume()
 
     def reset_fault(self) -> str | None:
-        """Reset a fault, for the operator; the drive stays disabled and has to be connected anew.
+        """Switch off and reset a fault, for the operator; the drive has to be connected anew.
 
         Returns
         -------
         str or None
-            What the fault was, in words; None if there was none.
+            What the fault was, in words; None if there was none. Either way the drive has shown
+            itself off, and that it would get ready to switch on.
 
         Raises
         ------
         DeviceError
-            If the drive does not answer, or the fault stands.
+            If the drive does not answer, does not show itself off within 0.2 s, the fault stands,
+            or it does not get ready.
         """
         self.disable()
         exchange = self._open_link()

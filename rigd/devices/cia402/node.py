@@ -1,7 +1,7 @@
 """The drive as a partner on the bus: start, SYNC, heartbeat, replies and requests."""
 
 import time
-from contextlib import suppress
+from collections.abc import Callable
 from math import ceil
 
 from rigd.devices.canbus import CanExchange
@@ -19,6 +19,8 @@ _FIRST_REPLY_NS = 100_000_000
 _FIRST_REPLIES = 20
 """SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""
 _WRITTEN_NS = 50_000_000
+_LOOK_AGAIN_NS = 200_000
+_LOOKS = 500
 _REASON_NS = 5_000_000
 """How long a drive in fault has to say why."""
 
@@ -166,6 +168,15 @@ class Node:
         self.send_sync()
         return self.await_reply(patience_ns)
 
+    def sync_if_possible(self) -> bool:
+        """Send SYNC whatever the bus reports, and return whether it was answered; never raises."""
+        self._drain_quietly()  # what has come is no answer
+        self.pairing.ask()
+        self.sync_ns = time.monotonic_ns()
+        self.send_if_possible(self.frames.sync)
+        patience_ns = self.deadline_ns if self.lock_step else self.period_ns
+        return self._await_quietly(self._is_answered, patience_ns)
+
     def await_grid(self, grid_ns: int) -> None:
         """Wait for the next SYNC as the ticks will go on: whole periods after `grid_ns`."""
         if self.lock_step:
@@ -177,31 +188,26 @@ class Node:
         """Send an SDO request to write, and return whether it was confirmed in time."""
         inbox = self.inbox
         inbox.reply = b""
-        try:
-            self.exchange.send(request)
-            return self.exchange.wait_until(
-                lambda: is_written(inbox.reply, index, sub), time.monotonic_ns() + _WRITTEN_NS
-            )
-        except (DeviceError, OSError):
-            return False
+        return self.send_if_possible(request) and self._await_quietly(
+            lambda: is_written(inbox.reply, index, sub), _WRITTEN_NS
+        )
 
     def is_off(self) -> bool:
         """Ask the drive for its statusword by SDO, and return whether it shows the drive off."""
         inbox = self.inbox
         inbox.reply = b""
-        with suppress(DeviceError, OSError):
-            self.exchange.send(self.frames.ask_statusword)
-            self.exchange.wait_until(
-                lambda: read_statusword(inbox.reply) is not None,
-                time.monotonic_ns() + _WRITTEN_NS,
-            )
+        if self.send_if_possible(self.frames.ask_statusword):
+            self._await_quietly(lambda: read_statusword(inbox.reply) is not None, _WRITTEN_NS)
         statusword = read_statusword(inbox.reply)
         return statusword is not None and state_of(statusword) in OFF
 
-    def send_if_possible(self, frame: bytes) -> None:
-        """Send a frame, or not."""
-        with suppress(DeviceError, OSError):
+    def send_if_possible(self, frame: bytes) -> bool:
+        """Send a frame, and return whether the bus has taken it; never raises."""
+        try:
             self.exchange.send(frame)
+        except Exception:  # an adapter's library may raise anything, and this is the way off
+            return False
+        return True
 
     def await_alarm(self) -> None:
         """Give a drive that has left operation a little time to say why."""
@@ -235,6 +241,32 @@ class Node:
                 f" Remove the cause; if drive or daemon are in fault then: {self._reset_command}"
             )
         raise DeviceError(reason)
+
+    def _await_quietly(self, ready: Callable[[], bool], patience_ns: int) -> bool:
+        """Wait for something on a bus that may report anything; return whether it came."""
+        deadline_ns = time.monotonic_ns() + patience_ns
+        for _ in range(_LOOKS):
+            try:
+                return self.exchange.wait_until(ready, deadline_ns)
+            except Exception:  # this is the way off: see send_if_possible
+                left_ns = deadline_ns - time.monotonic_ns()
+            if ready() or left_ns <= 0:
+                break
+            time.sleep(min(left_ns, _LOOK_AGAIN_NS) * 1e-9)
+        return ready()
+
+    def _drain_quietly(self) -> None:
+        """Deliver all that has come.
+
+        A damaged frame may end a look before what came after it; that the controller is off the
+        bus is told at every look, after all has been delivered. So it looks again, within bounds.
+        """
+        for _ in range(_LOOKS):
+            try:
+                self.exchange.drain()
+            except Exception:  # this is the way off: see send_if_possible
+                continue
+            return
 
     def _is_operational(self) -> bool:
         return self.inbox.nmt_state == OPERATIONAL

@@ -8,23 +8,33 @@ from typing import Final
 
 SYNC_COB_ID: Final = 0x1005
 SYNC_PERIOD_US: Final = 0x1006
+SYNC_WINDOW_US: Final = 0x1007
 DEVICE_NAME: Final = 0x1008
 SOFTWARE_VERSION: Final = 0x100A
+EMERGENCY_COB_ID: Final = 0x1014
 HEARTBEAT_CONSUMER: Final = 0x1016
 """Sub 1: watched node in bits 23 to 16, its time-out in ms in bits 15 to 0."""
 HEARTBEAT_PRODUCER_MS: Final = 0x1017
 IDENTITY: Final = 0x1018
 """Sub 1 to 4: vendor, product code, revision, serial number."""
+SYNC_OVERFLOW: Final = 0x1019
+"""Largest value of the counter in SYNC; 0: SYNC carries none."""
 COMMUNICATION_ERROR: Final = 0x1029
 RPDO_COMMUNICATION: Final = 0x1400
 RPDO_MAPPING: Final = 0x1600
 TPDO_COMMUNICATION: Final = 0x1800
 TPDO_MAPPING: Final = 0x1A00
 """Of the first PDO; those of the n-th are n - 1 further."""
+INHIBIT_TIME: Final = 3
+EVENT_TIMER: Final = 5
+"""Sub-indices of a PDO's communication parameters, in 100 µs and in ms; of an RPDO the event timer
+is the deadline of the next one."""
 ABORT_OPTION: Final = 0x6007
 ERROR_CODE: Final = 0x603F
 CONTROLWORD: Final = 0x6040
 STATUSWORD: Final = 0x6041
+QUICK_STOP_OPTION: Final = 0x605A
+FAULT_REACTION_OPTION: Final = 0x605E
 MODE: Final = 0x6060
 MODE_DISPLAY: Final = 0x6061
 POSITION: Final = 0x6064
@@ -35,6 +45,8 @@ TORQUE_OFFSET: Final = 0x60B2
 TORQUE_LIMITS: Final = (0x60E0, 0x60E1)
 """Largest torque forwards and backwards."""
 ACTUAL_TORQUE: Final = 0x6077
+POLARITY: Final = 0x607E
+"""Bit 7 turns the position round, bit 6 the speed, bit 5 the torque."""
 MAX_SPEED_RPM: Final = 0x6080
 """Of the motor."""
 INTERPOLATION_TIME: Final = 0x60C2

@@ -6,7 +6,8 @@ What it takes of an object's type stands in ``drive.eds``.
 
 import logging
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -26,6 +27,7 @@ EVERY_BIT = 0xFFFF_FFFF
 _EDS = Path(__file__).with_name("drive.eds")
 _SDO_TIMEOUT_S = 0.5
 _SDO_TRIES = 2
+_HURRIED_TIMEOUT_S = 0.05
 _RECEIVER_POLL_S = 0.02
 _ABSENT = (0x0602_0000, 0x0609_0011, 0x060A_0023)
 """SDO abort codes: no such object, no such sub-index, nothing behind it."""
@@ -89,7 +91,7 @@ class SdoAccess:
         trace: TracebackType | None,
     ) -> None:
         # It reports a cut bus once more, when everything has ended.
-        with suppress(DeviceError, OSError, can.CanError):
+        with suppress(Exception):
             self._network.disconnect()
 
     def to_pre_operational(self) -> None:
@@ -100,7 +102,7 @@ class SdoAccess:
         DeviceError
             If it does not.
         """
-        self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        self.tell_pre_operational()
         try:
             self.read(objects.IDENTITY, 1)
         except SdoRefusal:
@@ -111,6 +113,32 @@ class SdoAccess:
             raise DeviceError(
                 f"{error} Look at its supply, its node id (cia402.node_id) and bit rate{heard}."
             ) from None
+
+    def tell_pre_operational(self) -> None:
+        """Tell the drive to leave operational, which it may ignore; nobody waits for it.
+
+        Raises
+        ------
+        DeviceError
+            If the bus does not take the command.
+        """
+        try:
+            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        except can.CanError as error:
+            raise DeviceError(
+                f"{self._name}: CAN bus {self._bus_name} takes no commands ({error})."
+            ) from None
+
+    @contextmanager
+    def hurried(self) -> Iterator[None]:
+        """Wait for each answer for 50 ms only, and ask once, as where torque is to be taken off."""
+        client = self._node.sdo
+        before = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
+        client.RESPONSE_TIMEOUT, client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
+        try:
+            yield
+        finally:
+            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = before
 
     def read(self, index: int, sub: int = 0) -> int:
         """Return the value of an object.

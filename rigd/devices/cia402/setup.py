@@ -1,20 +1,9 @@
-"""Set-up of the drive, in pre-operational, before the cycle starts; and the reset of a fault."""
-
-import time
-from collections.abc import Callable
-from contextlib import suppress
+"""Set-up of the drive, in pre-operational, before the cycle starts."""
 
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import objects
-from rigd.devices.cia402.faults import describe_error
-from rigd.devices.cia402.sdo import EVERY_BIT, SdoAccess, SdoRefusal, show_value
-from rigd.devices.cia402.states import (
-    DISABLE_VOLTAGE,
-    FAULT_BIT,
-    FAULT_RESET,
-    DriveState,
-    state_of,
-)
+from rigd.devices.cia402.sdo import EVERY_BIT, SdoAccess, show_value
+from rigd.devices.cia402.standing import command_off, require_off, still_on, wait_for
 from rigd.devices.cia402.values import (
     interpolation_time,
     max_speed_rpm,
@@ -24,7 +13,6 @@ from rigd.devices.cia402.values import (
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters, ServoDrive
 
-_POLL_S = 0.01
 _MODE_PATIENCE_S = 0.3
 _RATED_TORQUE_TOLERANCE = 0.02
 
@@ -57,10 +45,16 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> dict[str, object]:
     period_us = sync_period_us(rig.rate_hz)
     interpolation = interpolation_time(rig.rate_hz)
     with SdoAccess(port, settings.node_id, name) as sdo:
+        # Before anything else, whoever it is: a session that was killed may have left it turning.
+        command_off(sdo)
         sdo.to_pre_operational()
+        command_off(sdo)
         identity = _read_identity(sdo)
-        _check_identity(identity, settings, name)
-        _switch_off(sdo, rig, name)
+        try:
+            _check_identity(identity, settings, name)
+        except DeviceError as error:
+            raise DeviceError(f"{error}{still_on(sdo)}") from None
+        require_off(sdo, rig, name)
         _check_torque(sdo, identity, rig, name)
         _configure_torque(sdo, torque_limit_per_mille(rig))
         _configure_speed(sdo, settings, name)
@@ -69,45 +63,8 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> dict[str, object]:
         _configure_pdos(sdo, settings)
         sdo.configure(objects.MODE, 0, objects.CYCLIC_TORQUE)
         # Some drives show it only once they are enabled: it is looked at again then.
-        _wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
+        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
     return identity
-
-
-def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
-    """Reset a fault; the drive is left pre-operational and disabled.
-
-    Returns
-    -------
-    str or None
-        What the fault was, in words; None if there was none.
-
-    Raises
-    ------
-    DeviceError
-        If the drive does not answer, or the fault stands.
-    """
-    settings = rig.cia402
-    assert settings is not None
-    with SdoAccess(port, settings.node_id, name) as sdo:
-        sdo.to_pre_operational()
-        with suppress(SdoRefusal):
-            # Nobody sends a heartbeat now, whose absence would be the next fault.
-            sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
-        if not sdo.read(objects.STATUSWORD) & FAULT_BIT:
-            return None
-        fault = _fault(sdo)
-        patience_s = settings.enable_timeout_s
-        _wait_for(lambda: _state(sdo) is DriveState.FAULT, patience_s)
-        for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
-            sdo.write(objects.CONTROLWORD, 0, controlword)
-        gone = _wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
-        sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-        if not gone:
-            raise DeviceError(
-                f"{name}: the fault cannot be reset: {_fault(sdo)}. It is in the state "
-                f'"{_state(sdo).value}"; remove the cause, or switch the drive off and on.'
-            )
-    return fault
 
 
 def _read_identity(sdo: SdoAccess) -> dict[str, object]:
@@ -184,32 +141,6 @@ def _configure_speed(sdo: SdoAccess, settings: ServoDrive, name: str) -> None:
     sdo.configure(objects.MAX_SPEED_RPM, 0, max_speed_rpm(settings))
 
 
-def _switch_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
-    """Have the drive disabled, as a session that was killed may have left it."""
-    settings = rig.cia402
-    assert settings is not None
-    if not sdo.read(objects.STATUSWORD) & FAULT_BIT:
-        sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-        if (
-            _wait_for(
-                lambda: _state(sdo) in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT),
-                settings.enable_timeout_s,
-            )
-            and _state(sdo) is DriveState.SWITCH_ON_DISABLED
-        ):
-            return
-    statusword = sdo.read(objects.STATUSWORD)
-    if statusword & FAULT_BIT:
-        raise DeviceError(
-            f"{name}: it is in fault: {_fault(sdo)}. Remove the cause, then: rigd reset --profile "
-            f"{rig.name}"
-        )
-    raise DeviceError(
-        f'{name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
-        f'"{state_of(statusword).value}" (statusword 0x{statusword:04X}); switch it off and on.'
-    )
-
-
 def _configure_sync(sdo: SdoAccess, period_us: int, interpolation: tuple[int, int]) -> None:
     cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
     if cob_id is not None and cob_id & ~objects.PDO_DISABLED != objects.SYNC_ID:
@@ -267,26 +198,3 @@ def _disable_pdo(sdo: SdoAccess, communication: int) -> None:
     cob_id = sdo.read_if_there(communication, 1)
     if cob_id is not None and not cob_id & objects.PDO_DISABLED:
         sdo.configure(communication, 1, cob_id | objects.PDO_DISABLED)
-
-
-def _state(sdo: SdoAccess) -> DriveState:
-    return state_of(sdo.read(objects.STATUSWORD))
-
-
-def _fault(sdo: SdoAccess) -> str:
-    """Return in words why the drive is in fault."""
-    try:
-        code = sdo.read(objects.ERROR_CODE)
-    except SdoRefusal:
-        code = 0
-    code = code or sdo.last_emergency()
-    return describe_error(code) if code else "the drive names no cause"
-
-
-def _wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
-    deadline = time.monotonic() + patience_s
-    while not reached():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(_POLL_S)
-    return True

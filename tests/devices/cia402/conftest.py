@@ -76,6 +76,11 @@ class ScriptedDrive(threading.Thread):
         self.pending = None  # controlword and torque of an RPDO that waits for SYNC
         self.control = 0
         self.stays_in = None  # a state that it does not leave upwards
+        self.on_ready = "ready"  # where it goes instead
+        self.ignores_nmt = False
+        self.off_delay_s = 0.0  # from the command on
+        self.told_off_after = -1  # SDO frames, until the statusword was read as off
+        self._off_at = None
         self.follows = True
         self.mode_follows = True
         self.sdo_works = True
@@ -180,6 +185,10 @@ class ScriptedDrive(threading.Thread):
                     self._take(can_id, data[:length])
 
     def _take(self, can_id, data):
+        if self._off_at is not None and time.monotonic() >= self._off_at:
+            self.state, self.torque, self._off_at = "switch-on disabled", 0, None
+        if can_id == 0 and self.ignores_nmt:
+            return
         if can_id == 0 and data[1] in (0, NODE):
             self.nmt = {1: 5, 2: 4, 128: 0x7F}[data[0]]
             if self.nmt == 4 and self.stops:
@@ -244,7 +253,11 @@ class ScriptedDrive(threading.Thread):
         low = controlword & 0x0F
         if self.state != self.stays_in and (self.state, low) in _UP:
             self.state = _UP[self.state, low]
-        elif not low & 0x02:
+            if self.state == "ready":
+                self.state = self.on_ready
+        elif not low & 0x02 and self.off_delay_s and self.state == "enabled":
+            self._off_at = self._off_at or time.monotonic() + self.off_delay_s
+        elif not low & 0x02 and "no supply" not in self.state:
             self.state, self.torque = "switch-on disabled", 0
 
     def status(self):
@@ -270,6 +283,8 @@ class ScriptedDrive(threading.Thread):
             size = struct.pack("<I", len(self._rest))
             self.send(0x580 + NODE, b"\x41" + reply + size)
         elif command == 0x40:
+            if index == 0x6041 and self.state != "enabled" and self.told_off_after < 0:
+                self.told_off_after = len(self.frames(0x605))
             value = {0x6041: self.status(), 0x6061: self._mode()}.get(index)
             value = self.objects[index, sub] if value is None else value
             raw = struct.pack(_format(index, sub), value)

@@ -12,7 +12,8 @@ import pytest
 import rigd.devices.cia402 as package
 from rigd.devices.canbus import CanExchange, open_port
 from rigd.devices.canbus.port import SocketPort
-from rigd.devices.cia402.setup import reset_fault, set_up
+from rigd.devices.cia402.setup import set_up
+from rigd.devices.cia402.standing import reset_fault
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.simulator import SimulatorAddress
@@ -180,12 +181,13 @@ def test_the_bytes_of_a_fault_reset(node, port, rig):
     def on_write(index, subindex, od, data):
         if index == 0x6040:
             words.append(bytes(data))
-            if data[0] & 0x80:
-                node.sdo[0x6041].raw = 0x0250
+            fault = node.sdo[0x6041].raw & 0x08
+            if data[0] & 0x80 or not fault:
+                node.sdo[0x6041].raw = 0x0231 if data[0] == 0x06 else 0x0250
 
     node.add_write_callback(on_write)
     assert "under-voltage" in reset_fault(port, rig, "Drive")
-    assert words == [b"\x00\x00", b"\x80\x00", b"\x00\x00"]
+    assert [word[0] for word in words] == [0x00, 0x00, 0x80, 0x00, 0x06, 0x00]
 
 
 def test_the_port_is_free_for_the_cycle_afterwards(node, port, rig):

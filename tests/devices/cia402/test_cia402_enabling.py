@@ -239,6 +239,55 @@ def test_disabling_never_raises(make_drive, rig, scripted):
     drive.close()
 
 
+class TestAnAdapterThatRaisesAnything:
+    """Nothing that its library does keeps the way off from switching the torque off."""
+
+    @pytest.fixture
+    def drive(self, make_drive, rig, scripted):
+        drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
+        drive.connect()
+        drive.enable()
+        scripted.seen.clear()
+        return drive
+
+    def test_a_burst_of_damaged_lines(self, drive, scripted):
+        exchange = drive._node.exchange
+        receive, left = exchange._receive, [60]
+
+        def damaged():
+            if left[0]:
+                left[0] -= 1
+                raise ValueError("could not convert string to int: 'ZZZ'")
+            return receive()
+
+        exchange._receive = damaged
+        drive.disable()
+        assert scripted.state == "switch-on disabled"
+        assert drive.off_doubt == ""
+        assert scripted.frames(0x605) == []  # by PDO, at once
+
+    def test_an_error_that_stands_keeps_no_sync_from_being_sent(self, drive, scripted):
+        drive._node.exchange._bus_off = "CAN bus can0: the controller is error-passive."
+        drive.disable()
+        assert scripted.state == "switch-on disabled"
+        assert drive.off_doubt == ""
+        order = [can_id for can_id, _ in scripted.seen]
+        assert order[:2] == [0x205, 0x080]
+        assert 0x605 not in order
+
+    @pytest.mark.parametrize("error", [ValueError, RuntimeError, MemoryError, KeyError])
+    def test_nothing_works_any_more(self, drive, error):
+        def fail(*_):
+            raise error("anything")
+
+        exchange = drive._node.exchange
+        exchange._receive = exchange._send = fail
+        exchange.port.receive = exchange.port.wait = fail
+        drive.disable()
+        assert "does not show that it is off" in drive.off_doubt
+        drive.close()
+
+
 def test_a_frozen_drive_does_not_hold_disabling_up_for_ever(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 1e4)))
     drive.connect()

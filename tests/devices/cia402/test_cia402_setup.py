@@ -1,6 +1,8 @@
 """Set-up against a scripted drive: order, read-back, refusals; and the reset of a fault."""
 
+import struct
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -101,7 +103,10 @@ def test_everything_written_is_read_back(drive, scripted):
 def test_nothing_is_configured_but_in_pre_operational(drive, scripted):
     drive.connect()
     before_start = scripted.seen[: scripted.seen.index((0x000, b"\x01\x05"))]
-    assert before_start[0] == (0x000, b"\x80\x05")
+    off = (0x605, bytes.fromhex("2B40600000000000"))
+    # Off before all else, and in pre-operational again, for not every drive takes it before.
+    assert before_start[:2] == [off, (0x000, b"\x80\x05")]
+    assert off in before_start[2:]
     assert {can_id for can_id, _ in before_start} == {0x000, 0x605}
     after = scripted.seen[len(before_start) + 1 :]
     assert {can_id for can_id, _ in after} == {0x080}
@@ -251,7 +256,8 @@ def test_resetting_a_fault(drive, scripted):
     scripted.objects[0x603F, 0] = 0x3210
     assert drive.reset_fault() == "over-voltage in the DC link (error code 0x3210)"
     assert scripted.state == "switch-on disabled"
-    assert [value for _, _, value in writes_to(scripted, 0x6040)] == [0x00, 0x80, 0x00]
+    words = [value for _, _, value in writes_to(scripted, 0x6040)]
+    assert words == [0x00, 0x00, 0x80, 0x00, 0x06, 0x00]
     assert not scripted.frames(0x205)
     drive.connect()
 
@@ -272,7 +278,91 @@ def test_resetting_after_a_session_that_ended_in_a_fault(drive, scripted):
 
 def test_without_a_fault_there_is_nothing_to_reset(drive, scripted):
     assert drive.reset_fault() is None
-    assert scripted.writes == [(0x1016, 1, 0)]
+    assert scripted.writes == [(0x6040, 0, 0), (0x1016, 1, 0), (0x6040, 0, 6), (0x6040, 0, 0)]
+    assert scripted.state == "switch-on disabled"
+
+
+class TestResettingADriveThatTurns:
+    """Operation enabled, with torque; NMT pre-operational changes nothing for it."""
+
+    @pytest.fixture
+    def turning(self, scripted):
+        scripted.state, scripted.torque, scripted.nmt = "enabled", 200, 5
+        scripted.objects[0x1016, 1] = 100 << 16 | 50
+        scripted.ignores_nmt = True
+        return scripted
+
+    def test_it_is_off_before_anything_else(self, drive, turning):
+        assert drive.reset_fault() is None
+        assert turning.seen[0] == (0x605, bytes.fromhex("2B40600000000000"))
+        assert (turning.state, turning.torque, turning.nmt) == ("switch-on disabled", 0, 5)
+
+    def test_its_watch_is_taken_away_only_after_it_was_seen_off(self, drive, turning):
+        turning.off_delay_s = 0.08
+        drive.reset_fault()
+        frames = [data for can_id, data in turning.seen if can_id == 0x605]
+        watch = frames.index(struct.pack("<BHBI", 0x23, 0x1016, 1, 0))
+        seen_off = turning.told_off_after
+        assert 0 < seen_off <= watch
+
+    def test_a_drive_that_stays_on_is_said_to_turn_and_keeps_its_watch(self, drive, turning):
+        turning.obeys = False
+        began = time.monotonic()
+        with pytest.raises(DeviceError) as caught:
+            drive.reset_fault()
+        assert time.monotonic() - began < 5
+        told = str(caught.value)
+        for words in ("within 0.2 s", '"operation enabled"', "0x1237", "may still turn", "STO"):
+            assert words in told
+        assert turning.objects[0x1016, 1] == 100 << 16 | 50
+        assert (0x1016, 1, 0) not in turning.writes
+
+    def test_a_node_that_was_stopped_answers_again(self, drive, turning):
+        """It answers no SDO before it is told to leave that state."""
+        turning.ignores_nmt, turning.nmt = False, 4
+        answers, sdo = turning._sdo, []
+        turning._sdo = lambda data: sdo.append(data) if turning.nmt == 4 else answers(data)
+        assert drive.reset_fault() is None
+        assert sdo
+        assert turning.state == "switch-on disabled"
+
+    def test_nobody_answers(self, drive, turning):
+        turning.silent = True
+        with pytest.raises(DeviceError, match=r"no answer on CAN bus can0"):
+            drive.reset_fault()
+
+
+def test_a_drive_with_its_sto_open_is_not_said_to_be_ready(drive, scripted):
+    scripted.state = "switch-on disabled, no supply"
+    with pytest.raises(DeviceError) as caught:
+        drive.reset_fault()
+    told = str(caught.value)
+    for words in ("not in fault", "it is disabled", "does not get ready", "0x0240", "STO"):
+        assert words in told
+    assert "supply is not there" in told
+
+
+def test_a_fault_that_comes_back_when_it_is_told_to_get_ready(drive, scripted):
+    scripted.on_ready = "fault"
+    scripted.objects[0x603F, 0] = 0x3220
+    with pytest.raises(DeviceError, match=r"told to get ready it went to fault: under-voltage"):
+        drive.reset_fault()
+
+
+def test_another_drive_that_turns_is_switched_off_before_it_is_refused(drive, scripted):
+    scripted.state, scripted.torque = "enabled", 200
+    scripted.objects[0x1018, 2] = 0x1
+    with pytest.raises(DeviceError, match="another drive") as caught:
+        drive.connect()
+    assert (scripted.state, scripted.torque) == ("switch-on disabled", 0)
+    assert "may still turn" not in str(caught.value)
+
+
+def test_another_drive_that_cannot_be_switched_off_is_said_to_turn(drive, scripted):
+    scripted.state, scripted.obeys = "enabled", False
+    scripted.objects[0x6502, 0] = 0x1ED
+    with pytest.raises(DeviceError, match=r"no cyclic synchronous torque.*may still turn.*STO"):
+        drive.connect()
 
 
 def test_a_fault_whose_cause_stands(drive, scripted):
