@@ -102,11 +102,13 @@ class DriveNode:
         It receives and sends nothing, as if its plug were out; its own watchdogs go on.
     torque_lag_s : float
         Time constant with which its actual torque (6077) follows what it exerts, as one that is
-        measured and filtered does; 0 shows it at once.
+        measured and filtered does; 0 shows it at once. The profile's ``torque_response_s``, until
+        it is set.
     stays_operational : bool
         It does not take the NMT command to pre-operational.
     never_follows : bool
-        Its statusword has no bit 12, which says that the drive follows its target.
+        Its statusword has no bit 12, which says that the drive follows its target; by the
+        profile's ``follows_target_bit``, until it is set.
     watchless : bool
         It does not notice that its host is silent: no heartbeat, SYNC or RPDO is missed.
     angle_offset_counts : int
@@ -151,8 +153,9 @@ class DriveNode:
             )
         self.frozen = False
         self.angle_offset_counts = 0
-        self.torque_lag_s = 0.0
-        self.stays_operational = self.never_follows = self.watchless = False
+        self.torque_lag_s = rig.cia402.torque_response_s
+        self.never_follows = not rig.cia402.follows_target_bit
+        self.stays_operational = self.watchless = False
         self._sto_dropped = False
         self._sto_error_code = rig.cia402.sto_error_code
         self._simulated = simulated

@@ -5,6 +5,7 @@ The operator's commands come over the control socket.
 """
 
 import gc
+import math
 import os
 import select
 import time
@@ -57,7 +58,7 @@ class SimulatorOptions:
     quiet: bool = False
     """Tell nothing on the terminal."""
     eds: Path | None = None
-    """The manufacturer's file of the drive that is simulated; by default one of this program's."""
+    """The manufacturer's file of the drive that is simulated; by default the profile's, if any."""
 
 
 def check_on_wire(rig: RigParameters) -> None:
@@ -150,11 +151,12 @@ class _Process:
         self._stack = stack
         self._handlers: Handlers = {}
         self._file: DeviceFile | None = None
-        if options.eds is not None:
+        assert rig.cia402 is not None
+        eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
+        if eds is not None:
             from rigd.sim.wire.canopen_eds import read_eds
 
-            assert rig.cia402 is not None
-            self._file = read_eds(options.eds, rig.cia402.node_id)
+            self._file = read_eds(eds, rig.cia402.node_id)
         folder = stack.enter_context(socket_folder(rig.name))
         self._bus: Hub | VirtualCan
         can_socket = ""
@@ -253,8 +255,7 @@ class _Process:
             world.step,
             world.can_port("drive"),
             self._log,
-            # How long a drive bears silence is not known: as long as its heartbeat may stay away.
-            sync_timeout_s=rig.cia402.heartbeat_timeout_s,
+            sync_timeout_s=self._sync_timeout_s(),
             file=self._file,
         )
         world.join("drive", drive)
@@ -267,6 +268,17 @@ class _Process:
 
             world.join("sensor", AtiCanNode(rig, simulated, world.can_port("sensor"), self._log))
         return world
+
+    def _sync_timeout_s(self) -> float:
+        """How long the drive bears that no SYNC comes."""
+        drive = self._rig.cia402
+        assert drive is not None
+        if drive.own_watchdog_s:
+            return drive.own_watchdog_s
+        if self._file is not None and (0x1006, 0) not in self._file.entries:
+            return math.inf  # it is not told when to expect one
+        # How long others bear it is not known: as long as its heartbeat may stay away.
+        return drive.heartbeat_timeout_s
 
     def _invitation(self) -> Iterator[str]:
         address, rig = self._address, self._rig
