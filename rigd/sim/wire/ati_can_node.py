@@ -6,6 +6,7 @@ wire is big-endian. Where no document tells what the box does, it is stated here
 * a request with an unknown opcode, of another length, or with an index that cannot be (axis or
   diagnostic channel above 5, calibration above 15, base above 0x7F) gets no reply;
 * after power-up or a reset calibration 0 is active, and the base stays as it was set;
+* a board that started anew by itself says so by bit 0 of the status, until a calibration is set;
 * a calibration that is not in the box is selected and echoed all the same, but from then on bit 6
   of the status is set and the matrix reads as not-a-number, as erased memory does; serial number,
   units and counts do not depend on the calibration;
@@ -34,6 +35,7 @@ _COUNTS = Struct(">2I").pack
 _WORD = Struct(">H").pack
 _FIRMWARE = Struct(">BBH").pack
 
+_RESTARTED = 1 << 0
 _BAD_CALIBRATION = 1 << 6
 _ANY_ERROR = 1 << 15
 _ERASED_ROW = (float("nan"),) * 6
@@ -111,6 +113,7 @@ class AtiCanNode:
             {settings.calibration} if calibrations is None else frozenset(calibrations)
         )
         self._active = 0
+        self._restarted = False
         self._base = settings.base_id
         serial_number = settings.serial_number or SERIAL_NUMBER
         self._serial_number = serial_number.encode("ascii", "replace")[:8].ljust(8, b"\0")
@@ -137,6 +140,12 @@ class AtiCanNode:
         if request is not None and len(data) == request[0]:
             request[1](data)
 
+    def restart(self) -> None:
+        """Have the board start anew by itself, as its own watchdog does."""
+        self._active = 0
+        self._restarted = True
+        self._log("sensor", "restart")
+
     def tick(self, now_s: float) -> None:
         """Nothing here takes time: the box only answers."""
 
@@ -146,6 +155,8 @@ class AtiCanNode:
     def _read_gauges(self, _: bytes) -> None:
         g0, g1, g2, g3, g4, g5 = self.gauges.read((self._measure(),), self.saturate)[0].tolist()
         status = self.status_bits & 0xFFFF
+        if self._restarted:
+            status |= _RESTARTED
         if self._active not in self._calibrations:
             status |= _BAD_CALIBRATION
         if status:
@@ -170,6 +181,7 @@ class AtiCanNode:
         if index > 15:
             return
         self._active = index
+        self._restarted = False
         self._log("sensor", "calibration set", index=index, present=index in self._calibrations)
         self._reply(0x6, data)
 
