@@ -222,7 +222,15 @@ class _Attendance:
             If a device failed: the message has been sent all the same.
         """
         board, devices = self._board, self._devices
-        for word in (Word.START_UTC_NS, Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST):
+        for word in (
+            Word.START_UTC_NS,
+            Word.SCHEDULED,
+            Word.MISSED,
+            Word.LATE,
+            Word.LOST,
+            Word.STALE_ANGLES,
+            Word.STALE_WRENCHES,
+        ):
             board[word] = 0
         self._warn_of_refusals()
         cycle = self._cycle = self._make_cycle(job.profile)

@@ -263,6 +263,8 @@ class Procedure:
                 if tick >= total:
                     last = total - 1
                     break
+            if end is None and cycle.stale:  # in the tick before
+                end = self._stale_too_many(tick)
             if end is None and (
                 stop[0] or counts.lost or signals.requested or tick % LOOK_EVERY == 0
             ):
@@ -374,6 +376,13 @@ class Procedure:
         if not missed:
             return None
         reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
+        return None if reason is None else SessionEnd("fault", str(reason))
+
+    def _stale_too_many(self, scheduled: int) -> SessionEnd | None:
+        counts = self.counts
+        reason = self._cycle.watch.check_stale_share(
+            counts.stale_angles, counts.stale_wrenches, scheduled
+        )
         return None if reason is None else SessionEnd("fault", str(reason))
 
     def _stop_reason(self) -> SessionEnd | None:

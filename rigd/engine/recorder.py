@@ -208,6 +208,8 @@ class Recorder:
                 "scheduled": str(scheduled),
                 "missed": str(board[Word.MISSED]),
                 "late": str(board[Word.LATE]),
+                "stale_angles": str(board[Word.STALE_ANGLES]),
+                "stale_wrenches": str(board[Word.STALE_WRENCHES]),
             }
         )
 

@@ -172,6 +172,27 @@ INTERLOCKS: Final = (
         "Look at sensor, cable and line.",
     ),
     Interlock(
+        "stale angle share",
+        "part of ticks without a new angle",
+        "%",
+        "limits.stale_percent",
+        0.5,
+        Checked.TICK,
+        Action.FAULT,
+        "Look at drive (inhibit time of its TPDO), cable and bus, or allow the replies more time "
+        "(acquisition.deadline_us).",
+    ),
+    Interlock(
+        "stale wrench share",
+        "part of ticks without a new wrench",
+        "%",
+        "limits.stale_percent",
+        0.5,
+        Checked.TICK,
+        Action.FAULT,
+        "Look at sensor, cable and line, or allow the replies more time (acquisition.deadline_us).",
+    ),
+    Interlock(
         "missed ticks",
         "run of missed ticks",
         "ticks",

@@ -10,8 +10,9 @@ from rigd.safety.violation import Violation
 LOOK_EVERY = 64
 """Ticks between two checks of what changes slowly."""
 
-MISSED_WINDOW_S = 10.0
-"""Missed ticks are counted against at least this much time, so that one early burst is no fault."""
+SHARE_WINDOW_S = 10.0
+"""Missed ticks and old readings are counted against at least this much time, so that one early
+burst is no fault."""
 
 REARM_S = 1.0
 """How long a channel has to stay clear of its limit before it is announced as near it again."""
@@ -69,8 +70,6 @@ class LimitWatch:
         "_last_look_ns",
         "_limits",
         "_looks",
-        "_missed_near",
-        "_missed_window",
         "_notices",
         "_peak_nm",
         "_per_tick2_rad",
@@ -80,6 +79,8 @@ class LimitWatch:
         "_rate_hz",
         "_rearm_looks",
         "_saturated",
+        "_share_near",
+        "_share_window",
         "_slowly_near",
         "_stale_angles",
         "_stale_wrenches",
@@ -121,7 +122,7 @@ class LimitWatch:
         self._jump_warning = _part("encoder jump") * (self._per_tick2_rad + self._jump_rad)
         self._wrench_limits = tuple(limits.sensor_range_percent / 100 * r for r in sensor_range)
         self._wrench_warnings = tuple(_part("wrench range") * w for w in self._wrench_limits)
-        self._missed_window = MISSED_WINDOW_S * rate_hz
+        self._share_window = SHARE_WINDOW_S * rate_hz
         self._rearm_looks = max(1, round(REARM_S * rate_hz / LOOK_EVERY))
         self._heat_nm2 = 0.0
         self._last_look_ns: int | None = None
@@ -140,7 +141,7 @@ class LimitWatch:
         self._stale_wrenches = 0
         self._saturated = 0
         self._unsure = 0
-        self._missed_near = False
+        self._share_near = False
         self._slowly_near = False
         self.warning = False
 
@@ -211,8 +212,8 @@ class LimitWatch:
         wrench: Sequence[float],
         angle_stale: bool,
     ) -> Violation | None:
-        self.warning = self._slowly_near or self._missed_near
-        self._missed_near = False
+        self.warning = self._slowly_near or self._share_near
+        self._share_near = False
         limits = self._limits
         error_rad = reference_rad - angle_rad
         readings: list[_Reading] = [
@@ -273,6 +274,8 @@ class LimitWatch:
         self._stale_angles = self._stale_angles + 1 if angle_stale else 0
         self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0
         self._saturated = self._saturated + 1 if saturated else 0
+        if self._share_near:  # by a wrench alone, which the check of the angle has not seen
+            self._share_near, self.warning = False, True
         limits = self._limits
         return self._judge(
             (
@@ -299,16 +302,41 @@ class LimitWatch:
         """
         self.skip(missed)
         limits = self._limits
-        percent = 100.0 * missed_so_far / max(scheduled, self._missed_window)
-        before, self.warning = self.warning, False
-        violation = self._judge(
-            (
-                _reading("missed ticks", missed, limits.missed_ticks_in_a_row),
-                _reading("missed share", percent, limits.missed_percent),
-            )
+        return self._judge_share(
+            _reading("missed ticks", missed, limits.missed_ticks_in_a_row),
+            _reading(
+                "missed share", self._percent(missed_so_far, scheduled), limits.missed_percent
+            ),
         )
+
+    def check_stale_share(
+        self, stale_angles: int, stale_wrenches: int, scheduled: int
+    ) -> Violation | None:
+        """Check how many readings did not come, after a tick in which one did not.
+
+        No run of them need be long: a drive that answers every third SYNC has none of more than
+        two ticks, and yet the loop runs on old angles and the record is worth nothing.
+
+        Parameters
+        ----------
+        stale_angles, stale_wrenches, scheduled
+            Ticks with an old angle, ticks with an old wrench, and ticks scheduled, since the
+            record's first.
+        """
+        limit = self._limits.stale_percent
+        return self._judge_share(
+            _reading("stale angle share", self._percent(stale_angles, scheduled), limit),
+            _reading("stale wrench share", self._percent(stale_wrenches, scheduled), limit),
+        )
+
+    def _percent(self, ticks: int, scheduled: int) -> float:
+        return 100.0 * ticks / max(scheduled, self._share_window)
+
+    def _judge_share(self, *readings: _Reading) -> Violation | None:
+        before, self.warning = self.warning, False
+        violation = self._judge(readings)
         # The next sample carries it.
-        self._missed_near, self.warning = self.warning, before or self.warning
+        self._share_near, self.warning = self.warning, before or self.warning
         return violation
 
     def look(

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Final
 
 from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.events import Event, read_events
@@ -33,6 +34,16 @@ _START_PATIENCE_S = 30.0
 _MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
+_COUNTED = {
+    "scheduled": Word.SCHEDULED,
+    "missed": Word.MISSED,
+    "late": Word.LATE,
+    "stale_angles": Word.STALE_ANGLES,
+    "stale_wrenches": Word.STALE_WRENCHES,
+}
+"""What the control process counts on the board, by the names of the outcome."""
+_NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
+
 
 class SessionFailedError(Exception):
     """A session could not be run or ended; the message says why, in the operator's words.
@@ -44,12 +55,13 @@ class SessionFailedError(Exception):
     kept
         Where its record was saved, if that is not the ``.part`` of the file.
     counts
-        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``.
+        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``,
+        ``stale_angles``, ``stale_wrenches``.
     """
 
     path: Path | None = None
     kept: Path | None = None
-    counts: Mapping[str, int] = MappingProxyType({"scheduled": 0, "missed": 0, "late": 0})
+    counts: Mapping[str, int] = _NO_TICKS
 
     def result(self) -> "SessionResult":
         """Return how the session ended, once its processes have."""
@@ -94,6 +106,9 @@ class SessionResult:
     lost: int | None
     fault: bool
     """Something failed, in the record or after it, whatever was asked for meanwhile."""
+    stale_angles: int = 0
+    """Recorded ticks whose angle is an old one; likewise `stale_wrenches`."""
+    stale_wrenches: int = 0
     live_dropped: int = 0
     """Samples that the live view did not get."""
     part: Path | None = None
@@ -116,6 +131,8 @@ class SessionResult:
             "missed": self.missed,
             "late": self.late,
             "lost": self.lost,
+            "stale_angles": self.stale_angles,
+            "stale_wrenches": self.stale_wrenches,
         }
 
 
@@ -323,9 +340,8 @@ class Session:
 
     def _counts(self) -> dict[str, int]:
         board = self._board
-        words = {"scheduled": Word.SCHEDULED, "missed": Word.MISSED, "late": Word.LATE}
         # Before this session's record they stand where the last one left them.
-        return {name: board[word] if board[Word.GO] else 0 for name, word in words.items()}
+        return {name: board[word] if board[Word.GO] else 0 for name, word in _COUNTED.items()}
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -390,7 +406,7 @@ class Session:
         self._crew.recorder.send(close=outcome)
         closed = self._ask_recorder("closed", 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
-        counts = {"scheduled": 0, "missed": 0, "late": 0} | counts | closed.get("counts", {})
+        counts = {**_NO_TICKS, **counts, **closed.get("counts", {})}
         ended, reason = closed.get("outcome", (finished["finished"], finished["reason"]))
         return SessionResult(
             path=None if closed["closed"] is None else Path(closed["closed"]),
@@ -401,6 +417,8 @@ class Session:
             missed=counts["missed"],
             late=counts["late"],
             lost=counts.get("lost", 0),
+            stale_angles=counts["stale_angles"],
+            stale_wrenches=counts["stale_wrenches"],
             fault=finished["fault"] or ended == "fault",
             live_dropped=self._board[Word.LIVE_DROPPED],
         )

@@ -40,6 +40,7 @@ CHANGES = (
     ("stale_ticks_in_a_row = { value = 10", "stale_ticks_in_a_row = { value = 400"),
     ("missed_ticks_in_a_row = { value = 25", "missed_ticks_in_a_row = { value = 400"),
     ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
+    ("stale_percent = { value = 1.0", "stale_percent = { value = 50.0"),
     # A tick that comes late measures where the motor is by then, which looks like a jump.
     ("acceleration_rad_s2 = { value = 1000.0", "acceleration_rad_s2 = { value = 10000.0"),
     ("drive_heartbeat_timeout_s = { value = 0.1", "drive_heartbeat_timeout_s = { value = 1.0"),

@@ -34,6 +34,7 @@ def test_sessions_follow_each_other_on_one_connection(make_session):
     assert (first["finished"], second["finished"]) == ("complete", "complete")
     assert first["counts"] == second["counts"] == {
         "scheduled": 1200, "missed": 0, "late": 0, "lost": 0,
+        "stale_angles": 0, "stale_wrenches": 0,
     }  # fmt: skip
     assert connects == [1]
     assert session.samples["tick"].tolist() == [*range(1200), *range(1200)]

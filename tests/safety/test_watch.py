@@ -180,6 +180,33 @@ def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
     )
 
 
+def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
+    assert watch.check_stale_share(49, 49, 10_000) is None
+    assert watch.take_notices() == []
+    assert watch.check_stale_share(51, 60, 10_000) is None
+    assert watch.check(0.0, 0.0, REST) is None
+    # No angle was old in this tick or the one before: the check of what is old carries it.
+    assert watch.check_stale(angle_stale=False, wrench_stale=False) is None
+    assert watch.warning
+    assert watch.check(0.0, 0.0, REST) is None
+    assert not watch.warning
+    angle, wrench = watch.take_notices()
+    assert angle == (
+        "The part of ticks without a new angle of 0.51 % is past its warning level of 0.5 %; its "
+        "limit is 1 % (limits.stale_percent)."
+    )
+    assert "new wrench of 0.6 %" in wrench
+
+
+@pytest.mark.parametrize(("angles", "wrenches", "which"), [(101, 0, "angle"), (3, 101, "wrench")])
+def test_too_many_old_readings_end_a_session(watch, angles, wrenches, which):
+    assert watch.check_stale_share(100, 100, 10_000) is None
+    violation = watch.check_stale_share(angles, wrenches, 5)  # as if ten seconds had passed
+    assert violation.channel == f"part of ticks without a new {which}"
+    assert (violation.value, violation.limit) == (pytest.approx(1.01), 1.0)
+    assert watch.check_stale_share(400, 400, 40_000) is None
+
+
 def test_a_torque_that_is_no_number_is_never_commanded(watch):
     assert "not a number" in str(watch.check_torque(math.nan))
     assert watch.check_torque(1.0) is None  # cut at 0.9 N·m, and told
