@@ -71,7 +71,8 @@ class Server:
         self._looked_up: set[int] = set()
         self._count = 0
         self._closed = False
-        self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+        self._spare: int | None = None
+        self._hold_a_spare()
 
     def serve(self, service: Service) -> None:
         """Accept clients from now on, from the running event loop."""
@@ -98,7 +99,7 @@ class Server:
             self._dismiss(client)
         while self._leaving:  # which takes no longer than `_FAREWELL_S`
             await asyncio.sleep(0.01)
-        os.close(self._spare)
+        self._give_the_spare()
 
     def forget(self, client: "_Client") -> None:
         """Take note that a client is gone."""
@@ -127,9 +128,10 @@ class Server:
             except BlockingIOError:
                 return
             except OSError as error:
-                if error.errno in (errno.EMFILE, errno.ENFILE):
-                    self._turn_away()
-                return
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    return
+                self._turn_away()
+                break
             self._welcome(link)
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._listener)
@@ -245,14 +247,26 @@ class Server:
         """Take a client off the queue although there is no descriptor for it."""
         if self._let_a_silent_one_go():
             return  # its descriptor is free now
-        os.close(self._spare)
+        if self._spare is None:
+            self._hold_a_spare()
+        self._give_the_spare()
         with suppress(OSError):
             link, _ = self._listener.accept()
             silent = self._introduced(link)
             with suppress(BlockingIOError):
                 silent.said += link.recv(LONGEST_LINE)
             self._answer_if_stop(silent)
-        self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+        self._hold_a_spare()
+
+    def _hold_a_spare(self) -> None:
+        """Keep a descriptor with which somebody can be accepted when there are no others left."""
+        with suppress(OSError):
+            self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+
+    def _give_the_spare(self) -> None:
+        spare, self._spare = self._spare, None
+        if spare is not None:
+            os.close(spare)
 
 
 @dataclass(slots=True)
