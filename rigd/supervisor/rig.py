@@ -234,7 +234,9 @@ class Rig:
         still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
             crew.control.kill()
-            message = {"ended": f"The control process has not moved for {still_s:.1f} s."}
+            message = {
+                "ended": f"The control process has not moved for {still_s:.1f} s. Check CPU load."
+            }
         if message is not None:
             self.disconnect()
             raise RigError(message.get("ended") or "The control process was asked to end.")
@@ -309,7 +311,7 @@ class Rig:
         if answer is None:
             raise RigError(
                 f"The control process does not answer within {patience_s:g} s; see whether the "
-                "devices are on."
+                "devices are on, and check CPU load."
             )
         if "ended" in answer:
             raise RigError(answer["ended"] or "It was stopped.")

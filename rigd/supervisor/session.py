@@ -289,7 +289,7 @@ class Session:
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
             still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
-                return self._kill_control(f"has not moved for {hung_after_s:g} s")
+                return self._kill_control(f"has not moved for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
                 return self._understood(answer)
             if self._recorder_lost is None:
@@ -366,7 +366,8 @@ class Session:
             self._report()
         if message is None:
             raise SessionFailedError(
-                f"The recorder process does not answer within {patience_s:g} s."
+                f"The recorder process does not answer within {patience_s:g} s. Check CPU load and "
+                "disk."
             )
         if "error" in message:
             self._note_kept(message)
