@@ -1,9 +1,10 @@
 """The checks of the loop, and the notices of what comes near a limit."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import exp, inf, isfinite, sqrt
 
-from rigd.safety.interlocks import BY_NAME
+from rigd.safety.interlocks import BY_NAME, OVERLOADED
 from rigd.safety.limits import Limits
 from rigd.safety.violation import Violation
 
@@ -19,6 +20,9 @@ REARM_S = 1.0
 
 _UNSURE_TICKS = 3
 """After missed ticks the next latches come unevenly, and no jump can be told from that."""
+
+_BLAMED_S = 0.005
+"""A standstill of the loop as long as this explains what a limit finds right after it."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _FORCES = 3
@@ -70,6 +74,8 @@ class LimitWatch:
         "_last_look_ns",
         "_limits",
         "_looks",
+        "_missed_lately",
+        "_missed_look",
         "_notices",
         "_peak_nm",
         "_per_tick2_rad",
@@ -141,6 +147,7 @@ class LimitWatch:
         self._stale_wrenches = 0
         self._saturated = 0
         self._unsure = 0
+        self._missed_lately = self._missed_look = 0
         self._share_near = False
         self._slowly_near = False
         self.warning = False
@@ -148,6 +155,23 @@ class LimitWatch:
     def skip(self, missed: int) -> None:
         """Tell the next check that ``missed`` ticks passed unseen: the speed is taken over them."""
         self._elapsed += missed
+        if missed:
+            self._missed_lately = missed + (self._missed_lately if self.after_missed else 0)
+            self._missed_look = self._looks
+
+    @property
+    def after_missed(self) -> str:
+        """Say how many ticks were missed just before, for who reports what came of it; or nothing.
+
+        Just before is within the last 64 to 128 ticks.
+        """
+        missed = self._missed_lately
+        if not missed or self._looks - self._missed_look > 1:
+            return ""
+        ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
+        if missed < _BLAMED_S * self._rate_hz:
+            return f"It came after {ticks}."
+        return f"It came after {ticks}. {OVERLOADED}"
 
     def check(
         self,
@@ -336,7 +360,8 @@ class LimitWatch:
         before, self.warning = self.warning, False
         violation = self._judge(readings)
         # The next sample carries it.
-        self._share_near, self.warning = self.warning, before or self.warning
+        self._share_near = self._share_near or self.warning
+        self.warning = before or self.warning
         return violation
 
     def look(
@@ -409,7 +434,7 @@ class LimitWatch:
                 near.append(reading)
         if worst is not None:
             self.warning = True
-            return _violation(worst, warns=False)
+            return self._left(worst)
         for reading in near:
             self.warning = True
             channel = reading[1] or reading[0]
@@ -417,6 +442,15 @@ class LimitWatch:
                 self._notices.append(str(_violation(reading, warns=True)))
             self._warned[channel] = self._looks
         return None
+
+    def _left(self, reading: _Reading) -> Violation:
+        """Say what is beyond its limit, and of the beam only what is not the computer's doing."""
+        violation, missed = _violation(reading, warns=False), self.after_missed
+        if not missed or not BY_NAME[reading[0]].follows_missed_ticks:
+            return violation
+        if OVERLOADED not in missed:
+            missed = f"{missed} {violation.remedy}"
+        return replace(violation, remedy=missed)
 
 
 def _part(name: str) -> float:

@@ -17,6 +17,7 @@ from rigd.engine.events import Event, read_events
 from rigd.engine.jobs import RecorderJob, SessionJob
 from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import CONTROL, RECORDER, Pulse
+from rigd.engine.realtime import REFUSED
 from rigd.engine.reference import put_reference
 from rigd.engine.ring import Observer
 from rigd.engine.signals import StopRequest
@@ -241,7 +242,8 @@ class Session:
         self._open_file()
         order = self._order
         self._control_at_work = True
-        crew.control.send_object("session", SessionJob(order.profile, reference))
+        job = SessionJob(order.profile, reference, self._refused_to_supervision())
+        crew.control.send_object("session", job)
         answer = self._listen_to_control()
         if "ready" in answer:
             crew.recorder.send(begin=file_header(order, self._connected, answer["ready"]))
@@ -255,18 +257,32 @@ class Session:
     def _open_file(self) -> None:
         """Have the file made, under another name if somebody else has just taken the one chosen."""
         crew = self._crew
+        realtime = None if self._virtual else self._order.profile.realtime
         for _ in range(_MOST_NAMES):
-            job = RecorderJob(self._order.path, crew.channels.specs)
+            job = RecorderJob(self._order.path, crew.channels.specs, realtime)
             crew.fresh(RECORDER).start(job)
             try:
-                self._ask_recorder("opened", _START_PATIENCE_S)
+                opened = self._ask_recorder("opened", _START_PATIENCE_S)
             except _NameTakenError as error:
                 taken = error
                 self._order = replace(self._order, path=another_path(self._order.path))
             else:
                 self._opened = self._order.path
+                granted = {f"recorder_{name}": text for name, text in opened["realtime"].items()}
+                self._connected = {
+                    **self._connected,
+                    "realtime": self._connected["realtime"] | granted,
+                }
                 return
         raise taken
+
+    def _refused_to_supervision(self) -> dict[str, str]:
+        """Return what the scheduler did not grant supervisor and recorder, and why."""
+        return {
+            name: text
+            for name, text in self._connected["realtime"].items()
+            if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
+        }
 
     def _listen_to_control(self) -> Message:
         """Wait for the control process's next message, watching everybody meanwhile."""
@@ -290,7 +306,7 @@ class Session:
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
             still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
-                return self._kill_control(f"has not moved for {hung_after_s:g} s")
+                return self._kill_control(f"has not moved for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
                 return self._understood(answer)
             if self._recorder_lost is None:
@@ -366,7 +382,8 @@ class Session:
             self._report()
         if message is None:
             raise SessionFailedError(
-                f"The recorder process does not answer within {patience_s:g} s."
+                f"The recorder process does not answer within {patience_s:g} s. Check CPU load and "
+                "disk."
             )
         if "error" in message:
             self._note_kept(message)

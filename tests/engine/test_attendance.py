@@ -188,7 +188,9 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
     session.run()
     session.assert_safe()
     assert session.finished["finished"] == "fault"
-    assert "supervising process has not moved" in session.finished["reason"]
+    assert session.finished["reason"] == (
+        "Supervisor watchdog timeout (2 s); session aborted. Check CPU load."
+    )
     samples = session.samples
     assert 2900 < len(samples) < 3300
     assert samples["status"][-1] & Status.TORQUE_OFF

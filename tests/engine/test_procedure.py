@@ -368,6 +368,30 @@ def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):
     assert_books_balance(session, samples)
 
 
+def test_a_drive_that_ends_right_after_missed_ticks_ended_for_the_computers_sake(make_session):
+    session = make_session(clock=LateAt({3_000_000_000: 40_200_000}))
+
+    def fail(_):
+        raise DeviceError("The drive reports an error.")
+
+    read = session.drive.read_angle
+
+    def read_angle():
+        # Its watchdog has acted meanwhile.
+        if session.clock.now_ns() > 3_001_000_000 and session.drive.enabled:
+            fail(0.0)
+        return read()
+
+    session.drive.read_angle = read_angle
+    session.run()
+    session.assert_safe()
+    assert session.finished["counts"]["missed"] == 40
+    assert session.finished["reason"] == (
+        "The drive reports an error. It came after 40 missed ticks. "
+        "The computer is overloaded: close other programs."
+    )
+
+
 def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
     session = make_session()
     session.run()
@@ -487,6 +511,18 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
     assert session.parent.said("connected")[0]["realtime"] == session.obtained
+
+
+def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session):
+    session = make_session()
+    order = session.order()
+    refused = {"supervisor_scheduling": "refused: not permitted"}
+    session.obey({"session": replace(order["session"], refused=refused)})
+    [warning] = [event for event in session.events if event.level == "warning"]
+    assert warning.message == (
+        "The system did not grant supervisor_scheduling (refused: not permitted): a computer that "
+        "is busy with other programs may end the session."
+    )
 
 
 def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):

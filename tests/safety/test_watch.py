@@ -227,3 +227,56 @@ def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
         RefusedError, match=r"75\.0 MB .* limits\.disk_free_mb = 50 MB .* make room"
     ):
         make_room(tmp_path / "sessions", excitation, LIMITS)
+
+
+OVERLOADED = "The computer is overloaded: close other programs."
+
+
+def left_behind(watch):
+    """Have the shaft fall far behind its reference, and return what is said of it."""
+    return str(watch.check(2.0 * LIMITS.tracking_error_rad, 0.0, REST))
+
+
+def test_what_a_limit_finds_right_after_a_standstill_is_the_computers_doing(watch):
+    assert "lower the amplitude" in left_behind(watch)
+    watch.reset(0.0)
+    assert watch.check_missed(20, 20, 1000) is None
+    said = left_behind(watch)
+    assert said.endswith(f"It came after 20 missed ticks. {OVERLOADED}")
+    assert "amplitude" not in said
+
+
+def test_missed_ticks_of_several_gaps_are_told_together(watch):
+    watch.skip(4)
+    assert watch.after_missed == "It came after 4 missed ticks."
+    watch.skip(5)
+    assert watch.after_missed == f"It came after 9 missed ticks. {OVERLOADED}"
+
+
+def test_a_tick_or_two_do_not_acquit_the_beam(watch):
+    watch.skip(1)
+    said = left_behind(watch)
+    assert "It came after 1 missed tick." in said
+    assert "lower the amplitude" in said
+    assert OVERLOADED not in said
+
+
+def test_missed_ticks_are_forgotten_after_two_looks(watch):
+    watch.skip(20)
+    watch.look(0)
+    assert watch.after_missed
+    watch.look(LOOK_EVERY * PERIOD_NS)
+    assert watch.after_missed == ""
+    assert "amplitude" in left_behind(watch)
+
+
+def test_missed_ticks_are_not_to_blame_for_what_they_cannot_do(watch):
+    watch.skip(20)
+    violation = watch.look(0, disk_free_mb=0.5 * LIMITS.disk_free_mb)
+    assert "missed" not in str(violation)
+
+
+def test_a_new_session_starts_without_the_missed_ticks_of_the_last_one(watch):
+    watch.skip(20)
+    watch.reset(0.0)
+    assert watch.after_missed == ""
