@@ -62,8 +62,8 @@ def with_values(text: str, values: dict[str, object]) -> str:
         return f'{{ value = {plain}, source = "assumed" }}' if number else plain
 
     def close() -> None:
-        for key in [k for k in left if k.rpartition(".")[0] == section]:
-            lines.append(f"{key.rpartition('.')[2]} = {shown(left.pop(key))}")
+        new = [key for key in left if key.rpartition(".")[0] == section]
+        lines.extend(f"{key.rpartition('.')[2]} = {shown(left.pop(key))}" for key in new)
 
     for line in text.splitlines():
         if line.startswith("["):
