@@ -12,7 +12,7 @@ and the drive right before the first tick: once it is operational it expects one
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 Wrench = tuple[float, float, float, float, float, float]
 """fx, fy, fz in N and tx, ty, tz in N·m, in the sensor's frame, as read (not tared)."""
@@ -116,6 +116,14 @@ class Drive(Protocol):
 
     def close(self) -> None:
         """Release the line; disables first."""
+
+
+@runtime_checkable
+class StatedDrive(Protocol):
+    """A drive with safeguards of its own, which a session's file has to state."""
+
+    def statement(self) -> dict[str, str]:
+        """Return them as keys of the file's metadata; known once it is connected."""
 
 
 class WrenchSensor(Protocol):

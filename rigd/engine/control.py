@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
-from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.contracts import DeviceError, Devices, StatedDrive
 from rigd.devices.registry import open_devices
 from rigd.engine.board import Phase, Word
 from rigd.engine.channels import Channels, attach_channels
@@ -88,13 +88,15 @@ def attend(
     try:
         # The drive last: once it is operational it expects a SYNC every period.
         devices.sensor.connect()
-        devices.drive.connect()
+        drive = devices.drive
+        drive.connect()
         attendance = _Attendance(profile, devices, clock, channels, parent, stop, obtained)
         channels.board[Word.PHASE] = Phase.OFF
         attendance.take_up_standstill()
         parent.send(
             connected=True,
             calibration=devices.sensor.calibration(),
+            drive=drive.statement() if isinstance(drive, StatedDrive) else {},
             realtime=obtained,
             simulated=devices.simulated,
         )

@@ -53,6 +53,7 @@ def _metadata(order: Order, connected: Message, tare: Message) -> dict[str, str]
         "software": f"rigd {__version__}",
         "host": platform.node(),
         **{f"realtime_{name}": value for name, value in connected["realtime"].items()},
+        **connected.get("drive", {}),
         **tare,
         **dict(order.notes),
     }

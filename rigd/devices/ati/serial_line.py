@@ -63,7 +63,7 @@ class SerialLine:
         self._selectable = [self._fd]
         self.low_latency = False
         # Not every driver offers it; pyserial then reports a value it could not set.
-        with suppress(ValueError, OSError):
+        with suppress(ValueError, OSError, termios.error):
             self._serial.set_low_latency_mode(True)
             self.low_latency = True
 
@@ -101,8 +101,19 @@ class SerialLine:
             raise self._gone(error.strerror) from None
 
     def wait(self, timeout_s: float) -> None:
-        """Return as soon as something may have arrived, or after the timeout."""
-        select.select(self._selectable, (), (), timeout_s)
+        """Return as soon as something may have arrived, or after the timeout.
+
+        Raises
+        ------
+        DeviceError
+            If the line is gone.
+        """
+        try:
+            select.select(self._selectable, (), (), timeout_s)
+        except OSError as error:
+            raise self._gone(error.strerror) from None
+        except ValueError as error:  # a descriptor beyond what select knows
+            raise self._gone(str(error)) from None
 
     def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:
         """Send a request and return what comes: `length` bytes or more, or fewer if no more come.
@@ -139,7 +150,7 @@ class SerialLine:
 
     def close(self) -> None:
         """Release the port; harmless when repeated."""
-        with suppress(OSError):
+        with suppress(OSError, termios.error):
             self._serial.close()
 
     def _gone(self, why: str | None) -> DeviceError:

@@ -17,10 +17,13 @@ SFF_MASK = 0x7FF
 
 BUS_OFF = 0x40
 """Class of an error frame: the controller has switched itself off after too many errors."""
+_PROTOCOL_VIOLATION = 0x08
 
 _FRAME = Struct("=IB3x8s")
 BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
 """What the kernel reports then."""
+DAMAGED_FRAME = _FRAME.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
+"""What stands in for a frame that came damaged; it is counted, and nothing else follows."""
 LENGTH_AT = 4
 """Where the number of data bytes stands in a raw frame."""
 read_head = Struct("=IB").unpack_from

@@ -8,7 +8,14 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Protocol
 
-from rigd.devices.canbus.frame import ERROR_MASK, FRAME_SIZE, SFF_MASK
+from rigd.devices.canbus.frame import (
+    DAMAGED_FRAME,
+    ERROR_FLAG,
+    ERROR_MASK,
+    FRAME_SIZE,
+    SFF_MASK,
+    read_head,
+)
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.simulator import SimulatorAddress
@@ -21,10 +28,16 @@ _RECEIVE_BUFFER = 212_992
 # As much as the system allows: a simulated rig that stands still is told by its silence.
 _SIMULATOR_SEND_BUFFER = 4_194_304
 _CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
+_DAMAGED_IN_A_ROW = 20
+"""Frames that an adapter cannot read, without a sound one in between, that end a session."""
 
 
 class CanPort(Protocol):
-    """One connection to a bus. Nothing here blocks, but for `wait`."""
+    """One connection to a bus. Nothing here blocks, but for `wait`.
+
+    Whatever an adapter's driver raises leaves every method as a `DeviceError`, but for `close`,
+    which raises nothing.
+    """
 
     name: str
     """Of the bus, for messages."""
@@ -41,6 +54,8 @@ class CanPort(Protocol):
     def receive(self) -> bytes | None:
         """Return the next frame that has arrived, of 16 bytes, or None.
 
+        One that came damaged is returned as an error frame.
+
         Raises
         ------
         DeviceError
@@ -48,12 +63,23 @@ class CanPort(Protocol):
         """
 
     def wait(self, timeout_s: float) -> None:
-        """Return as soon as a frame may have arrived, or after the timeout."""
+        """Return as soon as a frame may have arrived, or after the timeout.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is gone.
+        """
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
         """Let in only these identifiers from now on, and what the controller says of itself.
 
         None lets in everything again.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is gone.
         """
 
     def open_bus(self) -> "can.BusABC":
@@ -108,7 +134,10 @@ class SocketPort:
 
     def wait(self, timeout_s: float) -> None:
         """Wait for a frame."""
-        select.select(self._fd, (), (), timeout_s)
+        try:
+            select.select(self._fd, (), (), timeout_s)
+        except (OSError, ValueError) as error:
+            raise DeviceError(self._why("cannot be waited for", error)) from None
 
     def accept(self, can_ids: Iterable[int] | None) -> None:
         """Have the kernel drop all other identifiers; a simulated bus brings them all."""
@@ -116,7 +145,10 @@ class SocketPort:
             exactly = SFF_MASK | socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG
             wanted = [(0, 0)] if can_ids is None else [(i, exactly) for i in sorted(set(can_ids))]
             filters = b"".join(struct.pack("=II", *each) for each in wanted)
-            self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+            try:
+                self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+            except OSError as error:
+                raise DeviceError(self._why("takes no filter", error)) from None
 
     def open_bus(self) -> "can.BusABC":
         """Return a python-can bus that sends and receives through this port."""
@@ -129,17 +161,26 @@ class SocketPort:
         with suppress(OSError):
             self._link.close()
 
-    def _why(self, what: str, error: OSError) -> str:
+    def _why(self, what: str, error: OSError | ValueError) -> str:
+        reason, number = str(error), None
+        if isinstance(error, OSError):
+            reason, number = error.strerror or reason, error.errno
         remedy = (
             "no other device acknowledges: look at cable, termination, power and bit rate"
-            if error.errno in (errno.ENOBUFS, errno.EAGAIN)
+            if number in (errno.ENOBUFS, errno.EAGAIN)
             else self._remedy
         )
-        return f"CAN bus {self.name}: it {what} ({error.strerror}); {remedy}."
+        return f"CAN bus {self.name}: it {what} ({reason}); {remedy}."
 
 
 class PythonCanPort:
-    """Any adapter that python-can knows. It costs about three times what a socket costs."""
+    """Any adapter that python-can knows. It costs about three times what a socket costs.
+
+    An adapter's driver says by `can.CanError` or OSError that the adapter has failed. Anything else
+    that it raises while it receives is a frame that it could not read: the parser of slcan raises
+    ValueError for a damaged line. One such frame is an error on the line, and many in a row are an
+    adapter that has failed.
+    """
 
     def __init__(self, bus: "can.BusABC", name: str) -> None:
         import can
@@ -150,14 +191,18 @@ class PythonCanPort:
         self._to_message, self._from_message = to_message, from_message
         self._error = can.CanError
         self._next: bytes | None = None
+        self._damaged_in_a_row = 0
         self.name = name
 
     def send(self, frame: bytes) -> None:
         """Send one frame of 16 bytes."""
         try:
             self._bus.send(self._to_message(frame), timeout=0.0)
-        except (self._error, OSError) as error:
-            raise DeviceError(f"CAN bus {self.name}: it takes no more frames ({error}).") from None
+        except Exception as error:
+            raise DeviceError(
+                f"CAN bus {self.name}: it takes no more frames ({_words(error)}); look at cable "
+                "and adapter."
+            ) from None
 
     def receive(self) -> bytes | None:
         """Return the next frame, or None."""
@@ -182,15 +227,36 @@ class PythonCanPort:
 
     def close(self) -> None:
         """Shut the adapter down."""
-        with suppress(self._error, OSError):
+        with suppress(Exception):
             self._bus.shutdown()
 
     def _receive(self, timeout_s: float) -> bytes | None:
         try:
             message = self._bus.recv(timeout_s)
+            raw = None if message is None else self._from_message(message)
         except (self._error, OSError) as error:
-            raise DeviceError(f"CAN bus {self.name}: it cannot be read ({error}).") from None
-        return None if message is None else self._from_message(message)
+            raise DeviceError(
+                f"CAN bus {self.name}: it cannot be read ({_words(error)}); look at cable and "
+                "adapter."
+            ) from None
+        except Exception as error:
+            self._damaged_in_a_row += 1
+            if self._damaged_in_a_row < _DAMAGED_IN_A_ROW:
+                return DAMAGED_FRAME
+            self._damaged_in_a_row = 0
+            raise DeviceError(
+                f"CAN bus {self.name}: the adapter sends what is no CAN frame, "
+                f"{_DAMAGED_IN_A_ROW} times in a row ({_words(error)}); look at the adapter, its "
+                "cable and its firmware."
+            ) from None
+        if raw is not None and not read_head(raw)[0] & ERROR_FLAG:
+            self._damaged_in_a_row = 0
+        return raw
+
+
+def _words(error: Exception) -> str:
+    """Return what an adapter's driver says, and by which error: some say nothing else."""
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
@@ -222,9 +288,10 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
         bus = can.Bus(
             interface=settings.interface, channel=settings.channel, bitrate=settings.bitrate_bit_s
         )
-    except (can.CanError, OSError, ValueError, ImportError) as error:
+    except Exception as error:
         raise DeviceError(
-            f"CAN bus {name}: it cannot be opened ({error}); check can.interface and can.channel."
+            f"CAN bus {name}: it cannot be opened ({_words(error)}); check can.interface and "
+            "can.channel."
         ) from None
     return PythonCanPort(bus, name)
 

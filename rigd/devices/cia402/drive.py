@@ -13,8 +13,13 @@ from rigd.devices.cia402.following import TorqueFollowing
 from rigd.devices.cia402.frames import NodeFrames
 from rigd.devices.cia402.inbox import Inbox
 from rigd.devices.cia402.node import Node
-from rigd.devices.cia402.objects import HEARTBEAT_CONSUMER
-from rigd.devices.cia402.setup import set_up
+from rigd.devices.cia402.objects import (
+    ACTUAL_TORQUE,
+    HEARTBEAT_CONSUMER,
+    HEARTBEAT_PRODUCER_MS,
+)
+from rigd.devices.cia402.requirements import Watchdog
+from rigd.devices.cia402.setup import Outfit, set_up
 from rigd.devices.cia402.standing import reset_fault
 from rigd.devices.cia402.states import (
     DISABLE_VOLTAGE,
@@ -74,11 +79,18 @@ class Cia402Drive:
         self._rad_per_count = rig.encoder.resolution_rad * settings.direction
         self._per_mille_per_nm = 1000 * settings.direction / rig.motor.rated_torque_nm
         self._limit = torque_limit_per_mille(rig)
-        self._following = TorqueFollowing(self._name, settings.torque_tolerance_percent)
+        self._following = TorqueFollowing(
+            self._name,
+            settings.torque_tolerance_percent,
+            settings.torque_response_s,
+            1 / rig.rate_hz,
+        )
         self._open = False
         self._subscribed: CanExchange | None = None
         self._node: Node | None = None
-        self._identity: dict[str, object] = {}
+        self._outfit: Outfit | None = None
+        self._listens = True
+        self._keeps_deadline = False
         self._enabled = False
         self._may_be_on = False
         self._guard_mask, self._guard_value = FAULT_BIT, 0
@@ -112,11 +124,17 @@ class Cia402Drive:
         self._enabled = self._may_be_on = False
         self._guard_mask, self._guard_value = FAULT_BIT, 0
         self._inbox.clear()
-        self._identity = set_up(exchange.port, self._rig, self._name)
+        outfit = self._outfit = set_up(exchange.port, self._rig, self._name)
+        has_torque = outfit.has(ACTUAL_TORQUE)
+        self._inbox.expect(with_torque=has_torque)
+        self._following.compares = has_torque
+        # Without a heartbeat of its own the drive is heard by its TPDOs alone.
+        self._listens = outfit.has(HEARTBEAT_PRODUCER_MS)
+        self._keeps_deadline = outfit.watchdog is Watchdog.RPDO_DEADLINE
         self._subscribe(exchange)
         exchange.start()
         node = self._node = Node(self._rig, exchange, self._frames, self._inbox)
-        node.go_operational()
+        node.go_operational(beats=self._listens)
         node.await_first_reply()
         self._position, self._counts = self._inbox.position, 0
         self.angle_rad = 0.0
@@ -134,9 +152,41 @@ class Cia402Drive:
         dict
             ``vendor_id``, ``product_code``, ``revision``, ``serial_number`` (None where it has
             none), ``device_name``, ``supported_modes`` (object 6502), ``rated_torque_counts``
-            (6076) and, where the profile gives its unit, ``rated_torque_nm`` at the output shaft.
+            (6076) and, where the profile gives its unit, ``rated_torque_nm`` at the output shaft;
+            ``quick_stop_option`` (605A) and ``fault_reaction_option`` (605E) where it has them.
         """
-        return dict(self._identity)
+        return {} if self._outfit is None else dict(self._outfit.identity)
+
+    def outfit(self) -> Outfit | None:
+        """Return what the drive turned out to have at :meth:`connect`, or None before."""
+        return self._outfit
+
+    def statement(self) -> dict[str, str]:
+        """Return what a session's file has to say of the drive's own safeguards.
+
+        Returns
+        -------
+        dict
+            ``drive_watchdog`` and ``drive_watchdog_s``; where the drive lacks something that the
+            profile accepts by name, ``drive_without``; where something stands in for an object,
+            ``drive_stand_ins``; objects that the profile has set, ``drive_objects_set``.
+        """
+        outfit = self._outfit
+        if outfit is None:
+            return {}
+        told = {
+            "drive_watchdog": outfit.watchdog.value,
+            "drive_watchdog_s": repr(outfit.watchdog_s),
+        }
+        stand_ins = [f"{row.place}: {row.stand_in}" for row in outfit.lacks if row.stand_in]
+        for key, texts in (
+            ("drive_without", outfit.accepted),
+            ("drive_stand_ins", stand_ins),
+            ("drive_objects_set", outfit.assigned),
+        ):
+            if texts:
+                told[key] = "; ".join(texts)
+        return told
 
     def enable(self) -> None:
         """Bring the drive to operation enabled, at zero torque.
@@ -160,8 +210,9 @@ class Cia402Drive:
             raise
         self._enabled = True
         self._following.start()
-        self._guard_mask = STATE_BITS | FOLLOWS_TARGET
-        self._guard_value = ENABLED | FOLLOWS_TARGET
+        follows = FOLLOWS_TARGET if node.settings.follows_target_bit else 0
+        self._guard_mask = STATE_BITS | follows
+        self._guard_value = ENABLED | follows
         node.resume()
 
     def latch(self, due_ns: int) -> None:
@@ -180,6 +231,9 @@ class Cia402Drive:
         node = self._connected()
         if not self._same_tick:
             self._settle_previous(node)
+        if self._keeps_deadline and not self._enabled:
+            # The drive times the RPDOs from the first on, also while nobody commands a torque.
+            node.exchange.send(self._idle)
         node.send_sync_or_pause()
         self._awaiting = True
         node.now_ns = node.now_ns + node.period_ns if node.lock_step else due_ns
@@ -204,7 +258,7 @@ class Cia402Drive:
                 self._settle(node)
             node.send_heartbeat()
         inbox = self._inbox
-        if inbox.heard:
+        if inbox.heard or not self._listens:
             inbox.heard = False
             self._heard_ns = node.now_ns
         if (
@@ -252,10 +306,10 @@ class Cia402Drive:
         exchange = self._node.exchange
         pairing = self._node.pairing
         unproven = pairing.unproven
+        how = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
         doubt = (
             f"{self._name}: {unproven} of its TPDOs did not come, or all come later by as many "
-            "periods since, which cannot be told in lock-step: angles may be older than the file "
-            "states."
+            f"periods since, which cannot be told {how}: angles may be older than the file states."
             if unproven
             else ""
         )
@@ -282,9 +336,8 @@ class Cia402Drive:
         else:
             self.off_doubt = (
                 f"{self._name}: it does not show that it is off (statusword "
-                f"0x{self._inbox.statusword:04X}); see that it is, by its STO if need be. Without "
-                "the loop's heartbeat it has to switch itself off within "
-                f"cia402.heartbeat_timeout_s = {node.settings.heartbeat_timeout_s:g} s."
+                f"0x{self._inbox.statusword:04X}); see that it is, by its STO if need be. "
+                f"{self._own_end()}"
             )
         node.resume()
 
@@ -318,10 +371,21 @@ class Cia402Drive:
         node, self._node = self._node, None
         if node is not None and not self._may_be_on:
             node.send_if_possible(self._frames.pre_operational)
-            node.write(self._frames.forget_heartbeat, HEARTBEAT_CONSUMER, 1)
+            if self._outfit is not None and self._outfit.watchdog is Watchdog.HEARTBEAT:
+                node.write(self._frames.forget_heartbeat, HEARTBEAT_CONSUMER, 1)
         if self._open:
             self._open = False
             self._link.close()
+
+    def _own_end(self) -> str:
+        """Return how a drive ends that nobody can switch off, as a sentence."""
+        outfit = self._outfit
+        if outfit is None or outfit.watchdog is Watchdog.NONE:
+            return "It has no watchdog that would end it by itself."
+        return (
+            "Without the loop it has to switch itself off within "
+            f"{outfit.watchdog_s:g} s, by its {outfit.watchdog.value}."
+        )
 
     def _connected(self) -> Node:
         if self._node is None:

@@ -34,6 +34,8 @@ NMT_STATES: Final = {
 unpack_tpdo = Struct("<Hih").unpack
 """Statusword, position in counts, torque in 1/1000 of the rated one; ``struct.error`` if the
 length is not 8."""
+unpack_short_tpdo = Struct("<Hi").unpack
+"""The same of a drive that does not tell its torque."""
 _unpack_emergency = Struct("<HB").unpack_from
 _pack_rpdo = Struct("<Hh4x").pack
 _pack_sdo = Struct("<BHBI").pack

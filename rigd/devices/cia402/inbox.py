@@ -8,6 +8,7 @@ from rigd.devices.cia402.frames import (
     NMT_STATES,
     OPERATIONAL,
     read_emergency,
+    unpack_short_tpdo,
     unpack_tpdo,
 )
 from rigd.devices.contracts import wired_stop_dropped
@@ -48,6 +49,8 @@ class Inbox:
         The last SDO reply.
     malformed : int
         Frames of the wrong length.
+    with_torque : bool
+        TPDOs end in the actual torque.
     """
 
     __slots__ = (
@@ -65,13 +68,19 @@ class Inbox:
         "sto_error_code",
         "torque",
         "watching",
+        "with_torque",
     )
 
     def __init__(self, name: str, sto_error_code: int = 0) -> None:
         self.name = name
         self.sto_error_code = sto_error_code
         self.malformed = 0
+        self.with_torque = True
         self.clear()
+
+    def expect(self, *, with_torque: bool) -> None:
+        """Take TPDOs with the actual torque, or those of a drive that does not tell it."""
+        self.with_torque = with_torque
 
     def clear(self) -> None:
         """Forget everything but the number of malformed frames."""
@@ -91,7 +100,10 @@ class Inbox:
         """Take statusword and position."""
         self.replies += 1
         try:
-            self.statusword, self.position, self.torque = unpack_tpdo(data)
+            if self.with_torque:
+                self.statusword, self.position, self.torque = unpack_tpdo(data)
+            else:
+                self.statusword, self.position = unpack_short_tpdo(data)
             self.legible = True
         except LengthError:
             self.legible = False

@@ -19,8 +19,6 @@ _FIRST_REPLY_NS = 100_000_000
 _FIRST_REPLIES = 20
 """SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""
 _WRITTEN_NS = 50_000_000
-_LOOK_AGAIN_NS = 200_000
-_LOOKS = 500
 _REASON_NS = 5_000_000
 """How long a drive in fault has to say why."""
 
@@ -64,15 +62,21 @@ class Node:
         self.period_ns = round(1e9 / rig.rate_hz)
         self.deadline_ns = round(rig.acquisition.deadline_us * 1000)
         self.lock_step = self.deadline_ns > self.period_ns
-        self.pairing = ReplyPairing(inbox, pauses=not self.lock_step)
+        pauses = self.settings.sync_gaps and not self.lock_step
+        self.pairing = ReplyPairing(inbox, pauses=pauses)
         self.sync_ns = 0
         self.now_ns = 0
         self._reset_command = f"rigd reset --profile {rig.name}"
         self._heartbeat_ns = round(self.settings.heartbeat_period_s * 1e9)
         self._next_heartbeat_ns = _LONG_AGO_NS
 
-    def go_operational(self) -> None:
+    def go_operational(self, *, beats: bool = True) -> None:
         """Start the node and wait for the heartbeat that says so.
+
+        Parameters
+        ----------
+        beats
+            The drive has a heartbeat; without one its first TPDO has to say it.
 
         Raises
         ------
@@ -82,6 +86,9 @@ class Node:
         inbox = self.inbox
         inbox.nmt_state = None
         self.exchange.send(self.frames.start)
+        if not beats:
+            inbox.watching = True
+            return
         period_s = self.settings.drive_heartbeat_period_s
         if self.lock_step:
             # Its time does not pass without SYNC, not even up to its next heartbeat.
@@ -170,12 +177,11 @@ class Node:
 
     def sync_if_possible(self) -> bool:
         """Send SYNC whatever the bus reports, and return whether it was answered; never raises."""
-        self._drain_quietly()  # what has come is no answer
-        self.pairing.ask()
-        self.sync_ns = time.monotonic_ns()
-        self.send_if_possible(self.frames.sync)
-        patience_ns = self.deadline_ns if self.lock_step else self.period_ns
-        return self._await_quietly(self._is_answered, patience_ns)
+        with self.exchange.regardless():
+            self.exchange.drain()  # what has come is no answer
+            self.pairing.ask()
+            self.sync_ns = time.monotonic_ns()
+            return self.send_if_possible(self.frames.sync) and self.await_reply()
 
     def await_grid(self, grid_ns: int) -> None:
         """Wait for the next SYNC as the ticks will go on: whole periods after `grid_ns`."""
@@ -188,16 +194,15 @@ class Node:
         """Send an SDO request to write, and return whether it was confirmed in time."""
         inbox = self.inbox
         inbox.reply = b""
-        return self.send_if_possible(request) and self._await_quietly(
-            lambda: is_written(inbox.reply, index, sub), _WRITTEN_NS
-        )
+        return self._ask_if_possible(request, lambda: is_written(inbox.reply, index, sub))
 
     def is_off(self) -> bool:
         """Ask the drive for its statusword by SDO, and return whether it shows the drive off."""
         inbox = self.inbox
         inbox.reply = b""
-        if self.send_if_possible(self.frames.ask_statusword):
-            self._await_quietly(lambda: read_statusword(inbox.reply) is not None, _WRITTEN_NS)
+        self._ask_if_possible(
+            self.frames.ask_statusword, lambda: read_statusword(inbox.reply) is not None
+        )
         statusword = read_statusword(inbox.reply)
         return statusword is not None and state_of(statusword) in OFF
 
@@ -242,31 +247,12 @@ class Node:
             )
         raise DeviceError(reason)
 
-    def _await_quietly(self, ready: Callable[[], bool], patience_ns: int) -> bool:
-        """Wait for something on a bus that may report anything; return whether it came."""
-        deadline_ns = time.monotonic_ns() + patience_ns
-        for _ in range(_LOOKS):
-            try:
-                return self.exchange.wait_until(ready, deadline_ns)
-            except Exception:  # this is the way off: see send_if_possible
-                left_ns = deadline_ns - time.monotonic_ns()
-            if ready() or left_ns <= 0:
-                break
-            time.sleep(min(left_ns, _LOOK_AGAIN_NS) * 1e-9)
-        return ready()
-
-    def _drain_quietly(self) -> None:
-        """Deliver all that has come.
-
-        A damaged frame may end a look before what came after it; that the controller is off the
-        bus is told at every look, after all has been delivered. So it looks again, within bounds.
-        """
-        for _ in range(_LOOKS):
-            try:
-                self.exchange.drain()
-            except Exception:  # this is the way off: see send_if_possible
-                continue
-            return
+    def _ask_if_possible(self, request: bytes, answered: Callable[[], bool]) -> bool:
+        """Send an SDO request whatever the bus reports; return whether the answer came in time."""
+        with self.exchange.regardless():
+            return self.send_if_possible(request) and self.exchange.wait_until(
+                answered, time.monotonic_ns() + _WRITTEN_NS
+            )
 
     def _is_operational(self) -> bool:
         return self.inbox.nmt_state == OPERATIONAL

@@ -64,6 +64,7 @@ NO_REMOTE_REQUEST: Final = 0x4000_0000
 SYNC_ID: Final = 0x080
 PDO_COUNT: Final = 4
 """Pairs of PDOs with identifiers that CiA 301 sets beforehand."""
+PDO_COUNT_AT_MOST: Final = 512
 
 AT_EVERY_SYNC: Final = 1
 ON_ARRIVAL: Final = 255

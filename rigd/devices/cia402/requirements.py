@@ -41,7 +41,7 @@ class Watchdog(Enum):
 
     HEARTBEAT = "heartbeat consumer (1016:1)"
     RPDO_DEADLINE = "deadline of the RPDO (1400:5)"
-    OWN = "the drive's own watchdog (cia402.own_watchdog_s)"
+    OWN = "maker's own watchdog (cia402.own_watchdog_s)"
     NONE = "none"
 
 
@@ -69,13 +69,15 @@ class Fit(Enum):
     """The one that is needed."""
     AT_LEAST = "at least"
     """A limit that does not cut what is needed."""
+    EQUAL_OR_UNUSED = "exactly, or 0"
+    """0 says that it is not used."""
     ANY = "any"
     """It is only read."""
 
     def allows(self, found: int, wanted: int) -> bool:
         """Whether a value does where another one is wanted."""
-        if self is Fit.EQUAL:
-            return found == wanted
+        if self in (Fit.EQUAL, Fit.EQUAL_OR_UNUSED):
+            return found == wanted or (self is Fit.EQUAL_OR_UNUSED and found == 0)
         return self is Fit.ANY or found >= wanted
 
 
@@ -246,6 +248,7 @@ OPTIONAL: Final = (
         _R | _W,
         "transmission type 1: the drive goes by the SYNCs that come",
         "It has to be the period of rig.rate_hz in microseconds, or 0.",
+        Fit.EQUAL_OR_UNUSED,
     ),
     Requirement(
         objects.SYNC_WINDOW_US,
@@ -312,8 +315,9 @@ OPTIONAL: Final = (
         False,
         _R | _W,
         "",
-        "What the drive does when it misses this computer is then its maker's choice. Read it up, "
-        "and try it: pull the cable at a low torque.",
+        "What the drive does when it misses this computer is then its maker's choice: read it up, "
+        "and try it at a low torque by pulling the cable. If it has a value that does, take that "
+        "for cia402.abort_option.",
         accept=ABORT_OPTION,
     ),
     Requirement(

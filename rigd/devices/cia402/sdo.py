@@ -1,7 +1,8 @@
 """Reading and writing of the drive's objects by SDO, while no cycle runs.
 
 The canopen library does it, with a thread that receives; both are gone when the access is left.
-What it takes of an object's type stands in ``drive.eds``.
+An object's type is taken from the drive's EDS file where the profile names one, else from
+``drive.eds`` beside this module.
 """
 
 import logging
@@ -14,10 +15,18 @@ from types import TracebackType
 import can
 import canopen
 from canopen.network import MessageListener
-from canopen.objectdictionary import ObjectDictionaryError
+from canopen.objectdictionary import (
+    ObjectDictionary,
+    ObjectDictionaryError,
+    ODRecord,
+    ODVariable,
+    datatypes,
+)
+from canopen.sdo.base import SdoVariable
 
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import objects
+from rigd.devices.cia402.assignments import Assignment
 from rigd.devices.cia402.frames import NMT_PRE_OPERATIONAL
 from rigd.devices.contracts import DeviceError
 
@@ -29,8 +38,27 @@ _SDO_TIMEOUT_S = 0.5
 _SDO_TRIES = 2
 _HURRIED_TIMEOUT_S = 0.05
 _RECEIVER_POLL_S = 0.02
-_ABSENT = (0x0602_0000, 0x0609_0011, 0x060A_0023)
-"""SDO abort codes: no such object, no such sub-index, nothing behind it."""
+_ABSENT = {
+    0x0602_0000: "no such object",
+    0x0609_0011: "no such sub-index",
+    0x060A_0023: "nothing behind it",
+    0x0800_0024: "it has no value",
+    # What firmware says that knows no better of an object which it has not.
+    0x0800_0000: "general error",
+    0x0504_0001: "unknown command",
+    0x0601_0000: "unsupported access",
+}
+"""SDO abort codes by which an object that is read, or written after that, counts as absent. A state
+in which it cannot be accessed (0x08000022) and an access in the wrong direction do not."""
+_WRONG_LENGTHS = (0x0607_0010, 0x0607_0012, 0x0607_0013)
+_KINDS = {
+    "u8": datatypes.UNSIGNED8,
+    "u16": datatypes.UNSIGNED16,
+    "u32": datatypes.UNSIGNED32,
+    "i8": datatypes.INTEGER8,
+    "i16": datatypes.INTEGER16,
+    "i32": datatypes.INTEGER32,
+}
 
 
 class SdoRefusal(DeviceError):
@@ -39,6 +67,19 @@ class SdoRefusal(DeviceError):
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
         self.code = code
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether the drive has no such object, as far as its code tells."""
+        return self.code in _ABSENT
+
+
+class NotKept(DeviceError):
+    """The drive took a value and reads back another one, which this carries."""
+
+    def __init__(self, message: str, got: int) -> None:
+        super().__init__(message)
+        self.got = got
 
 
 class _Receiver(MessageListener):
@@ -63,15 +104,29 @@ class SdoAccess:
         Of the drive.
     name
         Of the drive, for messages.
+    eds
+        Path of the drive's EDS file, or empty.
+
+    Attributes
+    ----------
+    eds_identity : tuple of int
+        Vendor and product number in the drive's EDS file; 0 where it states none.
+
+    Raises
+    ------
+    DeviceError
+        If the EDS file cannot be read.
     """
 
-    def __init__(self, port: CanPort, node_id: int, name: str) -> None:
+    def __init__(self, port: CanPort, node_id: int, name: str, eds: str = "") -> None:
         for library in ("can", "canopen"):
             # What goes wrong is raised; without a handler they would also print it.
             logging.getLogger(library).addHandler(logging.NullHandler())
         self._name = name
         self._bus_name = port.name
-        self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_EDS), node_id))
+        dictionary = canopen.import_od(str(_EDS), node_id)
+        self.eds_identity = _take_types(dictionary, eds, node_id) if eds else (0, 0)
+        self._node = canopen.RemoteNode(node_id, dictionary)
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
         self._node.sdo.MAX_RETRIES = _SDO_TRIES
         port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
@@ -164,7 +219,7 @@ class SdoAccess:
         try:
             return self.read(index, sub)
         except SdoRefusal as refusal:
-            if refusal.code in _ABSENT:
+            if refusal.is_absent:
                 return None
             raise
 
@@ -191,15 +246,24 @@ class SdoAccess:
         Raises
         ------
         DeviceError
-            If the drive does not answer, refuses, or keeps another value in the bits of `mask`.
+            If the drive does not answer, refuses (:class:`SdoRefusal`), or keeps another value in
+            the bits of `mask` (:class:`NotKept`).
         """
         self.write(index, sub, value)
         got = self.read(index, sub)
         if (got ^ value) & mask:
-            raise DeviceError(
+            raise NotKept(
                 f"{self._name}: {self._title(index, sub)} was set to {show_value(value)} and reads "
-                f"{show_value(got)}; check with the drive's own tool why it does not keep it."
+                f"{show_value(got)}; check with the drive's own tool why it does not keep it.",
+                got,
             )
+
+    def assign(self, assignment: Assignment) -> None:
+        """Write an object of the maker's own and read it back; raises as :meth:`configure` does."""
+        index, sub = assignment.index, assignment.sub
+        variable = self._variable(index, sub)
+        variable.data_type = _KINDS[assignment.kind]
+        self.configure(index, sub, assignment.value)
 
     def last_emergency(self) -> int:
         """Return the code of the last emergency message heard, or 0."""
@@ -208,8 +272,7 @@ class SdoAccess:
 
     def _transfer(self, index: int, sub: int, value: int | None) -> object:
         """Write a value, or read one."""
-        variable = self._node.sdo.get_variable(index, sub)
-        assert variable is not None, f"0x{index:04X}:{sub} is missing in {_EDS.name}"
+        variable = SdoVariable(self._node.sdo, self._variable(index, sub))
         what = "reading" if value is None else f"writing {show_value(value)} to"
         try:
             if value is None:
@@ -217,8 +280,14 @@ class SdoAccess:
             variable.raw = value
             return value
         except canopen.SdoAbortedError as error:
+            remedy = (
+                " Name the drive's EDS file in the profile (cia402.eds), which has its types."
+                if error.code in _WRONG_LENGTHS
+                else ""
+            )
             raise SdoRefusal(
-                f"{self._name}: it refuses {what} {self._title(index, sub)}: {error}.", error.code
+                f"{self._name}: it refuses {what} {self._title(index, sub)}: {error}.{remedy}",
+                error.code,
             ) from None
         except (canopen.SdoCommunicationError, can.CanError):
             raise DeviceError(
@@ -230,10 +299,58 @@ class SdoAccess:
                 f"{self._name}: unusable answer to {what} {self._title(index, sub)} ({error})."
             ) from None
 
+    def _variable(self, index: int, sub: int) -> ODVariable:
+        """Return the entry of an object in the dictionary, made where it has none."""
+        dictionary = self._node.object_dictionary
+        known = dictionary.get_variable(index, sub)
+        if known is not None:
+            return known
+        variable = ODVariable("", index, sub)
+        variable.data_type = _KINDS[_kind_of_parameter(index, sub)]
+        if index not in dictionary:
+            dictionary.add_object(ODRecord(f"{index:04X}", index))
+        record = dictionary[index]
+        if isinstance(record, ODVariable):
+            dictionary.add_object(record := ODRecord(f"{index:04X}", index))
+        record.add_member(variable)
+        return variable
+
     def _title(self, index: int, sub: int) -> str:
-        entry = self._node.object_dictionary.get_variable(index, sub)
+        name = self._variable(index, sub).name
         place = f"{index:04X}:{sub}" if sub else f"{index:04X}"
-        return f"object {place}" + (f" ({entry.name})" if entry is not None else "")
+        return f"object {place}" + (f" ({name})" if name else "")
+
+
+def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
+    """Take the types of whole numbers from a drive's EDS file; return its identity."""
+    try:
+        theirs = canopen.import_od(eds, node_id)
+    except Exception as error:  # it raises whatever the parser meets
+        raise DeviceError(
+            f"{eds}: this EDS file cannot be read ({error}); get it anew from the maker, or "
+            "remove cia402.eds from the profile."
+        ) from None
+    for index, sub in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
+        entry, mine = theirs.get_variable(index, sub), own.get_variable(index, sub)
+        if (
+            entry is not None
+            and mine is not None
+            and {entry.data_type, mine.data_type} <= set(datatypes.INTEGER_TYPES)
+        ):
+            mine.data_type = entry.data_type
+    device = theirs.device_information
+    return device.vendor_number or 0, device.product_number or 0
+
+
+def _variables(entry: object) -> list[ODVariable]:
+    return [entry] if isinstance(entry, ODVariable) else list(entry.values())  # type: ignore[attr-defined]
+
+
+def _kind_of_parameter(index: int, sub: int) -> str:
+    """Return the type of a PDO's parameter or of a heartbeat consumer, by CiA 301."""
+    if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+        return {0: "u8", 1: "u32", 2: "u8"}.get(sub, "u16")
+    return "u32" if sub else "u8"
 
 
 def show_value(value: object) -> str:

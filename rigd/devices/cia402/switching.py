@@ -55,16 +55,18 @@ def step_up(node: Node) -> None:
             return state_of(inbox.statusword) is state
 
         _turn_until(node, controlword, grid_ns, reached, stuck)
-    _turn_until(
-        node,
-        ENABLE_OPERATION,
-        grid_ns,
-        lambda: inbox.statusword & FOLLOWS_TARGET != 0,
-        lambda: (
-            "it is enabled and ignores the target torque: bit 12 of its statusword "
-            f"0x{inbox.statusword:04X} is not set; look at its own diagnosis"
-        ),
-    )
+    if node.settings.follows_target_bit:
+        _turn_until(
+            node,
+            ENABLE_OPERATION,
+            grid_ns,
+            lambda: inbox.statusword & FOLLOWS_TARGET != 0,
+            lambda: (
+                "it is enabled and ignores the target torque: bit 12 of its statusword "
+                f"0x{inbox.statusword:04X} is not set; look at its own diagnosis, and if this "
+                "drive has no such bit: cia402.follows_target_bit = false"
+            ),
+        )
     _check_mode(node, grid_ns)
 
 

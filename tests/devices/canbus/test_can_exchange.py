@@ -143,3 +143,60 @@ def test_waiting_notices_a_cut(ends, exchange):
     with pytest.raises(DeviceError, match="cut off"):
         exchange.wait_until(lambda: False, time.monotonic_ns() + 10_000_000_000)
     cut.join()
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"), [(0x020, bytes(8)), (0x004, b"\0\x10" + bytes(6)), (0x040, bytes(8))]
+)
+def test_regardless_of_a_disturbed_bus_frames_go_and_come(ends, exchange, kind, data):
+    _, far = ends
+    got = []
+    exchange.subscribe(0x181, got.append)
+    far.send(ERROR | kind, data)
+    far.send(0x181, b"x")
+    with exchange.regardless():
+        exchange.drain()
+        exchange.send(pack_frame(0x80))
+        far.send(0x181, b"y")
+        assert exchange.wait_until(lambda: len(got) == 2, time.monotonic_ns() + 10_000_000_000)
+    assert got == [b"x", b"y"]
+    assert far.receive() == (0x80, b"")
+    with pytest.raises(DeviceError):  # it is told to whoever goes on with the loop
+        exchange.drain()
+
+
+def test_regardless_of_a_line_that_is_gone_waiting_ends_in_time(ends, exchange):
+    _, far = ends
+    far.socket.close()
+    with exchange.regardless():
+        exchange.drain()
+        before = time.monotonic_ns()
+        assert not exchange.wait_until(lambda: False, before + 20_000_000)
+        with pytest.raises(DeviceError, match="takes no more frames"):
+            exchange.send(pack_frame(0x80))
+    with pytest.raises(DeviceError, match="cut off"):
+        exchange.drain()
+
+
+def test_regardless_of_a_port_that_cannot_be_waited_for_the_computer_is_not_kept_busy(ends):
+    port, _ = ends
+    tries = 0
+
+    class Broken:
+        name = "can0 (broken)"
+        send = port.send
+
+        def receive(self):
+            nonlocal tries
+            tries += 1
+            raise DeviceError("it cannot be read")
+
+        def wait(self, _):
+            raise DeviceError("it cannot be waited for")
+
+    exchange = CanExchange(Broken())
+    with exchange.regardless():
+        assert not exchange.wait_until(lambda: False, time.monotonic_ns() + 50_000_000)
+    assert 0 < tries <= 10 * 52  # ten a drain, a drain a millisecond
+    with pytest.raises(DeviceError, match="cannot be read"):
+        exchange.drain()

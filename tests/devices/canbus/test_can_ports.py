@@ -306,3 +306,79 @@ def test_a_closed_adapter_is_told_and_may_be_closed_again(adapter):
         port.send(pack_frame(0x80))
     with pytest.raises(DeviceError):
         port.receive()
+
+
+class Scripted:
+    """A python-can bus whose driver raises, or returns, what it is given; then nothing comes."""
+
+    def __init__(self, *script):
+        self._script = list(script)
+
+    def recv(self, _):
+        step = self._script.pop(0) if self._script else None
+        if isinstance(step, Exception):
+            raise step
+        return step
+
+    def send(self, _, timeout):
+        raise AssertionError
+
+    def shutdown(self):
+        raise RuntimeError("no such thread")
+
+
+@pytest.mark.parametrize(
+    "failure", [ValueError("invalid literal"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "start")]
+)
+def test_a_damaged_line_is_an_error_frame_and_the_next_one_counts(failure):
+    got = []
+    exchange = CanExchange(
+        PythonCanPort(Scripted(failure, message(0x181, b"a"), failure, message(0x181, b"b")), "it")
+    )
+    exchange.subscribe(0x181, got.append)
+    exchange.drain()
+    assert got == [b"a", b"b"]
+    assert exchange.error_frames == 2
+
+
+def test_nineteen_damaged_lines_between_sound_ones_end_nothing():
+    script = [ValueError()] * 19 + [message(0x181)] + [ValueError()] * 19
+    exchange = CanExchange(PythonCanPort(Scripted(*script), "it"))
+    exchange.drain()
+    assert exchange.error_frames == 38
+
+
+def test_silence_and_the_controller_s_reports_do_not_make_damaged_lines_sound():
+    script = [ValueError("odd"), None, message(1, bytes(8), is_error_frame=True)] * 20
+    exchange = CanExchange(PythonCanPort(Scripted(*script), "slcan0 (slcan)"))
+    with pytest.raises(DeviceError, match=r"slcan0 \(slcan\).*20 times in a row.*ValueError: odd"):
+        for _ in range(60):
+            exchange.drain()
+
+
+def test_a_frame_of_can_fd_is_none_of_ours():
+    port = PythonCanPort(Scripted(message(0x181, bytes(64), is_fd=True)), "it")
+    assert unpack_frame(port.receive())[0] & 0x2000_0000
+
+
+@pytest.mark.parametrize("failure", [can.CanOperationError("gone"), OSError(5, "gone")])
+def test_an_adapter_that_has_failed_is_told_at_once(failure):
+    port = PythonCanPort(Scripted(failure, failure), "it")
+    with pytest.raises(DeviceError, match=r"it cannot be read .*gone"):
+        port.receive()
+    with pytest.raises(DeviceError, match=r"it cannot be read .*gone"):
+        port.wait(0.1)
+
+
+def test_whatever_an_adapter_s_driver_raises_is_told_and_closing_is_silent():
+    port = PythonCanPort(Scripted(), "it")
+    with pytest.raises(DeviceError, match=r"takes no more frames \(AssertionError\)"):
+        port.send(pack_frame(0x80))
+    port.close()
+
+
+def test_waiting_for_a_closed_port_is_told(ends):
+    port, _ = ends
+    port.close()
+    with pytest.raises(DeviceError, match="cannot be waited for"):
+        port.wait(0.1)

@@ -35,6 +35,8 @@ _UP = {
 }
 _FORMATS = {
     0x6080: "<I",
+    0x1007: "<I", 0x1014: "<I", 0x1019: "<B", 0x607E: "<B", 0x605A: "<h", 0x605E: "<h",
+    0x3001: "<I", 0x6077: "<h",
     0x60B2: "<h",
     0x60E0: "<H",
     0x60E1: "<H",
@@ -49,7 +51,9 @@ def _format(index, sub):
         return "<b"
     if 0x1400 <= index < 0x1B00:
         mapping = bool(index & 0x200)
-        return ("<I" if sub else "<B") if mapping else {1: "<I", 2: "<B"}[sub]
+        return ("<I" if sub else "<B") if mapping else {1: "<I", 2: "<B"}.get(sub, "<H")
+    if (index, sub) == (0x1016, 0):
+        return "<B"
     return _FORMATS[index]
 
 
@@ -95,6 +99,10 @@ class ScriptedDrive(threading.Thread):
         self.on_sync = None
         self.reply_delay_s = 0.0
         self.refuse, self.keep = {}, set()
+        self.read_only, self.refuse_value = set(), {}
+        self.formats = {}
+        self.short_tpdo = False
+        self.nmt_heartbeats = True
         self.seen = []  # everything that came: identifier, data
         self.writes = []  # SDO: index, sub, value
         self.objects = {
@@ -193,7 +201,8 @@ class ScriptedDrive(threading.Thread):
             self.nmt = {1: 5, 2: 4, 128: 0x7F}[data[0]]
             if self.nmt == 4 and self.stops:
                 self.state, self.torque = "switch-on disabled", 0
-            self.heartbeat()
+            if self.nmt_heartbeats:
+                self.heartbeat()
         elif can_id == 0x80:
             self._sync()
         elif can_id == 0x200 + NODE and self.nmt == 5:
@@ -222,6 +231,8 @@ class ScriptedDrive(threading.Thread):
             self.send(0x180 + NODE, self.garble.popleft())
             return
         reply = struct.pack("<Hih", self.status(), self.position, self.torque)
+        if self.short_tpdo:
+            reply = reply[:6]
         if self.reply_delay_s:
             time.sleep(self.reply_delay_s)
         if self.hold:
@@ -287,14 +298,23 @@ class ScriptedDrive(threading.Thread):
                 self.told_off_after = len(self.frames(0x605))
             value = {0x6041: self.status(), 0x6061: self._mode()}.get(index)
             value = self.objects[index, sub] if value is None else value
-            raw = struct.pack(_format(index, sub), value)
+            raw = struct.pack(self.formats.get(index) or _format(index, sub), value)
             head = 0x43 | (4 - len(raw)) << 2
             self.send(0x580 + NODE, bytes([head]) + reply + raw.ljust(4, b"\0"))
         else:
             size = 4 - (command >> 2 & 3)
             assert command & 0xE3 == 0x23, "an expedited download with its size"
-            assert size == struct.calcsize(_format(index, sub)), f"{index:04X} has another length"
-            (value,) = struct.unpack(_format(index, sub), data[4 : 4 + size])
+            form = self.formats.get(index) or _format(index, sub)
+            assert size == struct.calcsize(form), f"{index:04X} has another length"
+            (value,) = struct.unpack(form, data[4 : 4 + size])
+            no = (
+                0x06010002
+                if (index, sub) in self.read_only
+                else self.refuse_value.get((index, sub))
+            )
+            if no:
+                self.send(0x580 + NODE, b"\x80" + reply + struct.pack("<I", no))
+                return
             self.writes.append((index, sub, value))
             if (index, sub) not in self.keep:
                 self.objects[index, sub] = value

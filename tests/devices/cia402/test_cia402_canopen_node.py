@@ -126,7 +126,7 @@ def port(path):
 
 
 def test_the_whole_set_up(node, port, rig):
-    identity = set_up(port, rig, "Drive")
+    identity = set_up(port, rig, "Drive").identity
     assert identity["device_name"] == "CANOPEN NODE"
     assert identity["serial_number"] == 4
 
@@ -169,7 +169,7 @@ def test_what_canopen_itself_reads_of_the_pdos(node, port, rig):
 
 def test_a_node_without_an_object(node, port, rig):
     del node.object_dictionary[0x6007]
-    with pytest.raises(DeviceError, match=r"6007.*Object does not exist"):
+    with pytest.raises(DeviceError, match=r"no object 6007.*\"abort_option\""):
         set_up(port, rig, "Drive")
 
 

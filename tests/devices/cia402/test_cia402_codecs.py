@@ -192,11 +192,12 @@ def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
     dictionary = canopen.import_od(str(EDS), 5)
     types = {
         datatypes.UNSIGNED8: [(0x1001, 0), (0x1029, 1), (0x1400, 2), (0x1800, 2), (0x1600, 0),
-                              (0x1A00, 0), (0x60C2, 1)],
+                              (0x1A00, 0), (0x60C2, 1), (0x1019, 0), (0x607E, 0)],
         datatypes.INTEGER8: [(0x6060, 0), (0x6061, 0), (0x60C2, 2)],
         datatypes.UNSIGNED16: [(0x1017, 0), (0x603F, 0), (0x6040, 0), (0x6041, 0), (0x6072, 0)],
-        datatypes.INTEGER16: [(0x6007, 0), (0x6071, 0), (0x6077, 0)],
+        datatypes.INTEGER16: [(0x6007, 0), (0x6071, 0), (0x6077, 0), (0x605A, 0), (0x605E, 0)],
         datatypes.UNSIGNED32: [(0x1000, 0), (0x1005, 0), (0x1006, 0), (0x1016, 1), (0x1018, 1),
+                               (0x1007, 0), (0x1014, 0),
                                (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x6076, 0), (0x6080, 0),
                                (0x6502, 0),
                                *((0x1400 + n, 1) for n in range(4)),

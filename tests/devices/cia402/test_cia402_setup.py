@@ -19,6 +19,7 @@ def writes_to(scripted, *indices):
 
 
 def test_what_the_drive_is_told(drive, scripted):
+    scripted.objects |= {(0x60C2, 2): 0, (0x1029, 1): 1}
     drive.connect()
     told = {(index, sub): value for index, sub, value in scripted.writes}
     assert told[0x1006, 0] == 1000
@@ -195,8 +196,7 @@ def test_zero_in_the_profile_accepts_any_drive(make_drive, rig, settings, script
 )  # fmt: skip
 @pytest.mark.parametrize("how", ["refuses", "keeps"])
 def test_an_object_that_does_not_take_its_value(drive, scripted, place, how):
-    scripted.objects[0x1029, 1] = 2
-    scripted.objects[0x60C2, 2] = 0
+    scripted.objects |= {(0x1029, 1): 2, (0x60C2, 2): 0, (0x1006, 0): 4000}
     index, sub = place
     if how == "refuses":
         scripted.refuse[place] = 0x08000022

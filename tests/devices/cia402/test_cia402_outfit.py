@@ -1,0 +1,369 @@
+"""Drives that lack objects, or have them read-only: what stands in, and what is refused by name."""
+
+from dataclasses import replace
+
+import pytest
+
+from rigd.checks.drive import drive_rows
+from rigd.checks.rows import Verdict
+from rigd.devices.cia402.requirements import Watchdog
+from rigd.devices.contracts import DeviceError
+
+READ_ONLY, ABSENT, GENERAL = 0x06010002, 0x06020000, 0x08000000
+
+
+def without(scripted, *places):
+    for place in places:
+        scripted.objects.pop(place, None)
+
+
+@pytest.fixture
+def make(make_drive, rig, settings):
+    def make(**changes):
+        return make_drive(replace(rig, cia402=replace(settings, **changes)))
+
+    return make
+
+
+def written(scripted):
+    return {(index, sub): value for index, sub, value in scripted.writes}
+
+
+class TestTheTwoRealDrives:
+    """What their public EDS files say."""
+
+    def test_elmo_gold_has_torque_limits_that_are_read_only_and_far_off(self, make, scripted):
+        scripted.objects |= {(0x60E0, 0): 50_000, (0x60E1, 0): 50_000}
+        scripted.read_only |= {(0x60E0, 0), (0x60E1, 0)}
+        drive = make()
+        drive.connect()
+        assert drive.outfit().accepted == ()
+        drive.enable()
+        assert scripted.state == "enabled"
+
+    def test_epos4_has_no_6072_and_no_1006(self, make, scripted):
+        without(scripted, (0x6072, 0), (0x1006, 0))
+        scripted.objects[0x3001, 2] = 1000
+        drive = make(accept_without=("torque_limit",), set_objects=("3001:2 u32 2500",))
+        drive.connect()
+        assert scripted.objects[0x3001, 2] == 2500
+        assert [row.place for row in drive.outfit().lacks] == ["6072", "1006"]
+        told = drive.statement()
+        assert told["drive_without"] == "torque_limit"
+        assert told["drive_objects_set"] == "3001:2 u32 2500"
+        assert "1006: transmission type 1" in told["drive_stand_ins"]
+        drive.enable()
+        assert scripted.state == "enabled"
+
+    def test_a_torque_limit_that_is_missing_has_to_be_accepted_by_name(self, make, scripted):
+        without(scripted, (0x6072, 0))
+        with pytest.raises(
+            DeviceError, match=r'no object 6072.*accept_without = \["torque_limit"\]'
+        ):
+            make().connect()
+
+
+@pytest.mark.parametrize("index", [0x60E0, 0x60E1])
+def test_a_read_only_limit_below_the_wanted_one_is_refused_by_name(make, scripted, index):
+    scripted.objects[index, 0] = 1799
+    scripted.read_only.add((index, 0))
+    words = rf"{index:04X} .*is 1799, needed is 1800.*read-only.*motor\.peak_torque_nm"
+    with pytest.raises(DeviceError, match=words):
+        make().connect()
+
+
+def test_a_read_only_object_that_holds_what_is_needed_is_fine(make, scripted):
+    scripted.objects |= {(0x6072, 0): 1800, (0x60C2, 1): 1, (0x6007, 0): 2, (0x1017, 0): 20}
+    scripted.read_only |= {(0x6072, 0), (0x60C2, 1), (0x60C2, 2), (0x6007, 0), (0x1017, 0)}
+    make().connect()
+
+
+def test_a_read_only_limit_that_is_too_high_is_none(make, scripted):
+    scripted.objects[0x6072, 0] = 5000
+    scripted.read_only.add((0x6072, 0))
+    with pytest.raises(DeviceError, match=r"6072 .*is 5000, needed is 1800"):
+        make().connect()
+
+
+def test_a_limit_that_is_too_high_may_be_accepted_by_name(make, scripted):
+    scripted.objects[0x6072, 0] = 5000
+    scripted.read_only.add((0x6072, 0))
+    drive = make(accept_without=("torque_limit",))
+    drive.connect()
+    assert drive.outfit().accepted == ("torque_limit",)
+
+
+@pytest.mark.parametrize("code", [ABSENT, GENERAL, 0x06090011, 0x060A0023, 0x05040001])
+def test_the_ways_of_makers_to_say_that_an_object_is_absent(make, scripted, code):
+    scripted.refuse |= dict.fromkeys([(0x1006, 0), (0x60C2, 1), (0x60C2, 2)], code)
+    drive = make()
+    drive.connect()
+    assert {row.place for row in drive.outfit().lacks} == {"1006", "60C2:1", "60C2:2"}
+
+
+class TestTheWatchdog:
+    """It never goes missing silently."""
+
+    def test_the_heartbeat_consumer(self, make):
+        drive = make()
+        drive.connect()
+        assert drive.statement() == {
+            "drive_watchdog": "heartbeat consumer (1016:1)",
+            "drive_watchdog_s": "0.05",
+        }
+
+    def test_none_at_all_is_refused(self, make, scripted):
+        without(scripted, (0x1016, 1))
+        with pytest.raises(DeviceError) as caught:
+            make().connect()
+        told = str(caught.value)
+        for words in ("1016:1", "cia402.own_watchdog_s", 'accept_without = ["watchdog"]'):
+            assert words in told
+
+    def test_the_deadline_of_the_rpdo_stands_in(self, make, scripted):
+        without(scripted, (0x1016, 1))
+        scripted.objects[0x1400, 5] = 0
+        drive = make()
+        drive.connect()
+        assert scripted.objects[0x1400, 5] == 50
+        assert drive.outfit().watchdog is Watchdog.RPDO_DEADLINE
+        # It times them from the first on, so that they go on while nobody commands a torque.
+        scripted.seen.clear()
+        for k in range(5):
+            drive.latch(k * 1_000_000)
+            drive.read_angle()
+        assert len(scripted.frames(0x205)) == 5
+
+    def test_the_makers_own_stands_in_as_the_profile_says(self, make, scripted):
+        without(scripted, (0x1016, 1), (0x6007, 0))
+        drive = make(own_watchdog_s=0.03)
+        drive.connect()
+        assert drive.statement()["drive_watchdog_s"] == "0.03"
+        assert "maker's own" in drive.statement()["drive_watchdog"]
+
+    def test_none_is_accepted_by_name_and_told(self, make, scripted, rig):
+        without(scripted, (0x1016, 1))
+        drive = make(accept_without=("watchdog",))
+        drive.connect()
+        assert drive.statement()["drive_watchdog_s"] == "inf"
+        assert drive.statement()["drive_without"] == "watchdog"
+        rows = {row.what: row for row in drive_rows(drive, rig)}
+        assert rows["watchdog"].verdict is Verdict.WARNING
+        assert "STO" in rows["watchdog"].detail
+
+    def test_a_watchdog_of_which_nobody_knows_what_it_does(self, make, scripted):
+        without(scripted, (0x6007, 0))
+        with pytest.raises(DeviceError, match=r'no object 6007.*\["abort_option"\]'):
+            make().connect()
+
+    def test_what_it_does_may_be_accepted_by_name(self, make, scripted):
+        without(scripted, (0x6007, 0))
+        drive = make(accept_without=("abort_option",))
+        drive.connect()
+        assert drive.outfit().accepted == ("abort_option",)
+
+    def test_one_node_twice_is_refused_so_the_old_entry_goes_first(self, make, scripted):
+        scripted.objects |= {(0x1016, 0): 3, (0x1016, 2): 100 << 16 | 70, (0x1016, 3): 9 << 16 | 5}
+        make().connect()
+        places = [(index, sub, value) for index, sub, value in scripted.writes if index == 0x1016]
+        assert places == [(0x1016, 2, 0), (0x1016, 1, 100 << 16 | 50)]
+
+    @pytest.mark.parametrize(
+        ("changes", "time_s"),
+        [
+            ({}, 0.05),
+            ({"own_watchdog_s": 0.03}, 0.05),
+            ({"own_watchdog_s": 0.3}, 0.3),
+            ({"accept_without": ("watchdog",)}, float("inf")),
+            ({"accept_without": ("torque_limit",)}, 0.05),
+        ],
+    )
+    def test_its_time_as_far_as_a_profile_tells(self, settings, changes, time_s):
+        assert replace(settings, **changes).watchdog_s == time_s
+
+
+class TestWhatADriveHoldsFromBefore:
+    @pytest.mark.parametrize(
+        ("place", "value"), [((0x1007, 0), 100), ((0x1019, 0), 10), ((0x1800, 3), 10)]
+    )
+    def test_it_is_cleared(self, make, scripted, place, value):
+        scripted.objects[place] = value
+        make().connect()
+        assert scripted.objects[place] == 0
+
+    @pytest.mark.parametrize("place", [(0x1007, 0), (0x1019, 0), (0x1800, 3), (0x60B2, 0)])
+    def test_what_cannot_be_cleared_is_refused_by_name(self, make, scripted, place):
+        scripted.objects[place] = 10
+        scripted.read_only.add(place)
+        index, sub = place
+        with pytest.raises(DeviceError, match=f"{index:04X}{f':{sub}' if sub else ''} .*is 10"):
+            make().connect()
+
+    def test_the_sync_counter_is_changed_while_the_period_is_0(self, make, scripted):
+        scripted.objects |= {(0x1019, 0): 10, (0x1006, 0): 2000}
+        make().connect()
+        order = [write[:1] + write[2:] for write in scripted.writes if write[0] in (0x1006, 0x1019)]
+        assert order == [(0x1006, 0), (0x1019, 0), (0x1006, 1000)]
+
+    def test_the_inhibit_time_is_changed_while_the_pdo_is_off(self, make, scripted):
+        scripted.objects[0x1800, 3] = 10
+        make().connect()
+        order = [write for write in scripted.writes if write[0] == 0x1800]
+        assert order.index((0x1800, 3, 0)) > order.index((0x1800, 1, 0xC0000185))
+        assert order[-1] == (0x1800, 1, 0x40000185)
+
+    def test_pdos_beyond_the_fourth_are_switched_off(self, make, scripted):
+        for n in range(2, 7):
+            scripted.objects[0x1400 + n, 1] = 0x300 + n
+            scripted.objects[0x1800 + n, 1] = 0x40000280 + n
+        make().connect()
+        for n in range(1, 7):
+            assert scripted.objects[0x1400 + n, 1] & 0x80000000
+            assert scripted.objects[0x1800 + n, 1] & 0x80000000
+
+    @pytest.mark.parametrize("polarity", [0x80, 0x40, 0xC0])
+    def test_a_polarity_is_refused_by_name(self, make, scripted, polarity):
+        scripted.objects[0x607E, 0] = polarity
+        with pytest.raises(DeviceError, match=rf"607E \(Polarity\) is 0x{polarity:02X}.*run away"):
+            make().connect()
+        assert (0x607E, 0) not in written(scripted)
+
+    def test_a_polarity_that_the_profile_sets_to_0_is_fine(self, make, scripted):
+        scripted.objects[0x607E, 0] = 0x80
+        make(set_objects=("607E:0 u8 0",)).connect()
+
+    def test_reactions_are_reported(self, make, scripted):
+        scripted.objects |= {(0x605A, 0): 2, (0x605E, 0): 0}
+        drive = make()
+        drive.connect()
+        assert drive.identity()["quick_stop_option"] == 2
+        assert drive.identity()["fault_reaction_option"] == 0
+
+
+def test_pdos_that_are_mapped_as_wanted_may_be_read_only(make, scripted):
+    scripted.objects |= {
+        (0x1800, 1): 0x40000185, (0x1800, 2): 1, (0x1400, 1): 0x205, (0x1400, 2): 1,
+        (0x1A00, 0): 3, (0x1A00, 1): 0x60410010, (0x1A00, 2): 0x60640020, (0x1A00, 3): 0x60770010,
+        (0x1600, 0): 2, (0x1600, 1): 0x60400010, (0x1600, 2): 0x60710010,
+    }  # fmt: skip
+    mapping = {place for place in scripted.objects if place[0] in (0x1400, 0x1800, 0x1600, 0x1A00)}
+    scripted.read_only |= mapping
+    drive = make()
+    drive.connect()
+    drive.enable()
+    assert scripted.state == "enabled"
+
+
+def test_a_target_torque_that_cannot_be_mapped_is_named(make, scripted):
+    scripted.refuse_value[0x1600, 2] = 0x06040041
+    with pytest.raises(DeviceError, match=r"6071 \(Target torque\) into RPDO1.*cannot be mapped"):
+        make().connect()
+
+
+class TestWithoutItsTorque:
+    def test_it_is_refused(self, make, scripted):
+        scripted.refuse_value[0x1A00, 3] = ABSENT
+        with pytest.raises(DeviceError, match=r'no object 6077.*\["torque_feedback"\]'):
+            make().connect()
+
+    def test_accepted_by_name(self, make, scripted):
+        scripted.short_tpdo = True
+        drive = make(accept_without=("torque_feedback",), torque_tolerance_percent=10.0)
+        drive.connect()
+        assert scripted.objects[0x1A00, 0] == 2
+        drive.enable()
+        for k in range(30):
+            drive.latch(k * 1_000_000)
+            drive.read_angle()
+            assert not drive.angle_stale
+            drive.command(0.4)
+
+
+def test_without_a_heartbeat_of_its_own_its_tpdos_tell_that_it_is_there(make, scripted):
+    without(scripted, (0x1017, 0))
+    scripted.heartbeat_every = 10**9
+    scripted.nmt_heartbeats = False
+    drive = make()
+    drive.connect()
+    drive.enable()
+    for k in range(100):
+        drive.latch(k * 1_000_000)
+        drive.read_angle()
+    assert drive.outfit().watchdog is Watchdog.HEARTBEAT
+
+
+def test_no_torque_mode_is_refused_within_a_second(make, scripted):
+    import time
+
+    scripted.objects[0x6502, 0] = 0x6D
+    began = time.monotonic()
+    with pytest.raises(DeviceError, match=r"no cyclic synchronous torque.*6502 = 109"):
+        make().connect()
+    assert time.monotonic() - began < 1
+
+
+class TestWithAnEds:
+    TEXT = """[DeviceInfo]
+VendorName=any
+VendorNumber={vendor}
+ProductName=any
+ProductNumber={product}
+
+[OptionalObjects]
+SupportedObjects=1
+1=0x60E0
+
+[60E0]
+ParameterName=Positive torque limit
+ObjectType=0x7
+DataType=0x0007
+AccessType=rw
+PDOMapping=0
+"""
+
+    def eds(self, tmp_path, vendor="0x1234", product="0xABCD"):
+        path = tmp_path / "drive.eds"
+        path.write_text(self.TEXT.format(vendor=vendor, product=product))
+        return str(path)
+
+    def test_its_types_are_used(self, make, scripted, tmp_path):
+        scripted.objects[0x60E0, 0] = 70_000  # no u16 holds that
+        scripted.formats[0x60E0] = "<I"
+        make(eds=self.eds(tmp_path)).connect()
+        assert scripted.objects[0x60E0, 0] == 1800
+
+    def test_the_drive_has_to_be_its(self, make, scripted, tmp_path):
+        with pytest.raises(DeviceError, match=r"VendorNumber in .*drive\.eds is 0x00000099"):
+            make(eds=self.eds(tmp_path, vendor="0x99")).connect()
+
+    def test_the_product_has_to_be_its(self, make, scripted, tmp_path):
+        with pytest.raises(DeviceError, match=r"ProductNumber in .*drive\.eds is 0x00000007"):
+            make(eds=self.eds(tmp_path, product="7")).connect()
+
+    @pytest.mark.parametrize("content", ["", "nonsense", "[60E0\n", "\0\0"])
+    def test_a_file_that_is_none(self, make, tmp_path, content):
+        path = tmp_path / "broken.eds"
+        path.write_text(content)
+        drive = make(eds=str(path))
+        try:
+            drive.connect()
+        except DeviceError as error:
+            assert "broken.eds" in str(error)
+
+
+def test_bit_12_is_demanded(make, scripted):
+    scripted.follows = False
+    drive = make()
+    drive.connect()
+    with pytest.raises(DeviceError, match=r"bit 12.*follows_target_bit = false"):
+        drive.enable()
+
+
+def test_a_drive_without_bit_12(make, scripted):
+    scripted.follows = False
+    drive = make(follows_target_bit=False)
+    drive.connect()
+    drive.enable()
+    for k in range(20):
+        drive.latch(k * 1_000_000)
+        drive.read_angle()
