@@ -16,6 +16,7 @@ from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.identify import identify_app
 from rigd.cli.info import info
 from rigd.cli.live import live
+from rigd.cli.profiles import profiles_app
 from rigd.cli.recover import recover
 from rigd.cli.replay import replay
 from rigd.cli.run import run_app, start_app
@@ -48,6 +49,7 @@ app.command()(info)
 app.command()(replay)
 app.command()(recover)
 app.add_typer(identify_app, name="identify")
+app.add_typer(profiles_app, name="profiles")
 app.command()(bench)
 app.command()(simulate)
 app.command()(inject)

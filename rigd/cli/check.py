@@ -42,12 +42,12 @@ def check(
     """
     _end_as_by_ctrl_c()
     if eds is not None:
-        _report(_rows_of(eds, profile), as_json=as_json)
+        _report(_rows_of(eds, profile), as_json=as_json, on_paper=True)
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
     from rigd.checks.rig import check_rig
 
-    _report(check_rig(rig_profile), as_json=as_json)
+    _report(check_rig(rig_profile), as_json=as_json, on_paper=False)
 
 
 def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
@@ -65,7 +65,7 @@ def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
     return list(eds_rows(eds, rig_profile.rig))
 
 
-def _report(rows: "list[Row]", *, as_json: bool) -> None:
+def _report(rows: "list[Row]", *, as_json: bool, on_paper: bool) -> None:
     from rigd.checks import overall
 
     verdict = overall(rows)
@@ -73,9 +73,9 @@ def _report(rows: "list[Row]", *, as_json: bool) -> None:
         document = {"verdict": verdict, "rows": [row.as_dict() for row in rows]}
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
-        from rigd.checks.table import print_table
+        from rigd.checks.table import OF_A_RIG, OF_AN_EDS, print_table
 
-        print_table(rows)
+        print_table(rows, OF_AN_EDS if on_paper else OF_A_RIG)
     if verdict == "failed":
         raise typer.Exit(EXIT_FAILED)
 

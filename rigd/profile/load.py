@@ -137,8 +137,13 @@ def _profile_folders() -> tuple[Path, ...]:
     return Path(__file__).resolve().parents[2] / "hw_profiles", Path("hw_profiles")
 
 
+def known_profiles() -> list[str]:
+    """Return the names of the profiles in ``hw_profiles``, of the project and of this folder."""
+    return sorted({path.stem for folder in _profile_folders() for path in folder.glob("*.toml")})
+
+
 def _known_profiles() -> str:
-    names = sorted({path.stem for folder in _profile_folders() for path in folder.glob("*.toml")})
+    names = known_profiles()
     return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
 
 

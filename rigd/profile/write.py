@@ -2,14 +2,17 @@
 
 import json
 import re
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.profile.load import ProfileError
-from rigd.profile.settings import TEXTS, is_text, keys
+from rigd.profile.settings import is_number, keys
 
-SettingValue = bool | int | float | str
+SettingValue = bool | int | float | str | tuple[str, ...]
+
+_WIDTH = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,9 +23,9 @@ class Setting:
     """Dotted: ``cia402.node_id``."""
     value: SettingValue
     source: str = "assumed"
-    """One of the words that a profile knows; a text has none."""
+    """One of the words that a profile knows; only numbers have one."""
     reason: str = ""
-    """One line, which becomes a comment above the value."""
+    """Becomes a comment above the value."""
     hexadecimal: bool = False
 
 
@@ -32,22 +35,25 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     Parameters
     ----------
     text
-        Of a profile that has all the keys.
+        Of a profile that can be used.
     settings
-        What is to stand in it.
+        What is to stand in it; a key that it has left out comes first in its section.
 
     Raises
     ------
     KeyError
-        If the profile does not have a key.
+        If the profile does not have the section of a key.
     """
     lines = text.splitlines()
-    places = dict(_places(lines))
-    # From the last line to the first, so that comments move no line that is still to come.
-    for setting in sorted(settings, key=lambda setting: -places[setting.key]):
-        place = places[setting.key]
-        comment = [f"# {setting.reason}"] if setting.reason else []
-        lines[place : place + 1] = [*comment, _line(setting)]
+    for setting in settings:
+        places = _places(lines)
+        new = [*_comment(setting.reason), _line(setting)]
+        if setting.key in places:
+            place = places[setting.key]
+            lines[place : place + 1] = new
+        else:
+            place = places[setting.key.rpartition(".")[0]] + 1
+            lines[place:place] = new
     return "\n".join(lines) + "\n"
 
 
@@ -55,7 +61,28 @@ def with_head(text: str, head: Sequence[str]) -> str:
     """Return the text of a profile with other comments before its first key."""
     lines = text.splitlines()
     first = next(i for i, line in enumerate(lines) if line and not line.startswith("#"))
-    return "\n".join([*(f"# {line}".rstrip() for line in head), "", *lines[first:]]) + "\n"
+    return (
+        "\n".join(
+            [*(each for line in head for each in _comment(line) or ["#"]), "", *lines[first:]]
+        )
+        + "\n"
+    )
+
+
+def check_new(path: Path) -> None:
+    """Refuse a path for a new profile under which none could be written, or found again.
+
+    Raises
+    ------
+    ProfileError
+        If there is a file, no folder for it, or its name is no profile's.
+    """
+    if path.suffix != ".toml":
+        raise ProfileError(f"{path}: the name of a profile ends in .toml.")
+    if path.exists() or path.is_symlink():
+        raise _taken(path)
+    if not path.parent.is_dir():
+        raise ProfileError(f"{path}: there is no folder {path.parent}; make it first.")
 
 
 def write_new(path: Path, text: str) -> None:
@@ -70,32 +97,40 @@ def write_new(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError as error:
-        raise ProfileError(
-            f"{path}: is there already and is left as it is; name another file."
-        ) from error
+        raise _taken(path) from error
     except OSError as error:
         raise ProfileError(f"{path}: cannot be written ({error.strerror}).") from error
 
 
-def _places(lines: Sequence[str]) -> Iterable[tuple[str, int]]:
-    """Yield each key of a profile with the number of its line."""
+def _taken(path: Path) -> ProfileError:
+    return ProfileError(f"{path}: is there already and is left as it is; name another file.")
+
+
+def _places(lines: Sequence[str]) -> dict[str, int]:
+    """Return the number of the line on which each section and each key of a profile stands."""
+    places = {}
     section = ""
     for place, line in enumerate(lines):
         if title := re.match(r"\[([^\]]+)\]", line):
+            places[title[1]] = place
             section = title[1] + "."
         elif key := re.match(r"(\w+)\s*=", line):
-            yield section + key[1], place
+            places[section + key[1]] = place
+    return places
+
+
+def _comment(text: str) -> list[str]:
+    """Return a text as lines of comment."""
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 
 def _line(setting: Setting) -> str:
-    value = setting.value
-    if isinstance(value, bool):
-        shown = str(value).lower()
-    elif isinstance(value, str):
-        shown = json.dumps(value, ensure_ascii=False)  # escaped as TOML has it, too
-    else:
-        shown = f"0x{value:08X}" if setting.hexadecimal and isinstance(value, int) else repr(value)
     name = setting.key.rpartition(".")[2]
-    if setting.key in TEXTS or is_text(keys()[setting.key]):
+    value = setting.value
+    # What JSON makes of texts and truth, TOML reads.
+    shown = json.dumps(value, ensure_ascii=False)
+    if not is_number(keys()[setting.key]):
         return f"{name} = {shown}"
+    if setting.hexadecimal and isinstance(value, int):
+        shown = f"0x{value:08X}"
     return f'{name} = {{ value = {shown}, source = "{setting.source}" }}'

@@ -92,6 +92,8 @@ class Eds:
     """What a file tells of a drive."""
 
     path: Path
+    node_id: int
+    """For which it was read."""
     vendor_name: str
     vendor_id: int
     """What object 1018:1 shows; 0: not told."""
@@ -100,6 +102,8 @@ class Eds:
     """What object 1018:2 shows; 0: not told."""
     bit_rates_bit_s: tuple[int, ...]
     """Empty: not told."""
+    commissioned_node_id: int
+    """Of the one drive that a DCF configures; 0: not told."""
     entries: Mapping[tuple[int, int], EdsEntry]
     """By index and sub-index; a plain variable has the sub-index 0."""
 
@@ -138,6 +142,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
         raise EdsError(f"{path}: is no EDS file: no object of a drive is described in it.")
     return Eds(
         path=path,
+        node_id=node_id,
         vendor_name=_shown(device.get("vendorname", "")),
         vendor_id=_identity(entries, 1, device.get("vendornumber", "")),
         product_name=_shown(device.get("productname", "")),
@@ -147,8 +152,18 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
             for rate in _BIT_RATES_KBIT_S
             if _integer(device.get(f"baudrate_{rate}", ""))
         ),
+        commissioned_node_id=_commissioned(sections),
         entries=entries,
     )
+
+
+def _commissioned(sections: Sections) -> int:
+    # The first spelling is CiA 306's.
+    for title in ("devicecomissioning", "devicecommissioning"):
+        node_id = _integer(sections.get(title, {}).get("nodeid", ""))
+        if 1 <= node_id <= 127:
+            return node_id
+    return 0
 
 
 def _text(path: Path) -> str:

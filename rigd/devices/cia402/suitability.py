@@ -78,12 +78,14 @@ _LENGTHS: Final = {
     entry >> 16: entry & 0xFF for entries in _PDO_ENTRIES.values() for entry in entries
 }
 """Bits that each mapped object has in its PDO."""
-_IN_HEX: Final = (
-    objects.SYNC_COB_ID,
-    objects.EMERGENCY_COB_ID,
-    objects.IDENTITY,
-    objects.SUPPORTED_MODES,
-)
+_COB_IDS: Final = {
+    (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
+    (objects.EMERGENCY_COB_ID, 0): 0x080,
+    (objects.TPDO_COMMUNICATION, 1): 0x180,
+    (objects.RPDO_COMMUNICATION, 1): 0x200,
+}
+"""Identifiers that CiA 301 sets beforehand; the node id is added to all but that of SYNC."""
+_TOLD_BEFORE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
 def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
@@ -104,7 +106,7 @@ class _Judge:
     def __init__(self, eds: Eds, rig: "RigParameters | None") -> None:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
-        self._settings: "ServoDrive | None" = self._rig.cia402 if self._rig else None
+        self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
 
     def findings(self) -> Iterator[Finding]:
         yield from self._identity()
@@ -112,8 +114,8 @@ class _Judge:
         yield self._torque_mode()
         yield self._watchdog()
         for needed in REQUIREMENTS:
-            if needed.index == objects.SUPPORTED_MODES or needed.accept == WATCHDOG:
-                continue  # told above
+            if needed.index in _TOLD_BEFORE or needed.accept == WATCHDOG:
+                continue
             entry = self._eds.get(needed.index, needed.sub)
             yield self._absent(needed) if entry is None else self._present(needed, entry)
 
@@ -179,7 +181,7 @@ class _Judge:
         """Tell what in the drive takes the torque off when this computer falls silent."""
         heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
         deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
-        own_s = getattr(self._settings, "own_watchdog_s", 0.0)
+        own_s = self._settings.own_watchdog_s if self._settings else 0.0
         found = watchdog(
             heartbeat=heartbeat is not None and heartbeat.writable,
             rpdo_deadline=deadline is not None and deadline.writable,
@@ -201,18 +203,20 @@ class _Judge:
         if self._is_set_by_profile(needed):
             sentence = f"it has no object {needed.place} ({needed.name}). {needed.sentence}"
             return Finding(what, "absent", "", Grade.REFUSED, _sentence(sentence))
-        return Finding(what, f"absent; stands in: {needed.stand_in}", "", Grade.STANDS_IN)
+        stand_in = f"; in its place: {needed.stand_in}" if needed.stand_in.strip("–") else ""
+        return Finding(what, f"absent{stand_in}", "", Grade.STANDS_IN)
 
     def _to_accept(self, needed: Requirement, what: str, found: str, wanted: str) -> Finding:
         """Judge what is missing unless the profile accepts that by name."""
-        stand_in = f"; stands in: {needed.stand_in}" if needed.stand_in else ""
-        if needed.accept in getattr(self._settings, "accept_without", ()):
-            found = f"{found}, accepted by the profile{stand_in}"
-            return Finding(what, found, wanted, Grade.ACCEPTED, accept=needed.accept)
-        sentence = _sentence(needed.missing())
+        stand_in = f" In its place: {needed.stand_in}." if needed.stand_in else ""
+        if self._settings is not None and needed.accept in self._settings.accept_without:
+            found = f"{found}, accepted by the profile"
+            sentence = f"{what}: {found}.{stand_in}"
+            return Finding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
+        sentence = _sentence(needed.missing()) + stand_in
         # Without a profile nobody has had the chance to accept it.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
-        return Finding(what, f"{found}{stand_in}", wanted, grade, sentence, needed.accept)
+        return Finding(what, found, wanted, grade, sentence, needed.accept)
 
     def _is_set_by_profile(self, needed: Requirement) -> bool:
         """Whether the profile asks for what only this object can do."""
@@ -222,8 +226,6 @@ class _Judge:
         return {
             (objects.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
             (objects.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
-            (objects.IDENTITY, 1): settings.vendor_id > 0,
-            (objects.IDENTITY, 2): settings.product_code > 0,
         }.get((needed.index, needed.sub), False)
 
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
@@ -260,8 +262,8 @@ class _Judge:
     ) -> Finding:
         """Judge an object that would be written and cannot be: what it holds may do."""
         what = f"{needed.place} {needed.name}"
-        if needed.fit is Fit.AT_LEAST and wanted is not None:
-            asked = f"at least {wanted}"
+        if needed.fit is Fit.AT_LEAST:
+            asked = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
             asked = "" if wanted is None else _shown(needed, wanted)
         if needed.index in _PDO_ENTRIES:
@@ -269,7 +271,7 @@ class _Judge:
             does = None if None in held else held == _PDO_ENTRIES[needed.index]
         elif wanted is None or entry.default is None:
             does = None
-        elif needed.index in (objects.RPDO_COMMUNICATION, objects.TPDO_COMMUNICATION):
+        elif (needed.index, needed.sub) in _COB_IDS:
             # Drives are free to set the bit that forbids remote requests.
             does = (entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
         else:
@@ -308,8 +310,10 @@ class _Judge:
             return objects.CYCLIC_TORQUE
         if (needed.index, needed.sub) == (objects.TPDO_COMMUNICATION, 2):
             return objects.AT_EVERY_SYNC
-        if needed.index == objects.SYNC_COB_ID:
-            return objects.SYNC_ID
+        place = needed.index, needed.sub
+        if place in _COB_IDS:
+            node_id = 0 if needed.index == objects.SYNC_COB_ID else self._eds.node_id
+            return _COB_IDS[place] + node_id
         rig, settings = self._rig, self._settings
         if rig is None or settings is None:
             return None
@@ -317,8 +321,6 @@ class _Judge:
         value, exponent = interpolation_time(rig.rate_hz)
         limit = torque_limit_per_mille(rig)
         wanted = {
-            (objects.RPDO_COMMUNICATION, 1): 0x200 + settings.node_id,
-            (objects.TPDO_COMMUNICATION, 1): 0x180 + settings.node_id,
             (objects.RPDO_COMMUNICATION, 2): (
                 objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL
             ),
@@ -328,13 +330,12 @@ class _Judge:
             (objects.ABORT_OPTION, 0): settings.abort_option,
             (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option,
             (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
-            (objects.EMERGENCY_COB_ID, 0): 0x80 + settings.node_id,
             (objects.MAX_TORQUE, 0): limit,
             **{(index, 0): limit for index in objects.TORQUE_LIMITS},
         }
         if settings.max_speed_rad_s > 0:
             wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
-        return wanted.get((needed.index, needed.sub))
+        return wanted.get(place)
 
 
 def _default(entry: EdsEntry | None) -> int | None:
@@ -350,7 +351,7 @@ def _takes(entry: EdsEntry, value: int) -> bool:
 
 def _shown(needed: Requirement, value: int) -> str:
     """Return a value as messages show it: identifiers and codes in hexadecimal."""
-    in_hex = value > 0xFFFF or needed.index in _IN_HEX
+    in_hex = value > 0xFFFF or (needed.index, needed.sub) in _COB_IDS
     return f"0x{value:X}" if in_hex and value >= 0 else str(value)
 
 
