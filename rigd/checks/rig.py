@@ -1,6 +1,9 @@
 """The whole check, in the order in which one thing rules out the next."""
 
+from pathlib import Path
+
 from rigd.checks.devices import inspect_devices
+from rigd.checks.eds import eds_rows
 from rigd.checks.loop import loop_rows
 from rigd.checks.machine import machine_rows
 from rigd.checks.on_paper import profile_rows, wiring_rows
@@ -18,6 +21,7 @@ def check_rig(profile: Profile) -> list[Row]:
     """
     wiring = list(wiring_rows(profile.rig))
     rows = [
+        *_drive_rows(profile),
         *profile_rows(profile),
         *wiring,
         *loop_rows(profile),
@@ -29,3 +33,9 @@ def check_rig(profile: Profile) -> list[Row]:
         why = "not connected: first the bus has to be right"
         return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
     return rows + inspect_devices(profile)
+
+
+def _drive_rows(profile: Profile) -> list[Row]:
+    """Hold the EDS that a profile names against what is asked of a drive."""
+    settings = profile.rig.cia402
+    return list(eds_rows(Path(settings.eds), profile.rig)) if settings and settings.eds else []

@@ -1,6 +1,6 @@
 """The rows of a check as a table on the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -17,7 +17,20 @@ _STYLES = {
 }
 
 
-def print_table(rows: Sequence[Row]) -> None:
+OF_A_RIG = {
+    "failed": "no session may be run",
+    "warnings": "a session can be run",
+    "ok": "a session can be run",
+}
+"""What the verdict over all rows means to the operator."""
+OF_AN_EDS = {
+    "failed": "this drive cannot be used",
+    "warnings": "as far as its file tells, this drive can be used; read the warnings",
+    "ok": "as far as its file tells, this drive can be used",
+}
+
+
+def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG) -> None:
     """Print the table, what is too long for it, and the verdict, to standard output."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), expand=False)
     table.add_column("what", ratio=5, overflow="fold")
@@ -44,19 +57,14 @@ def print_table(rows: Sequence[Row]) -> None:
         if row.detail:
             console.print(Text(row.detail))
             console.print()
-    console.print(Text(_verdict(rows), style="bold"))
+    console.print(Text(_verdict(rows, consequences), style="bold"))
 
 
-def _verdict(rows: Sequence[Row]) -> str:
+def _verdict(rows: Sequence[Row], consequences: Mapping[str, str]) -> str:
     counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in Verdict}
     text = (
         f"failed: {counts[Verdict.FAIL]}, warnings: {counts[Verdict.WARNING]}, "
         f"ok: {counts[Verdict.OK]}, skipped: {counts[Verdict.SKIPPED]}"
     )
-    consequence = {
-        "failed": "no session may be run",
-        "warnings": "a session can be run",
-        "ok": "a session can be run",
-    }
     verdict = overall(rows)
-    return f"Verdict: {verdict} ({text}): {consequence[verdict]}."
+    return f"Verdict: {verdict} ({text}): {consequences[verdict]}."

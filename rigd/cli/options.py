@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 ProfileName = Annotated[
     str, typer.Option("--profile", help="Name of a hardware profile, or its file.")
 ]
+EdsFile = Annotated[
+    Path, typer.Option("--eds", metavar="FILE", help="EDS or DCF file of a CANopen drive.")
+]
 Output = Annotated[Path, typer.Option("--output", help="Folder for the session files.")]
 SESSIONS = Path("sessions")
 """Where session files go unless told otherwise."""

@@ -54,11 +54,23 @@ def load_profile(name_or_path: str | Path) -> Profile:
     path = _find(name_or_path)
     try:
         text = path.read_bytes().decode("utf-8")
-        document = tomllib.loads(text)
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
     except UnicodeDecodeError as error:
         raise ProfileError(f"{path}: is not a text file in UTF-8; save it as one.") from error
+    return profile_of(text, path)
+
+
+def profile_of(text: str, path: Path) -> Profile:
+    """Validate the text of a profile; `path` is the file that it stands in, or is to stand in.
+
+    Raises
+    ------
+    ProfileError
+        As :func:`load_profile`.
+    """
+    try:
+        document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
 
@@ -125,8 +137,13 @@ def _profile_folders() -> tuple[Path, ...]:
     return Path(__file__).resolve().parents[2] / "hw_profiles", Path("hw_profiles")
 
 
+def known_profiles() -> list[str]:
+    """Return the names of the profiles in ``hw_profiles``, of the project and of this folder."""
+    return sorted({path.stem for folder in _profile_folders() for path in folder.glob("*.toml")})
+
+
 def _known_profiles() -> str:
-    names = sorted({path.stem for folder in _profile_folders() for path in folder.glob("*.toml")})
+    names = known_profiles()
     return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
 
 

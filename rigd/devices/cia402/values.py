@@ -1,9 +1,12 @@
 """Numbers of the profile in the units of the drive's objects."""
 
 from math import ceil, tau
+from typing import TYPE_CHECKING
 
 from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import RigParameters, ServoDrive
+
+if TYPE_CHECKING:
+    from rigd.devices.parameters import RigParameters, ServoDrive
 
 _ROUNDING = 1e-9
 
@@ -45,12 +48,12 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
     )
 
 
-def torque_limit_per_mille(rig: RigParameters) -> int:
+def torque_limit_per_mille(rig: "RigParameters") -> int:
     """Return the peak torque in 1/1000 of the rated torque, rounded down, within 16 bits."""
     motor = rig.motor
     return min(int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING), 32767)
 
 
-def max_speed_rpm(settings: ServoDrive) -> int:
+def max_speed_rpm(settings: "ServoDrive") -> int:
     """Return the speed limit in turns of the motor a minute, rounded up, for object 6080."""
     return ceil(settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _ROUNDING)

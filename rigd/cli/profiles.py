@@ -1,0 +1,122 @@
+"""``rigd profiles``: the profiles there are, and a new one from a drive's EDS."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
+from rigd.cli.options import EdsFile, profile_named
+
+if TYPE_CHECKING:
+    from rigd.profile.from_eds import Draft
+
+profiles_app = typer.Typer(
+    help="List the hardware profiles, or write a new one from a drive's EDS file.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@profiles_app.callback()
+def profiles() -> None:
+    """List the hardware profiles, or write a new one from a drive's EDS file.
+
+    Example: rigd profiles list
+    """
+
+
+@profiles_app.command("list")
+def list_profiles() -> None:
+    """List the profiles that --profile takes by name.
+
+    Example: rigd profiles list
+    """
+    from rigd.profile import ProfileError, load_profile
+    from rigd.profile.load import known_profiles
+
+    for name in known_profiles():
+        try:
+            profile = load_profile(name)
+            typer.echo(f"{name}: {profile.description} ({profile.path})")
+        except ProfileError as error:
+            typer.echo(f"{name}: cannot be used: {str(error).splitlines()[0]}")
+
+
+@profiles_app.command()
+def new(
+    eds: EdsFile,
+    output: Annotated[
+        Path, typer.Option("--output", metavar="FILE", help="The new profile, a .toml file.")
+    ],
+    start_from: Annotated[
+        str,
+        typer.Option("--from", help="Profile to start from, with a CiA 402 drive."),
+    ] = "antenna_can",
+) -> None:
+    """Write a profile for a drive: what its EDS file tells, and what the terminal is asked for.
+
+    Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
+    motor are asked for; Enter keeps the value shown, which stays "assumed". Without a terminal
+    nothing is asked, and what has to be filled in is listed. No file is ever overwritten.
+
+    Example: rigd profiles new --eds drive.eds --output my_rig.toml
+    """
+    from rigd.devices.cia402.eds import EdsError, read_eds
+    from rigd.profile import ProfileError
+    from rigd.profile.from_eds import Draft, UnusableDriveError
+    from rigd.profile.write import check_new, write_new
+
+    base = profile_named(start_from)
+    try:
+        check_new(output)
+        draft = Draft(base, read_eds(eds), output)
+        text = _asked(draft) if is_terminal() else draft.text()
+        write_new(output, text)
+    except ProfileError as error:
+        fail(str(error), EXIT_WRONG_USE)
+    except (EdsError, UnusableDriveError) as error:
+        fail(str(error), EXIT_FAILED)
+    for doubt in draft.doubts:
+        typer.echo(f"Note: {doubt}", err=True)
+    missing = draft.unanswered()
+    if missing:
+        typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
+    for question in missing:
+        typer.echo(f"  {question.key} = {draft.value(question.key)}: {question.text}", err=True)
+    typer.echo(f"{output}: written. Next: rigd check --profile {output}")
+
+
+def is_terminal() -> bool:
+    """Whether somebody can be asked."""
+    return sys.stdin.isatty()
+
+
+def _asked(draft: "Draft") -> str:
+    """Ask for what no file tells, until the answers make a profile; returns its text."""
+    from rigd.profile import ProfileError
+
+    typer.echo("From data sheets; Enter keeps the value in brackets, as assumed.", err=True)
+    try:
+        while True:
+            for question in draft.questions():
+                _ask(draft, question.key, question.text)
+            try:
+                return draft.text()
+            except ProfileError as error:
+                typer.echo(f"{error}\nOnce more:", err=True)
+    except typer.Abort:
+        typer.echo("Stopped; no profile was written.", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _ask(draft: "Draft", key: str, text: str) -> None:
+    """Ask until the answer is one that the key takes."""
+    while True:
+        given = typer.prompt(text, default=str(draft.value(key)), err=True)
+        try:
+            draft.answer(key, given.strip())
+            return
+        except ValueError as error:
+            typer.echo(f"{key}: {error}.", err=True)

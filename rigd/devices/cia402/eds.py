@@ -1,0 +1,385 @@
+"""Electronic data sheets (EDS and DCF files, CiA 306): what a drive has, as its vendor's file says.
+
+The canopen library interprets types, limits, defaults and node ids. What real files have and it
+refuses (byte order marks, keys in lower case, sections given twice or out of order, empty values,
+octal numbers, missing names) is put right in one place before: :func:`_put_right`.
+"""
+
+import io
+import logging
+import re
+import stat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from canopen.objectdictionary import ODVariable
+
+MAX_BYTES: Final = 4_000_000
+"""Of a file: the greatest that vendors publish have a quarter of it."""
+MAX_ENTRIES: Final = 20_000
+"""Of its objects and sub-indices: five times what the greatest drives have."""
+
+_BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
+_VARIABLE, _ARRAY, _RECORD = 0x7, 0x8, 0x9
+_BITS: Final = {
+    0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32,
+    0x10: 24, 0x11: 64, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64,
+    0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64,
+}  # fmt: skip
+"""Lengths of the basic data types (CiA 301)."""
+_SIGNED: Final = frozenset((0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15))
+_UNSIGNED32: Final = 0x07
+"""What a variable counts as whose type the file does not tell."""
+_DOMAIN: Final = 0x0F
+_LAST_BASIC_TYPE: Final = 0x1B
+_ACCESS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
+
+_OBJECT = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
+_MEMBER = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?(0x[0-9a-f]{1,32}|[0-9]{1,32})", re.IGNORECASE)
+
+_KEYS: Final = {
+    key.lower(): key
+    for key in (
+        "ParameterName", "DataType", "AccessType", "PDOMapping", "LowLimit",
+        "HighLimit", "DefaultValue", "ParameterValue",
+    )
+}  # fmt: skip
+"""Of an object, in CiA 306's spelling; further ones are of no use here."""
+
+Sections = dict[str, dict[str, str]]
+"""Keys and values of a file, by the names of its sections; both in lower case."""
+
+
+class EdsError(ValueError):
+    """A file cannot be used as an EDS; the message is one sentence that names it."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdsEntry:
+    """One object, or one sub-index of one, as the file describes it."""
+
+    index: int
+    sub: int
+    name: str
+    data_type: int
+    """By CiA 301: 0x0006 is UNSIGNED16."""
+    access: str
+    """``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
+    mappable: bool
+    """Into a PDO."""
+    default: int | None
+    """Value after power-up, or the one that a DCF sets; None: not told, or no whole number."""
+    low: int | None
+    high: int | None
+
+    @property
+    def writable(self) -> bool:
+        """Whether the drive takes a value."""
+        return "w" in self.access
+
+    @property
+    def bits(self) -> int | None:
+        """Length of the value; None of a text or block."""
+        return _BITS.get(self.data_type)
+
+
+@dataclass(frozen=True, slots=True)
+class Eds:
+    """What a file tells of a drive."""
+
+    path: Path
+    node_id: int
+    """For which it was read."""
+    vendor_name: str
+    vendor_id: int
+    """What object 1018:1 shows; 0: not told."""
+    product_name: str
+    product_code: int
+    """What object 1018:2 shows; 0: not told."""
+    bit_rates_bit_s: tuple[int, ...]
+    """Empty: not told."""
+    commissioned_node_id: int
+    """Of the one drive that a DCF configures; 0: not told."""
+    entries: Mapping[tuple[int, int], EdsEntry]
+    """By index and sub-index; a plain variable has the sub-index 0."""
+
+    def get(self, index: int, sub: int = 0) -> EdsEntry | None:
+        """Return an object, or None where the file has none."""
+        return self.entries.get((index, sub))
+
+    def has(self, index: int) -> bool:
+        """Whether the file has an object, or any sub-index of it."""
+        return any((index, sub) in self.entries for sub in range(256))
+
+
+def read_eds(path: Path, node_id: int = 1) -> Eds:
+    """Read an EDS or DCF file.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    node_id
+        Of the drive: what ``$NODEID`` stands for in the file.
+
+    Returns
+    -------
+    Eds
+
+    Raises
+    ------
+    EdsError
+        If there is no such file, it is too large, or no EDS.
+    """
+    sections = _sections(_text(path), path)
+    device = sections.get("deviceinfo", {})
+    entries = {(e.index, e.sub): e for e in _entries(_put_right(sections, path), node_id)}
+    if not entries:
+        raise EdsError(f"{path}: is no EDS file: no object of a drive is described in it.")
+    return Eds(
+        path=path,
+        node_id=node_id,
+        vendor_name=_shown(device.get("vendorname", "")),
+        vendor_id=_identity(entries, 1, device.get("vendornumber", "")),
+        product_name=_shown(device.get("productname", "")),
+        product_code=_identity(entries, 2, device.get("productnumber", "")),
+        bit_rates_bit_s=tuple(
+            1000 * rate
+            for rate in _BIT_RATES_KBIT_S
+            if _integer(device.get(f"baudrate_{rate}", ""))
+        ),
+        commissioned_node_id=_commissioned(sections),
+        entries=entries,
+    )
+
+
+def _commissioned(sections: Sections) -> int:
+    # The first spelling is CiA 306's.
+    for title in ("devicecomissioning", "devicecommissioning"):
+        node_id = _integer(sections.get(title, {}).get("nodeid", ""))
+        if 1 <= node_id <= 127:
+            return node_id
+    return 0
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file of reasonable size, whatever its encoding."""
+    try:
+        # Opened before its kind is known, a pipe would be waited for.
+        found = path.stat()
+        if stat.S_ISDIR(found.st_mode):
+            raise EdsError(f"{path}: is a folder; name the EDS file in it.")
+        if not stat.S_ISREG(found.st_mode):
+            raise EdsError(f"{path}: is no ordinary file; name the drive's EDS file.")
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise EdsError(f"{path}: cannot be read ({error.strerror}).") from error
+    except ValueError as error:  # a NUL in the name
+        raise EdsError(f"{str(path)!r}: cannot be read ({error}).") from error
+    if len(data) > MAX_BYTES:
+        raise EdsError(
+            f"{path}: has more than {MAX_BYTES / 1e6:g} MB, which no EDS file of a drive has."
+        )
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("cp1252", errors="replace")
+    if "\0" in text:
+        raise EdsError(f"{path}: is no EDS file: it is not text.")
+    if text.lstrip().startswith("<"):
+        raise EdsError(
+            f"{path}: is XML (an XDD file, or ESI of EtherCAT) and no EDS file; "
+            "ask the vendor for the drive's EDS of CANopen."
+        )
+    return text
+
+
+def _sections(text: str, path: Path) -> Sections:
+    """Take a file apart; what is neither section nor key is passed over.
+
+    Of sections and keys that stand twice the first counts.
+    """
+    sections: Sections = {}
+    keys: dict[str, str] = {}
+    for line in map(str.strip, text.splitlines()):
+        if not line or line[0] in ";#":
+            continue
+        if line[0] == "[":
+            title, bracket, _ = line[1:].partition("]")
+            # Without its end it is no section, and what follows belongs to none.
+            keys = sections.setdefault(title.strip().lower(), {}) if bracket else {}
+            if len(sections) > MAX_ENTRIES:
+                raise _too_many(path)
+            continue
+        key, equals, value = line.partition("=")
+        if equals:
+            # A comment may follow after white space, as canopen has it.
+            keys.setdefault(key.strip().lower(), re.split(r"\s;", value, maxsplit=1)[0].strip())
+    return sections
+
+
+def _too_many(path: Path) -> EdsError:
+    return EdsError(
+        f"{path}: describes more than {MAX_ENTRIES} objects, which no EDS file of a drive does."
+    )
+
+
+def _put_right(sections: Sections, path: Path) -> Sections:
+    """Return the objects of a file as the canopen library takes them.
+
+    Each object comes before its sub-indices; every sub-index is written out, also those that an
+    array declares together (``CompactSubObj``); names, types and access rights are there; keys have
+    CiA 306's spelling, and numbers are decimal. What has no value is left out.
+    """
+    members: dict[int, dict[int, dict[str, str]]] = {}
+    for title, keys in sections.items():
+        if match := _MEMBER.fullmatch(title):
+            members.setdefault(int(match[1], 16), {}).setdefault(int(match[2], 16), keys)
+        elif _OBJECT.fullmatch(title):
+            members.setdefault(int(title, 16), {})
+    right: Sections = {}
+    for index, subs in members.items():
+        title = f"{index:04x}"
+        keys = sections.get(title, {})
+        for sub, compact in _compact_members(title, sections):
+            subs.setdefault(sub, compact)
+        # Neither a kind that is missing nor a wrong one makes members disappear.
+        kind = _integer(keys.get("objecttype", ""))
+        if subs:
+            kind = _RECORD
+        elif kind in (_ARRAY, _RECORD) and "datatype" not in keys:
+            continue  # nothing of it is described
+        else:
+            kind = _VARIABLE
+        shared = {key: keys[key] for key in ("datatype", "accesstype") if key in keys}
+        name = keys.get("parametername") or title.upper()
+        right[title] = _object_keys(keys, name, kind, sections)
+        for sub in sorted(subs):
+            own = _object_keys(shared | subs[sub], name, _VARIABLE, sections)
+            right[f"{title}sub{sub:X}"] = own
+        if len(right) > MAX_ENTRIES:
+            raise _too_many(path)
+    return right
+
+
+def _compact_members(title: str, sections: Sections) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield the sub-indices that an object declares together, with their own names and values."""
+    shared = dict(sections.get(title, {}))
+    count = _integer(shared.pop("compactsubobj", ""))
+    if not 0 < count < 255:
+        return
+    names, values = (sections.get(title + end, {}) for end in ("name", "value"))
+    yield (
+        0,
+        {
+            "parametername": "Number of entries",
+            "datatype": "0x0005",
+            "accesstype": "ro",
+            "defaultvalue": str(count),
+        },
+    )
+    for sub in range(1, count + 1):
+        own = {"parametername": names.get(str(sub), ""), "parametervalue": values.get(str(sub), "")}
+        yield sub, shared | {key: value for key, value in own.items() if value}
+
+
+def _object_keys(
+    keys: Mapping[str, str], name: str, kind: int, sections: Sections
+) -> dict[str, str]:
+    """Return the keys of an object that are of use, without those that have no value."""
+    found = {_KEYS[key]: value for key, value in keys.items() if key in _KEYS and value}
+    for key in ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit"):
+        if key in found:
+            found[key] = _NUMBER.sub(lambda match: str(_integer(match[0])), found[key])
+    data_type = _integer(found.get("DataType", ""))
+    if data_type > _LAST_BASIC_TYPE:
+        # Tools define a type of their own for a number with limits, as an object whose sub-index 1
+        # names the basic type.
+        basic = sections.get(f"{data_type:x}sub1", {}).get("defaultvalue", "")
+        data_type = _integer(basic)
+        if not 0 < data_type <= _LAST_BASIC_TYPE:
+            data_type = _DOMAIN
+    access = found.get("AccessType", "").lower()
+    return found | {
+        "ParameterName": found.get("ParameterName", name),
+        "ObjectType": str(kind),
+        "DataType": str(data_type if data_type > 0 else _UNSIGNED32),
+        "AccessType": access if access in _ACCESS else "rw",
+        "PDOMapping": str(_integer(found.get("PDOMapping", ""))),
+    }
+
+
+class _CleanFile(io.StringIO):
+    """A text that canopen takes for a file; it goes by the end of the name."""
+
+    name = "drive.eds"
+
+
+def _entries(right: Sections, node_id: int) -> Iterator[EdsEntry]:
+    """Have the canopen library interpret the objects of a file that has been put right."""
+    from canopen import import_od
+    from canopen.objectdictionary import ODVariable
+
+    # It warns of what is missing in a file; without a handler that would be printed.
+    logging.getLogger("canopen").addHandler(logging.NullHandler())
+    lines = ["[DeviceInfo]"]  # whose absence it warns of in a way that Python deprecates
+    for title, keys in right.items():
+        lines.append(f"[{title}]")
+        lines += [f"{key}={value}" for key, value in keys.items()]
+    for found in import_od(_CleanFile("\n".join(lines)), node_id).values():
+        if isinstance(found, ODVariable):
+            yield _entry(found)
+        else:
+            yield from map(_entry, found.subindices.values())
+
+
+def _entry(variable: "ODVariable") -> EdsEntry:
+    value = variable.default if variable.value is None else variable.value
+    data_type = variable.data_type or _UNSIGNED32
+    default = value if type(value) is int else None
+    bits = _BITS.get(data_type)
+    if default is not None and bits and data_type in _SIGNED and default >> bits - 1 == 1:
+        default -= 1 << bits  # written as a positive hexadecimal number
+    return EdsEntry(
+        index=variable.index,
+        sub=variable.subindex,
+        name=_shown(variable.name),
+        data_type=data_type,
+        access=variable.access_type,
+        mappable=variable.pdo_mappable,
+        default=default,
+        low=variable.min,
+        high=variable.max,
+    )
+
+
+def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str) -> int:
+    """Return what 1018 shows of itself: as the object says, else as the head of the file does."""
+    entry = entries.get((0x1018, sub))
+    value = (entry.default if entry else None) or _integer(stated)
+    return value if 0 <= value < 0xFFFF_FFFF else 0  # all bits set is how some say nothing
+
+
+def _integer(text: str) -> int:
+    """Return a number in CiA 306's notation: 0x1F, 31, or octal 037; 0 of anything else."""
+    match = _NUMBER.fullmatch(text.strip())
+    if match is None:
+        return 0
+    digits = match[0].lower()
+    octal = re.fullmatch(r"([+-]?)0([0-7]+)", digits)
+    if octal:
+        return int(octal[1] + octal[2], 8)
+    return int(digits, 16) if "x" in digits else int(digits)
+
+
+def _shown(text: str) -> str:
+    """Return a text of the file as messages may show it: one line, printable, not too long."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:80]
