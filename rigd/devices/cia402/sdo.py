@@ -38,6 +38,10 @@ _EDS = Path(__file__).with_name("drive.eds")
 _SDO_TIMEOUT_S = 0.5
 _SDO_TRIES = 2
 _HURRIED_TIMEOUT_S = 0.05
+_LATE_REPLIES = 3
+"""How many replies to earlier requests, given up since, may come in place of the one awaited."""
+_TIMED_OUT = "No SDO response"
+"""How canopen begins to tell that nothing came at all; what else it tells came, and was not it."""
 _RECEIVER_POLL_S = 0.02
 _ABSENT = {
     0x0602_0000: "no such object",
@@ -278,10 +282,7 @@ class SdoAccess:
         variable = SdoVariable(self._node.sdo, self._variable(index, sub))
         what = "reading" if value is None else f"writing {show_value(value)} to"
         try:
-            if value is None:
-                return variable.raw
-            variable.raw = value
-            return value
+            return _ask(variable, value)
         except canopen.SdoAbortedError as error:
             remedy = (
                 " Name the drive's EDS file in the profile (cia402.eds), which has its types."
@@ -322,6 +323,20 @@ class SdoAccess:
         name = self._variable(index, sub).name
         place = f"{index:04X}:{sub}" if sub else f"{index:04X}"
         return f"object {place}" + (f" ({name})" if name else "")
+
+
+def _ask(variable: SdoVariable, value: int | None) -> object:
+    """Write a value or read one, past replies to requests that were given up before."""
+    for left in reversed(range(_LATE_REPLIES + 1)):
+        try:
+            if value is None:
+                return variable.raw
+            variable.raw = value
+            return value
+        except canopen.SdoCommunicationError as error:
+            if not left or str(error).startswith(_TIMED_OUT):
+                raise
+    raise AssertionError
 
 
 def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
