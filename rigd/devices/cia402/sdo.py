@@ -105,29 +105,16 @@ class SdoAccess:
         Of the drive.
     name
         Of the drive, for messages.
-    eds
-        Path of the drive's EDS file, or empty.
-
-    Attributes
-    ----------
-    eds_identity : tuple of int
-        Vendor and product number in the drive's EDS file; 0 where it states none.
-
-    Raises
-    ------
-    DeviceError
-        If the EDS file cannot be read.
     """
 
-    def __init__(self, port: CanPort, node_id: int, name: str, eds: str = "") -> None:
+    def __init__(self, port: CanPort, node_id: int, name: str) -> None:
         for library in ("can", "canopen"):
             # What goes wrong is raised; without a handler they would also print it.
             logging.getLogger(library).addHandler(logging.NullHandler())
         self._name = name
         self._bus_name = port.name
-        dictionary = canopen.import_od(str(_EDS), node_id)
-        self.eds_identity = _take_types(dictionary, eds, node_id) if eds else (0, 0)
-        self._node = canopen.RemoteNode(node_id, dictionary)
+        self._node_id = node_id
+        self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_EDS), node_id))
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
         self._node.sdo.MAX_RETRIES = _SDO_TRIES
         port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
@@ -169,6 +156,21 @@ class SdoAccess:
             raise DeviceError(
                 f"{error} Look at its supply, its node id (cia402.node_id) and bit rate{heard}."
             ) from None
+
+    def use_eds(self, path: str) -> tuple[int, int]:
+        """Take objects' types from the drive's EDS file from now on.
+
+        Returns
+        -------
+        tuple of int
+            Vendor and product number in it; 0 where it states none.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be read.
+        """
+        return _take_types(self._node.object_dictionary, path, self._node_id)
 
     def tell_pre_operational(self) -> None:
         """Tell the drive to leave operational, which it may ignore; nobody waits for it.
