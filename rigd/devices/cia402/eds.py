@@ -31,8 +31,6 @@ _BITS: Final = {
 }  # fmt: skip
 """Lengths of the basic data types (CiA 301)."""
 _SIGNED: Final = frozenset((0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15))
-_UNSIGNED32: Final = 0x07
-"""What a variable counts as whose type the file does not tell."""
 _DOMAIN: Final = 0x0F
 _LAST_BASIC_TYPE: Final = 0x1B
 _ACCESS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
@@ -66,7 +64,7 @@ class EdsEntry:
     sub: int
     name: str
     data_type: int
-    """By CiA 301: 0x0006 is UNSIGNED16."""
+    """By CiA 301: 0x0006 is UNSIGNED16; 0: not told."""
     access: str
     """``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
     mappable: bool
@@ -83,7 +81,7 @@ class EdsEntry:
 
     @property
     def bits(self) -> int | None:
-        """Length of the value; None of a text or block."""
+        """Length of the value; None of a text or block, or where no type is told."""
         return _BITS.get(self.data_type)
 
 
@@ -311,7 +309,7 @@ def _object_keys(
     return found | {
         "ParameterName": found.get("ParameterName", name),
         "ObjectType": str(kind),
-        "DataType": str(data_type if data_type > 0 else _UNSIGNED32),
+        "DataType": str(max(data_type, 0)),
         "AccessType": access if access in _ACCESS else "rw",
         "PDOMapping": str(_integer(found.get("PDOMapping", ""))),
     }
@@ -343,7 +341,7 @@ def _entries(right: Sections, node_id: int) -> Iterator[EdsEntry]:
 
 def _entry(variable: "ODVariable") -> EdsEntry:
     value = variable.default if variable.value is None else variable.value
-    data_type = variable.data_type or _UNSIGNED32
+    data_type = variable.data_type or 0
     default = value if type(value) is int else None
     bits = _BITS.get(data_type)
     if default is not None and bits and data_type in _SIGNED and default >> bits - 1 == 1:

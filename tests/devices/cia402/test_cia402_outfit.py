@@ -340,12 +340,17 @@ PDOMapping=0
         with pytest.raises(DeviceError, match=r"ProductNumber in .*drive\.eds is 0x00000007"):
             make(eds=self.eds(tmp_path, product="7")).connect()
 
-    @pytest.mark.parametrize("content", ["nonsense", "[60E0\n", "\0\0", "[6040]\nDataType=x\n"])
+    def test_a_type_that_it_does_not_tell_stays_that_of_the_standard(self, make, tmp_path):
+        path = tmp_path / "drive.eds"
+        path.write_text("[6040]\nDataType=x\n[6072]\nParameterName=Max torque\n")
+        make(eds=str(path)).connect()
+
+    @pytest.mark.parametrize("content", ["nonsense", "[60E0\n", "\0\0", "<xml/>"])
     def test_a_file_that_is_none(self, make, scripted, tmp_path, content):
         path = tmp_path / "broken.eds"
         path.write_text(content)
         scripted.state, scripted.torque = "enabled", 200
-        with pytest.raises(DeviceError, match=r"broken\.eds: this EDS file cannot be read"):
+        with pytest.raises(DeviceError, match=r"broken\.eds: is .*Get it anew"):
             make(eds=str(path)).connect()
         # Not even that leaves a drive turning.
         assert (scripted.state, scripted.torque) == ("switch-on disabled", 0)

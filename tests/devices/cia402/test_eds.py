@@ -158,6 +158,12 @@ def test_a_type_of_its_own_for_a_number_with_limits(read):
     assert found.get(0x6073).bits is None
 
 
+@pytest.mark.parametrize("told", ["", "DataType=\n", "DataType=x\n", "DataType=0\n"])
+def test_a_type_that_is_not_told_is_none(read, told):
+    entry = read(f"[6040]\n{told}AccessType=rw\nDefaultValue=0x10\nHighLimit=20\n").get(0x6040)
+    assert (entry.data_type, entry.bits, entry.default, entry.high) == (0, None, 16, 20)
+
+
 def test_limits(read):
     found = read("[6060]\nDataType=2\nLowLimit=0xFF\nHighLimit=0x0A\n")
     assert (found.get(0x6060).low, found.get(0x6060).high) == (-1, 10)
