@@ -87,7 +87,8 @@ def inject(
     status,bits=0x0080[,for=0.5]              the sensor reports errors
     jump,counts=-500                          the encoder slips
     cut[,device=bus|sensor]                   the bus, or a sensor's serial line, is cut
-    restart,device=drive|sensor               its supply fails for a moment
+    restart,device=drive|sensor               it starts anew by itself
+    power_cycle,device=drive|sensor           it is switched off and on
     lag,ms=3.2[,for=0.5]                      the drive's actual torque (6077) is late
     no_bit_12[,for=0.5]                       its statusword does not say that it follows
     no_pre_operational[,for=0.5]              it does not take NMT pre-operational

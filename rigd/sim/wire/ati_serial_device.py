@@ -156,14 +156,18 @@ class AtiSerialDevice:
             self.streaming = False
             self._log("sensor", "stream stopped")
 
-    def restart(self) -> None:
-        """Have its supply fail for a moment: it streams no more, and remembers no set-up."""
+    def reset(self) -> None:
+        """Start anew by itself: it streams no more, and remembers no set-up."""
         self.streaming = self._unlocked = False
         self._holding = dict(self._at_power_up)
         self._unset = list(range(6))
         self._partial = b""
         self._jam = 0
         self._log("sensor", "restart")
+
+    def power_cycle(self) -> None:
+        """Take its power away and give it back, which is no different here."""
+        self.reset()
 
     def tick(self, now_s: float) -> None:
         """Forget an incomplete request when the line has been silent for long."""

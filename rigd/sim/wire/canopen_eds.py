@@ -25,6 +25,7 @@ _MOST_BYTES = 8_000_000
 _FIRST_INDEX = 0x1000
 """Below it stand types and dummies, which nobody can read."""
 _IDENTITY = 0x1018
+_WATCHED, _ONE_NODE = 0x1016, 0x1_0000
 
 _KINDS = {
     datatypes.BOOLEAN: "B",
@@ -203,6 +204,8 @@ def _described(variable: ODVariable) -> Description:
     low, high = variable.min, 1 if data_type == datatypes.BOOLEAN else variable.max
     if low is not None and high is not None and low >= high:  # as tools write that know none
         low = high = None
+    if variable.index == _WATCHED and high is not None and high < _ONE_NODE:
+        low = high = None  # some files limit the time in its lower half and forget the node above
     default = _fitted(value, kind) if isinstance(value, int) else None
     return Description(kind, access, directions, default, low, high)
 

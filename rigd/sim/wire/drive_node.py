@@ -264,9 +264,13 @@ class DriveNode:
         """Have the drive fail with an error code, bits of the error register, vendor's bytes."""
         self._fail(code, register, vendor)
 
-    def restart(self) -> None:
-        """Have its supply fail for a moment: it boots, and remembers nothing."""
+    def reset(self) -> None:
+        """Start anew by itself: it boots, and remembers nothing."""
         self._boot()
+
+    def power_cycle(self) -> None:
+        """Take its power away and give it back, which is no different here."""
+        self.reset()
 
     @property
     def sto_dropped(self) -> bool:

@@ -86,12 +86,14 @@ KINDS: dict[str, dict[str, _Key]] = {
     "jump": {"counts": _whole(-(2**31), 2**31 - 1, needed=True)},
     "cut": {"device": _one_of("bus", "sensor", default="bus")},
     "restart": {"device": _DEVICE},
+    "power_cycle": {"device": _DEVICE},
     "lag": {"ms": _positive(needed=True), "for": _FOR},
     "no_pre_operational": {"for": _FOR},
     "no_bit_12": {"for": _FOR},
     "no_watch": {"for": _FOR},
 }
-LASTING = tuple(kind for kind in KINDS if kind not in ("emcy", "jump", "restart"))
+_MOMENTARY = ("emcy", "jump", "restart", "power_cycle")
+LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
 """What goes on until it ends by itself or is ended."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 

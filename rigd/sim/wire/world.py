@@ -38,8 +38,11 @@ class Node(Protocol):
 
     frozen: bool
 
-    def restart(self) -> None:
-        """Start as at power-on."""
+    def reset(self) -> None:
+        """Start anew by itself."""
+
+    def power_cycle(self) -> None:
+        """Start as when its power comes back."""
 
     def receive(self, can_id: int, data: bytes) -> None:
         """Take a frame that somebody else sent."""
@@ -53,8 +56,11 @@ class SerialDevice(Protocol):
 
     frozen: bool
 
-    def restart(self) -> None:
-        """Start as at power-on."""
+    def reset(self) -> None:
+        """Start anew by itself."""
+
+    def power_cycle(self) -> None:
+        """Start as when its power comes back."""
 
     def receive(self, data: bytes) -> None:
         """Take bytes that the host sent."""
@@ -379,8 +385,9 @@ class World:
             self._stand(fault, self, "bus_off", True)
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
-        elif fault.kind == "restart":
-            (drive if values["device"] == "drive" else sensor).restart()
+        elif fault.kind in ("restart", "power_cycle"):
+            device = drive if values["device"] == "drive" else sensor
+            (device.reset if fault.kind == "restart" else device.power_cycle)()
         elif fault.kind == "lag":
             self._stand(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
         elif fault.kind in _TRAITS:

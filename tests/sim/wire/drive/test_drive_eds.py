@@ -183,6 +183,12 @@ def test_limits_of_the_file_hold(eds_bench, tmp_path):
     ]
 
 
+def test_a_limit_that_leaves_no_room_for_a_node_is_no_limit_of_the_watch(eds_bench):
+    bench = eds_bench(eds_path("elmo_gold"))
+    assert bench.write(0x1016, 1, 100 << 16 | 50, 4) == 0
+    assert bench.read(0x1016, 1) == 100 << 16 | 50
+
+
 PDOS = """
 1400:0 u8 ro 2
 1400:1 u32 rw $NODEID+0x200

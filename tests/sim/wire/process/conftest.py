@@ -24,7 +24,10 @@ class Drive:
     """Answers each SYNC with the number of periods that the rig has moved so far."""
 
     def __init__(self, step, send):
-        self.frozen = False
+        self.frozen = self.sto_dropped = False
+        self.torque_lag_s = 0.0
+        self.never_follows = self.stays_operational = self.watchless = False
+        self.restarts = []
         self.angle_offset_counts = 0
         self.heard = []
         self.ticks_s = []
@@ -43,6 +46,12 @@ class Drive:
     def tick(self, now_s):
         self.ticks_s.append(now_s)
 
+    def reset(self):
+        self.restarts.append("restart")
+
+    def power_cycle(self):
+        self.restarts.append("power_cycle")
+
     def emergency(self, code, register, vendor):
         self.emergencies.append((code, register, vendor))
 
@@ -55,7 +64,14 @@ class Sensor:
         self.saturate = None
         self.status_bits = 0
         self.heard = []
+        self.restarts = []
         self.send = send
+
+    def reset(self):
+        self.restarts.append("restart")
+
+    def power_cycle(self):
+        self.restarts.append("power_cycle")
 
     def receive(self, can_id, data):
         self.heard.append((can_id, data))

@@ -26,6 +26,7 @@ OPTIONAL = {
     "jump": ({"counts": whole(-(2**31), 2**31 - 1)}, {}),
     "cut": ({}, {"device": st.sampled_from(["bus", "sensor"])}),
     "restart": ({"device": device}, {}),
+    "power_cycle": ({"device": device}, {}),
     "lag": ({"ms": positive}, {"for": positive}),
     "no_pre_operational": ({}, {"for": positive}),
     "no_bit_12": ({}, {"for": positive}),

@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from rigd.sim.wire.faults import FaultError, parse_fault
+from rigd.sim.wire.faults import LASTING, LINE_KINDS, FaultError, parse_fault
 
 PERIOD_NS = 1_000_000
 RPDO, POLL = 0x201, 0x680
@@ -285,6 +285,82 @@ def test_a_fault_with_an_end_ends(make_world, spec, device, attribute, normal, v
         rig.sync(tick)
     assert seen == [value, value, value, normal, normal]
     assert [time_s for time_s, *_ in rig.log.of("fault over")] == [0.004]
+
+
+ENDLESS = [
+    ("freeze,device=drive", "drive", "frozen", False),
+    ("freeze,device=sensor", "sensor", "frozen", False),
+    ("sto", "drive", "sto_dropped", False),
+    ("busoff", "world", "bus_off", False),
+    ("saturate,gauge=4", "sensor", "saturate", None),
+    ("status,bits=0x0080", "sensor", "status_bits", 0),
+    ("lag,ms=3", "drive", "torque_lag_s", 0.0),
+    ("no_bit_12", "drive", "never_follows", False),
+    ("no_pre_operational", "drive", "stays_operational", False),
+    ("no_watch", "drive", "watchless", False),
+]
+
+
+@pytest.mark.parametrize("kind", [True, False], ids=["by kind", "all"])
+@pytest.mark.parametrize(("spec", "device", "attribute", "normal"), ENDLESS)
+def test_a_fault_without_an_end_is_ended(make_world, spec, device, attribute, normal, kind):
+    rig = make_world()
+    fault = parse_fault(spec)
+    rig.world.inject(fault)
+    assert getattr(getattr(rig, device), attribute) != normal
+    other = "sto" if fault.kind != "sto" else "freeze"
+    rig.world.inject(parse_fault(f"end,fault={other}"))
+    assert getattr(getattr(rig, device), attribute) != normal
+    rig.world.inject(parse_fault(f"end,fault={fault.kind}" if kind else "end"))
+    assert getattr(getattr(rig, device), attribute) == normal
+    assert [values["fault"] for *_, values in rig.log.of("fault over")] == [str(fault)]
+    rig.world.inject(parse_fault("end"))
+    assert len(rig.log.of("fault over")) == 1
+
+
+def test_every_fault_that_lasts_is_ended_here():
+    held = {spec.partition(",")[0] for spec, *_ in ENDLESS}
+    assert {*held, *LINE_KINDS, "cut"} == set(LASTING)
+
+
+def test_what_two_faults_hold_stays_until_both_are_over(make_world):
+    rig = make_world()
+    rig.sync(1)
+    rig.world.inject(parse_fault("freeze,device=drive,for=0.002"))
+    rig.world.inject(parse_fault("freeze,device=drive,for=0.004"))
+    seen = []
+    for tick in range(2, 8):
+        seen.append(rig.drive.frozen)
+        rig.sync(tick)
+    assert seen == [True, True, True, True, False, False]
+
+
+@pytest.mark.parametrize("kind", LINE_KINDS)
+def test_faults_of_a_line_are_ended(make_world, kind):
+    rig = make_world()
+    more = ",ms=1" if kind == "delay" else ""
+    rig.world.inject(parse_fault(f"{kind},from=host,frames=1000{more}"))
+    assert rig.world.disturbed == ["host"]
+    rig.world.inject(parse_fault("end"))
+    assert rig.world.disturbed == []
+    assert through(rig, 0, 3) == [0, 1, 2]
+
+
+def test_what_was_cut_is_mended_once(make_world):
+    rig = make_world(serial=True)
+    for spec in ("cut", "cut", "cut,device=sensor", "end,fault=cut", "end"):
+        rig.world.inject(parse_fault(spec))
+    assert rig.mended == ["bus", "sensor"]
+
+
+@pytest.mark.parametrize("kind", ["restart", "power_cycle"])
+@pytest.mark.parametrize("device", ["drive", "sensor"])
+def test_a_device_starts_anew(make_world, kind, device):
+    rig = make_world()
+    rig.world.inject(parse_fault(f"{kind},device={device}"))
+    assert (rig.drive.restarts, rig.sensor.restarts) == (
+        ([kind], []) if device == "drive" else ([], [kind])
+    )
 
 
 def test_an_emergency_is_the_drive_s(make_world):

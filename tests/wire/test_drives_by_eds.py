@@ -1,0 +1,56 @@
+"""Sessions on simulated drives that are made from EDS files."""
+
+import time
+
+import pytest
+from eds_files import eds_path
+
+from rigd.devices.resetting import reset_drive
+from rigd.sim.wire.simulate import inject
+from rigd.supervisor.rig import Rig, RigError
+
+CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1, "duration_s": 0.5}
+
+
+def test_a_drive_with_torque_mode_runs_fails_is_reset_and_runs_again(
+    quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
+):
+    path, log = quiet_profile("antenna_can"), tmp_path / "drive.jsonl"
+    start_simulator(path, "--lock-step", "--log", log, "--eds", eds_path("elmo_gold"))
+    profile = load(path)
+    first = run_order(profile, "first", fast=True, **CHIRP)
+    assert first.went_well, first.reason
+    written = {(e["index"], e["sub"]) for e in drive_log(log).of("sdo write")}
+    assert ("1016", 1) in written
+    assert ("60E0", 0) not in written  # read-only there
+    inject(profile.name, ["emcy,code=0x2310"])
+    assert "The fault is reset" in reset_drive(profile.rig)
+    again = run_order(profile, "again", fast=True, **CHIRP)
+    assert again.went_well, again.reason
+
+
+def test_a_drive_without_torque_mode_is_refused_by_name(quiet_profile, start_simulator, load):
+    path = quiet_profile("antenna_can")
+    start_simulator(path, "--lock-step", "--eds", eds_path("pilz_prbt"))
+    rig = Rig(load(path), fast=True)
+    begun = time.monotonic()
+    with pytest.raises(RigError, match="no cyclic synchronous torque mode"):
+        rig.connect()
+    assert time.monotonic() - begun < 30.0
+    rig.disconnect()
+
+
+def test_the_profile_s_own_file_makes_the_drive(quiet_profile, start_simulator, load):
+    path = quiet_profile("antenna_can")
+    text = path.read_text()
+    path.write_text(text.replace("[cia402]\n", f'[cia402]\neds = "{eds_path("pilz_prbt")}"\n', 1))
+    start_simulator(path, "--lock-step")
+    told = inject(load(path).name, [])
+    assert "drive: pilz_prbt.eds" in told
+
+
+def test_a_file_that_is_none_ends_the_command(rigd, quiet_profile, runtime_folder, tmp_path):
+    done = rigd("simulate", "--profile", quiet_profile("antenna_can"), "--eds", tmp_path / "no.eds")
+    assert done.returncode == 1
+    assert "There is no EDS file" in done.stderr
+    assert "Traceback" not in done.stderr
