@@ -30,6 +30,7 @@ MESSAGES = {
     "statusword corrupted": r"Drive .*statusword",
     "controlword corrupted": r"Drive .*command came over the bus that this computer did not give",
     "sensor reports an error": r"Sensor .*0x8040.*calibration",
+    "sensor restarted": r"Sensor .*watchdog has reset it .*0x8001.*back at calibration 0",
     "gauge at its end": r"sensor's f. of .* N exceeds its limit",
     "bus cut": r"CAN bus .*(cut off|takes no more frames|cannot be read)",
     "loop's frames lost": rf"{STALE} ticks",
