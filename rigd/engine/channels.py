@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from rigd.engine.board import Board, Stop, Word
 from rigd.engine.ring import Ring, RingSpec
-from rigd.engine.topics import BUFFERED_S, TOPICS
+from rigd.engine.topics import TOPICS
+from rigd.safety.limits import BUFFERED_S
 
 DESCRIPTORS = len(TOPICS) + 2
 """Of shared memory, for :func:`create_channels`."""

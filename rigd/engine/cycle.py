@@ -1,5 +1,6 @@
 """One tick: read the devices, check the limits, control, command."""
 
+from collections import deque
 from math import inf
 
 from rigd.control import PidController
@@ -15,6 +16,17 @@ _UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
 _TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
 _LIMIT_WARNING = int(Status.LIMIT_WARNING)
 _TORQUE_OFF = int(Status.TORQUE_OFF)
+
+_RECENT_TICKS = 32
+_SPEED_TICKS = 4
+"""Of the recent ticks, at either end, over which the speed is taken."""
+_SURE_STEPS = 10
+"""Encoder steps within `_SPEED_TICKS` above which a speed is one, and not the encoder's noise."""
+_GAIN = 0.2
+"""Part of the speed that has to be of these ticks: less says nothing about the torque in them."""
+_AGAINST = 1 / 3, 3.0
+"""Acceleration against the torque, over the one that the torque should give: friction and a motor
+whose inertia is only assumed stay within."""
 
 
 class Cycle:
@@ -68,6 +80,7 @@ class Cycle:
         self._were_unusable = False
         self._commanding = False
         self._torque_squares_nm2 = 0.0
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_RECENT_TICKS)
 
     def observe(self, due_ns: int) -> None:
         """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
@@ -105,6 +118,7 @@ class Cycle:
         )
         violation = violation or self.check_stale()
         if violation is not None:
+            self._recent.append((self.angle_rad, 0.0, 0.0))
             self.torque_off()
             self.flags |= _LIMIT_WARNING
             return violation
@@ -122,8 +136,41 @@ class Cycle:
         self._commanding = True
         sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
         self._torque_squares_nm2 += sent_nm * sent_nm
+        self._recent.append((self.angle_rad, self.coupling_torque_nm, sent_nm))
         self.flags = flags
         return None
+
+    def forget_recent(self) -> None:
+        """Begin anew with what `turns_against_torque` goes by."""
+        self._recent.clear()
+
+    def turns_against_torque(
+        self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
+    ) -> bool:
+        """Whether the shaft has just got faster and faster against the torque on it.
+
+        The torque on the motor is the commanded one less the coupling torque, which the sensor
+        measures: whatever is done to the beam is in it. A motor that answers by about as much as
+        its inertia lets it, but the other way round, has the sign of its angle or torque wrong, or
+        is turned by somebody at the shaft itself. Called after a tick whose check found a limit
+        violated.
+        """
+        recent = self._recent
+        if len(recent) < _RECENT_TICKS:
+            return False
+        angles_rad = [angle_rad for angle_rad, _, _ in recent]
+        before_rad = angles_rad[_SPEED_TICKS] - angles_rad[0]
+        now_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_TICKS]
+        faster_rad = now_rad - before_rad
+        if abs(now_rad) < _SURE_STEPS * resolution_rad or abs(faster_rad) < _GAIN * abs(now_rad):
+            return False
+        half = _SPEED_TICKS // 2
+        torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent]
+        impulse_nm_s = sum(torques_nm[half : -1 - half]) / rate_hz
+        expected_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
+        least, most = _AGAINST
+        against = -faster_rad * expected_rad
+        return least * expected_rad**2 <= against <= most * expected_rad**2 and against > 0.0
 
     @property
     def stale(self) -> bool:

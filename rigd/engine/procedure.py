@@ -6,6 +6,7 @@ through the same cycle and leaves its results in the metadata.
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -33,6 +34,12 @@ _GO_POLL_S = 0.0002
 _GO_PATIENCE_S = 10.0
 _SUPERVISOR_PATIENCE_S = 2.0
 """Of time that this process has run itself: a computer that stands still is nobody's fault."""
+_OF_MOTION = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
+_AGAINST_TORQUE = (
+    "The shaft gets faster against the torque: angle and torque do not count in the same sense. "
+    "Look at the drive's own polarity (object 607E), cia402.direction and the wiring of motor and "
+    "encoder; a lower amplitude does not help."
+)
 _SWINGING = 2.0
 """Spread of the torque after a session, over that before it, from which on the beam is swinging."""
 
@@ -199,6 +206,7 @@ class Procedure:
         # The angle of the last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
         self._cycle.controller.reset(self._start_angle_rad)
+        self._cycle.forget_recent()
         self._cycle.watch.reset(self._start_angle_rad)
         for number in range(round(_SETTLE_S * self._rate_hz)):
             # Enabling, right before the first, takes its time.
@@ -346,9 +354,17 @@ class Procedure:
             return SessionEnd("fault", reason, device_failed=True)
         if violation is None:
             return None
+        if violation.channel in _OF_MOTION and self._turns_against_torque():
+            violation = replace(violation, remedy=_AGAINST_TORQUE)
         # The zero is void then, and with it the limits of every further session.
         slipped = violation.channel == BY_NAME["encoder jump"].channel
         return SessionEnd("fault", str(violation), device_failed=slipped)
+
+    def _turns_against_torque(self) -> bool:
+        rig = self._profile.rig
+        return self._cycle.turns_against_torque(
+            rig.motor.inertia_kg_m2, rig.rate_hz, rig.encoder.resolution_rad
+        )
 
     def _observe_switched_off(self) -> None:
         """Switch off, and read once more for the last sample if the devices still answer."""

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from math import ceil
 
 from rigd.engine.events import EVENT_SIZE
+from rigd.safety.limits import BUFFERED_S
 from rigd.session.format import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
-BUFFERED_S = 16.0
-"""What the rings hold, so that no stall of a disk loses a sample."""
 HURRIED_BUFFERED_S = 160.0
-"""The same under the virtual clock, where a session passes in a second and the live view lags."""
+"""What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
+second, and the live view lags."""
 _EVENTS = 256
 
 

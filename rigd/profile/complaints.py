@@ -3,7 +3,7 @@
 import difflib
 import re
 from collections.abc import Iterator, Mapping
-from math import pi
+from math import pi, sqrt
 from typing import Any
 
 from pydantic_core import ErrorDetails
@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.profile.settings import SECTIONS, SOURCES, TEXTS, is_number, keys
+from rigd.safety.limits import BUFFERED_S
 
 # Longest endings first: the first that fits is the key's unit.
 _UNITS = {
@@ -38,6 +39,9 @@ _UNITS_OF_SIX = {
     "sensor.projection": "m, m, m, 1, 1, 1",
     "simulation.offset": "N, N, N, N·m, N·m, N·m",
 }
+
+_JUMP_FACTOR = 100.0
+"""Of the motor's own acceleration: a jump of the encoder up to that passes for motion."""
 
 _NAME = re.compile(r"[^\W_][\w .-]{0,63}")
 
@@ -91,6 +95,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"limits.stop_angle_rad = {stop:g} rad is not above limits.angle_rad = {angle:g} rad; "
             "the shaft could not come to rest before it is stopped by force."
         )
+    yield from _out_of_reach(values)
     warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
     if drift < warning:
         yield (
@@ -124,6 +129,40 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         )
     except ControlDesignError as error:
         yield str(error)
+
+
+def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield limits that nothing on this rig can leave: they look like a guard, and are none."""
+    angle_rad, inertia_kg_m2 = values["limits.angle_rad"], values["motor.inertia_kg_m2"]
+    most_rad_s2 = values["motor.peak_torque_nm"] / inertia_kg_m2
+    room = f"limits.angle_rad = {angle_rad:g} rad to either side"
+    error, speed = values["limits.tracking_error_rad"], values["limits.velocity_rad_s"]
+    if error >= 2 * angle_rad:
+        yield (
+            f"limits.tracking_error_rad = {error:g} rad can never be exceeded: reference and angle "
+            f"are within {room}; choose less than {2 * angle_rad:g} rad, some three times the "
+            "error of your excitation."
+        )
+    most_rad_s = sqrt(2 * most_rad_s2 * 2 * angle_rad)
+    if speed >= most_rad_s:
+        yield (
+            f"limits.velocity_rad_s = {speed:g} rad/s can never be exceeded: the peak torque "
+            f"accelerates the motor alone to {most_rad_s:.4g} rad/s between {room}; choose less, "
+            "some three times the speed of your excitation."
+        )
+    jump = values["limits.acceleration_rad_s2"]
+    if jump > _JUMP_FACTOR * most_rad_s2:
+        yield (
+            f"limits.acceleration_rad_s2 = {jump:g} rad/s² finds no jump of the encoder: it is "
+            f"more than {_JUMP_FACTOR:g} times the {most_rad_s2:.4g} rad/s² that the peak torque "
+            "gives the motor alone; choose some two to five times that."
+        )
+    lag = values["limits.recorder_lag_s"]
+    if lag >= BUFFERED_S:
+        yield (
+            f"limits.recorder_lag_s = {lag:g} s can never be exceeded: shared memory holds "
+            f"{BUFFERED_S:g} s, and the next sample is lost; choose less, 12 s for example."
+        )
 
 
 def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:

@@ -3,9 +3,14 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Gt, Le, Lt
 
 Positive = Annotated[float, Gt(0)]
+BelowAll = Annotated[float, Gt(0), Lt(100)]
+"""Per cent; a share is never more than all."""
+
+BUFFERED_S = 16.0
+"""What shared memory holds for the recorder, so that no stall of a disk loses a sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +40,14 @@ class Limits:
     stale_ticks_in_a_row: Annotated[int, Ge(1)]
     """Ticks for which an old angle or wrench may stand in for one that did not come."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
-    missed_percent: Annotated[float, Gt(0), Le(100)]
+    missed_percent: BelowAll
     """Of all ticks scheduled so far, counted as if they were at least ten seconds' worth."""
     tare_drift_nm: Positive
     """Change of the coupling torque's zero over a session, or since the one before."""
     recorder_lag_s: Positive
-    """Time by which the recorder may be behind the loop."""
+    """Time by which the recorder may be behind the loop, less than shared memory holds."""
     disk_free_mb: Positive
     """Free space of the disk that the session goes to, below which it ends; 1 MB is 10⁶ bytes."""
-    stale_percent: Annotated[float, Gt(0), Le(100)] = field(
-        default=1.0, metadata={"optional": True}
-    )
+    stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
     """Of all ticks scheduled so far, counted as `missed_percent` is: those whose angle is an old
     one, and likewise those whose wrench is. ``analyze`` takes no record with more than 1 %."""

@@ -116,7 +116,8 @@ class Crew:
             If there is not enough shared memory.
         """
         from rigd.engine.channels import create_channels
-        from rigd.engine.topics import BUFFERED_S, HURRIED_BUFFERED_S
+        from rigd.engine.topics import HURRIED_BUFFERED_S
+        from rigd.safety.limits import BUFFERED_S
 
         buffered_s = HURRIED_BUFFERED_S if fast and self.live else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)

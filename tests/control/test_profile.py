@@ -282,6 +282,39 @@ def test_a_peak_below_the_rated_torque_is_refused(refuse):
             "limits.acceleration_rad_s2 = 0 rad/s² must be more than 0",
         ),
         (
+            "acceleration_rad_s2 = { value = 2000.0",
+            "acceleration_rad_s2 = { value = 1.0e12",
+            "limits.acceleration_rad_s2 = 1e+12 rad/s² finds no jump of the encoder: it is more "
+            "than 100 times the 450 rad/s² that the peak torque gives",
+        ),
+        (
+            "tracking_error_rad = { value = 0.5",
+            "tracking_error_rad = { value = 1000.0",
+            "limits.tracking_error_rad = 1000 rad can never be exceeded: reference and angle are "
+            "within limits.angle_rad = 1.57 rad to either side; choose less than 3.14 rad",
+        ),
+        (
+            "velocity_rad_s = { value = 15.0",
+            "velocity_rad_s = { value = 54.0",
+            "limits.velocity_rad_s = 54 rad/s can never be exceeded: the peak torque accelerates "
+            "the motor alone to 53.16 rad/s between",
+        ),
+        (
+            "recorder_lag_s = { value = 12.0",
+            "recorder_lag_s = { value = 20.0",
+            "limits.recorder_lag_s = 20 s can never be exceeded: shared memory holds 16 s",
+        ),
+        (
+            "missed_percent = { value = 10.0",
+            "missed_percent = { value = 100.0",
+            "limits.missed_percent = 100 % must be less than 100",
+        ),
+        (
+            "stale_percent = { value = 1.0",
+            "stale_percent = { value = 100.0",
+            "limits.stale_percent = 100 % must be less than 100",
+        ),
+        (
             "disk_free_mb = { value = 50.0",
             "disk_free_mb = { value = -1.0",
             "limits.disk_free_mb = -1 MB must be more than 0",
@@ -323,3 +356,19 @@ def test_all_problems_are_reported_at_once(refuse):
 
 def test_the_shipped_profile_stands_where_the_checkout_keeps_it(profile):
     assert profile.path == Path(__file__).resolve().parents[2] / "hw_profiles" / "sim.toml"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("acceleration_rad_s2 = { value = 2000.0", "acceleration_rad_s2 = { value = 45000.0"),
+        ("tracking_error_rad = { value = 0.5", "tracking_error_rad = { value = 3.1"),
+        ("velocity_rad_s = { value = 15.0", "velocity_rad_s = { value = 53.0"),
+        ("recorder_lag_s = { value = 12.0", "recorder_lag_s = { value = 15.9"),
+    ],
+)
+def test_limits_that_can_only_just_be_exceeded_are_taken(sim_toml, tmp_path, old, new):
+    assert old in sim_toml
+    path = tmp_path / "rig.toml"
+    path.write_text(sim_toml.replace(old, new), encoding="utf-8")
+    load_profile(path)

@@ -340,3 +340,43 @@ def test_the_paper_s_chirp_comes_near_no_limit(name):
             assert watch.look(tick * 1_000_000, squares_nm2) is None
             squares_nm2 = 0.0
     assert watch.take_notices() == []
+
+
+@pytest.mark.parametrize("slow", [False, True])
+@pytest.mark.parametrize("amplitude_rad", [0.01, 0.025])
+def test_an_angle_that_counts_the_other_way_round_is_told_from_too_much_amplitude(
+    make_session, amplitude_rad, slow
+):
+    excitation = chirp(
+        rate_hz=1000.0, amplitude_rad=amplitude_rad, duration_s=4.0, rest_s=0.5, stop_hz=5.0
+    )
+    session = make_session(excitation=excitation)
+    if slow:  # the limits of a real rig
+        limit(session, velocity_rad_s=4.0, tracking_error_rad=0.1)
+    session.drive.fault_at, session.drive.fault = 1, lambda angle_rad: -angle_rad
+    reason = session.run().finished["reason"]
+    session.assert_safe()
+    assert "exceeds its limit" in reason
+    assert "against the torque" in reason
+    assert "object 607E" in reason
+    assert "lower the amplitude" not in reason
+
+
+@pytest.mark.parametrize("push_nm", [-0.5, 1.5])
+def test_a_push_on_the_beam_is_not_taken_for_a_wrong_sign(make_session, push_nm):
+    """A loop that has the sign right turns with its torque, whatever the sensor is made to feel."""
+    session = make_session()
+    limit(session, velocity_rad_s=2.0, tracking_error_rad=0.02)
+    sensor(session, added=[0.0, 0.0, 0.0, 0.0, 0.0, push_nm])
+    reason = session.run().finished["reason"]
+    assert "exceeds its limit" in reason
+    assert "against the torque" not in reason
+
+
+def test_too_great_an_amplitude_is_not_taken_for_a_wrong_sign(make_session):
+    session = make_session()
+    limit(session, velocity_rad_s=0.4)
+    reason = session.run().finished["reason"]
+    assert "The speed of" in reason
+    assert "lower the amplitude" in reason
+    assert "against the torque" not in reason

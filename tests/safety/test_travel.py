@@ -15,6 +15,11 @@ def profile():
     return load_profile("antenna_can")
 
 
+def worst_row(profile):
+    (row,) = [row for row in travel_rows(profile) if row.what.startswith("worst, ")]
+    return row
+
+
 def with_motor(rig, **changes):
     return replace(rig, motor=replace(rig.motor, **changes))
 
@@ -54,9 +59,12 @@ def test_the_drive_s_own_speed_limit_shortens_it(profile):
 
 @pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
 def test_the_shipped_rigs_come_to_rest_in_time(name):
-    (row,) = travel_rows(load_profile(name))
-    assert row.verdict is Verdict.OK
-    assert "object 6080" in row.detail
+    rows = list(travel_rows(load_profile(name)))
+    assert [row.verdict for row in rows] == [Verdict.OK] * 3
+    (worst,) = [row for row in rows if row.what.startswith("worst, ")]
+    assert worst.what == "worst, if the loop fails"
+    assert "object 6080" in worst.detail
+    assert [row.detail for row in rows if row is not worst] == ["", ""]
 
 
 def test_a_drive_in_this_program_ends_with_it():
@@ -75,6 +83,47 @@ def test_a_drive_in_this_program_ends_with_it():
 def test_a_travel_beyond_the_stop_is_refused(profile, drive, limits):
     rig = replace(profile.rig, cia402=replace(profile.rig.cia402, **drive))
     wrong = replace(profile, rig=rig, limits=replace(profile.limits, **limits))
-    (row,) = travel_rows(wrong)
+    row = worst_row(wrong)
     assert row.verdict is Verdict.FAIL
     assert "cia402.heartbeat_timeout_s" in row.detail
+
+
+@pytest.mark.parametrize(
+    ("limits", "what", "key"),
+    [
+        ({"stale_ticks_in_a_row": 1000}, "if no angle comes", "limits.stale_ticks_in_a_row"),
+        ({"missed_ticks_in_a_row": 1000}, "if ticks are missed", "limits.missed_ticks_in_a_row"),
+    ],
+)
+def test_a_loop_that_runs_blind_for_long_is_the_worst(profile, limits, what, key):
+    """With a thousand old angles a shaft turned by 38.5 rad, its drive's heartbeat being there."""
+    blind = replace(profile, limits=replace(profile.limits, **limits))
+    row = worst_row(blind)
+    assert row.what == f"worst, {what}"
+    assert row.verdict is Verdict.FAIL
+    assert f"1000 {'old angles' if 'stale' in key else 'missed ticks'} ({key})" in row.found
+    assert key in row.detail
+    others = [each for each in travel_rows(blind) if each.what != row.what]
+    assert [each.verdict for each in others] == [Verdict.OK, Verdict.OK]
+    # Five rad/s, the drive's own limit, for a second; then it runs out.
+    travel = worst_travel(blind.rig, blind.limits, 1.002, 5.0)
+    assert 4.9 < travel.driven_rad < 5.01
+    assert row.found.startswith(f"{travel.total_rad:.2f} rad: {travel.driven_rad:.2f} rad in the")
+
+
+def test_what_nothing_ends_is_told_and_takes_no_time(profile):
+    endless = {"max_speed_rad_s": 0.0}
+    blind = replace(
+        profile,
+        rig=replace(profile.rig, cia402=replace(profile.rig.cia402, **endless)),
+        limits=replace(profile.limits, stale_ticks_in_a_row=10**9),
+    )
+    row = worst_row(blind)
+    assert row.verdict is Verdict.FAIL
+    assert row.found.startswith("more than 100 rad: more than 100 rad in the")
+    assert worst_travel(profile.rig, profile.limits, math.inf, 5.0).total_rad == math.inf
+
+
+def test_a_speed_that_stays_is_not_followed_step_by_step(profile):
+    travel = worst_travel(profile.rig, profile.limits, 10.0, 5.0)
+    assert travel.driven_rad == pytest.approx(50.0, abs=0.02)
