@@ -50,6 +50,7 @@ class SessionFailedError(Exception):
     path: Path | None = None
     kept: Path | None = None
     counts: Mapping[str, int] = MappingProxyType({"scheduled": 0, "missed": 0, "late": 0})
+    hardware: bool | None = None
 
     def result(self) -> "SessionResult":
         """Return how the session ended, once its processes have."""
@@ -70,6 +71,7 @@ class SessionFailedError(Exception):
             lost=None,
             fault=True,
             part=part,
+            hardware=self.hardware,
             **self.counts,
         )
 
@@ -98,6 +100,8 @@ class SessionResult:
     """Samples that the live view did not get."""
     part: Path | None = None
     """What there is of a file that could not be made whole."""
+    hardware: bool | None = None
+    """Whether it was the hardware that moved, and nothing simulated; None: not known."""
 
     @property
     def went_well(self) -> bool:
@@ -116,6 +120,7 @@ class SessionResult:
             "missed": self.missed,
             "late": self.late,
             "lost": self.lost,
+            "hardware": self.hardware,
         }
 
 
