@@ -103,7 +103,7 @@ def run_in_foreground(
             profile, moving = load_rig(profile_name, fast=fast, seed=seed, hardware=hardware)
             if prepare is not None:
                 profile = prepare(profile)
-            tell(what_moves(profile.rig, moving))
+            _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is Reality.SIMULATED)
