@@ -10,7 +10,12 @@ import typer
 
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
-from rigd.devices.registry import Reality, UnknownDeviceError, simulated_differently
+from rigd.devices.registry import (
+    Reality,
+    UnknownDeviceError,
+    simulated_differently,
+    what_moves,
+)
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, ExcitationError
@@ -60,6 +65,7 @@ def run_in_foreground(
     live: bool,
     force: bool,
     quiet_stdout: bool,
+    hardware: bool = False,
     prepare: Callable[[Profile], Profile] | None = None,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
@@ -76,7 +82,7 @@ def run_in_foreground(
         Name or path of the profile.
     folder
         Where the files go; made if it does not exist.
-    repeat, seed, notes, fast, live, force
+    repeat, seed, notes, fast, live, force, hardware
         As on the command line. The sessions of a series follow each other on one connection: each
         waits until the beam has come to rest.
     quiet_stdout
@@ -94,18 +100,15 @@ def run_in_foreground(
     try:
         # The rig is given up last, when nobody has hold of the devices any more.
         with contextlib.ExitStack() as reserved, crew:
-            profile, moving = load_rig(profile_name, fast=fast, seed=seed)
+            profile, moving = load_rig(profile_name, fast=fast, seed=seed, hardware=hardware)
             if prepare is not None:
                 profile = prepare(profile)
-            if moving in (Reality.SIMULATOR, Reality.LOCK_STEP):
-                tell(f"No hardware: {profile.name} is simulated ({moving.value}).")
-                for difference in simulated_differently(profile.rig):
-                    tell(f"Warning: the simulated rig has {difference}.")
+            _tell(what_moves(profile.rig, moving), err=True)
+            for difference in simulated_differently(profile.rig):
+                tell(f"Warning: the simulated rig has {difference}.")
             alone = not (fast and moving is Reality.SIMULATED)
-            hardware = moving is Reality.HARDWARE
-            reserved.enter_context(
-                RigLock(profile.name, "rigd run", hardware=hardware, alone=alone)
-            )
+            shared = moving is Reality.HARDWARE
+            reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
             excitation = build(profile)
             plan = plan_session(profile, excitation, force=force)
             _tell_plan(tell, profile, excitation, plan)

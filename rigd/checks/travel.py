@@ -25,6 +25,7 @@ from rigd.safety import Limits
 _STEP_S = 5e-5
 _FOR_EVER_RAD = 100.0
 _GROUP = "travel"
+_LOOP_FAILS = "if the loop fails"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +107,14 @@ def _ways(profile: Profile) -> tuple[_Blindness, ...]:
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     assert drive is not None
     stale, missed = limits.stale_ticks_in_a_row, limits.missed_ticks_in_a_row
+    own = drive.watchdog_s > drive.heartbeat_timeout_s
+    watchdog = "cia402.own_watchdog_s" if own else "cia402.heartbeat_timeout_s"
     return (
         _Blindness(
-            "if the loop fails",
-            drive.heartbeat_timeout_s,
-            "of the drive's watchdog (cia402.heartbeat_timeout_s)",
-            "cia402.heartbeat_timeout_s",
+            _LOOP_FAILS,
+            drive.watchdog_s,
+            f"of the drive's watchdog ({watchdog})",
+            watchdog,
         ),
         # The tick that finds one too many switches off, and its command has its own delay.
         _Blindness(
@@ -134,20 +137,33 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     if drive is None:
         why = "the drive is part of this program and ends with it"
-        yield Row(_GROUP, "if the loop fails", why, "", Verdict.SKIPPED)
+        yield Row(_GROUP, _LOOP_FAILS, why, "", Verdict.SKIPPED)
         return
     ways = _ways(profile)
+    margin_rad = limits.stop_angle_rad - limits.angle_rad
+    bound = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
+    unbounded = isinf(drive.watchdog_s)
+    if unbounded:
+        ways = tuple(way for way in ways if not isinf(way.duration_s))
+        yield Row(
+            _GROUP,
+            f"worst, {_LOOP_FAILS}",
+            "without bound: the profile accepts a drive without a watchdog",
+            bound,
+            Verdict.WARNING,
+            f"Travel {_LOOP_FAILS}: nothing but the wired stop ends it "
+            '(cia402.accept_without = ["watchdog"]).',
+        )
     limited = drive.max_speed_rad_s > 0
     most_rad_s = drive.max_speed_rad_s if limited else inf
     travels = [worst_travel(rig, limits, way.duration_s, most_rad_s) for way in ways]
     longest = max(range(len(ways)), key=lambda number: travels[number].total_rad)
-    margin_rad = limits.stop_angle_rad - limits.angle_rad
     for number, (way, travel) in enumerate(zip(ways, travels, strict=True)):
         too_far = not travel.total_rad <= margin_rad
         detail = ""
         if number == longest:
             free = worst_travel(rig, limits, way.duration_s)
-            detail = f"Travel: the worst is {way.what}. "
+            detail = "" if unbounded else f"Travel: the worst is {way.what}. "
             detail += (
                 f"It counts on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
                 f"(object 6080); without it, it would be {_angle(free.total_rad)}."
@@ -160,14 +176,14 @@ def travel_rows(profile: Profile) -> Iterator[Row]:
                 f" Travel {way.what}: lower {way.key}, cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
-        worst = "worst, " if number == longest else ""
+        worst = "worst, " if number == longest and not unbounded else ""
         yield Row(
             _GROUP,
             f"{worst}{way.what}",
             f"{_angle(travel.total_rad)}: {_angle(travel.driven_rad)} in the "
             f"{way.duration_s * 1e3:g} ms {way.ended_by}, {_angle(travel.coasting_rad)} "
             "running out",
-            f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)",
+            bound,
             grade(fail=too_far),
             detail.strip(),
         )

@@ -129,9 +129,11 @@ def stop(
             "at rigd status and at the rig, and press the wired stop (STO) if anything moves.",
             EXIT_FAILED,
         )
+    series = status["series"]
+    by_signal = told["signalled"] and series is not None and series["stopped"]
     if status["state"] == "fault":
         typer.echo(f"No session is running. The rig is in fault: {status['reason']}")
-    elif told["stopping"]:
+    elif told["stopping"] or by_signal:
         typer.echo(f"The session has ended; the torque is off.{_file_of_last(status)}")
     else:
         typer.echo("No session is running; the torque is off.")

@@ -8,7 +8,16 @@ import typer
 
 from rigd.cli.crew import CrewGroup, start_crew
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
-from rigd.cli.options import SESSIONS, AsJson, Fast, Output, ProfileName, Seed, profile_named
+from rigd.cli.options import (
+    SESSIONS,
+    AsJson,
+    Fast,
+    Hardware,
+    Output,
+    ProfileName,
+    Seed,
+    profile_named,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,6 +69,7 @@ def motor(
     ] = None,
     seed: Seed = None,
     fast: Fast = False,
+    hardware: Hardware = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure inertia, friction, torque constant and delay of the motor, with deviations.
@@ -75,7 +85,14 @@ def motor(
         files = from_files
     else:
         files = _run_sessions(
-            profile, output, torque_percent, stroke_rad, seed, fast=fast, quiet_stdout=as_json
+            profile,
+            output,
+            torque_percent,
+            stroke_rad,
+            seed,
+            fast=fast,
+            hardware=hardware,
+            quiet_stdout=as_json,
         )
     _, found = _estimate(files, profile)
     if as_json:
@@ -96,6 +113,7 @@ def _run_sessions(
     seed: int | None,
     *,
     fast: bool,
+    hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
     """Run the trial and both sessions; ends the command if one does not go well.
@@ -125,6 +143,7 @@ def _run_sessions(
             live=False,
             force=False,
             quiet_stdout=quiet_stdout,
+            hardware=hardware,
             prepare=prepare,
         )
         if stop.requested and not any(result.fault for result in results):

@@ -43,6 +43,11 @@ def live(
     if web:
         typer.echo(view.page_url)
         typer.echo(tunnel_advice(view), err=True)
+        typer.echo(
+            f"Every user and program of this computer can read the view, and write to it, on port "
+            f"{view.grpc_port}; the session files are not concerned.",
+            err=True,
+        )
     elif not has_screen():
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "

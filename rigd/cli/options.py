@@ -28,6 +28,13 @@ Fast = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Write one JSON document to standard output.")]
 
+Hardware = Annotated[
+    bool,
+    typer.Option(
+        "--hardware", help="Move the hardware, even if somebody simulates it out of reach."
+    ),
+]
+
 Repeat = Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")]
 Operator = Annotated[str, typer.Option("--operator", help="Goes into the file.")]
 Specimen = Annotated[str, typer.Option("--specimen", help="Goes into the file.")]

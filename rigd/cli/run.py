@@ -20,6 +20,7 @@ from rigd.cli.options import (
     AsJson,
     Fast,
     Force,
+    Hardware,
     Note,
     Operator,
     Output,
@@ -104,6 +105,7 @@ def run_sessions(
     fast: Fast = False,
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
+    hardware: Hardware = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
@@ -127,6 +129,7 @@ def run_sessions(
             live=live,
             force=force,
             quiet_stdout=as_json,
+            hardware=hardware,
         )
     except ForegroundError as error:
         if as_json and not error.wrong_use:

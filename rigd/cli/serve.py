@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
-from rigd.cli.options import SESSIONS, Fast, Output, ProfileName
+from rigd.cli.options import SESSIONS, Fast, Hardware, Output, ProfileName
 
 
 def serve(
@@ -23,6 +23,7 @@ def serve(
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
     ] = False,
     fast: Fast = False,
+    hardware: Hardware = False,
 ) -> None:
     """Own a rig and run sessions for rigd start, until Ctrl-C or SIGTERM ends it safely.
 
@@ -40,7 +41,7 @@ def serve(
     from rigd.supervisor.orders import load_rig, make_folder
 
     try:
-        rig_profile, _ = load_rig(profile, fast=fast)
+        rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
         make_folder(output)
         number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
     except (ProfileError, UnknownDeviceError, UnknownGroupError, RefusedError) as error:

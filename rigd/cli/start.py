@@ -51,6 +51,7 @@ def start_sessions(
         "force": force,
     }
     with daemon_of(profile) as client, _Interrupts.caught() as interrupts:
+        typer.echo(client.ask("status")["daemon"]["what_moves"], err=True)
         if not detach:
             client.ask("watch")
         told = client.ask("start", **request)

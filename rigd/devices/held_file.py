@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import re
 import stat
 from contextlib import suppress
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 from rigd.devices.simulator import runtime_folder
 
 _COMMON = Path("/run/lock")
+_LOCKS = Path("/proc/locks")
 _NAME_SIZE = 200
 
 
@@ -81,4 +83,26 @@ def _lock(fd: int, *, alone: bool) -> None:
         fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
         said = os.pread(fd, _NAME_SIZE, 0).decode(errors="replace").strip() or "unknown"
-        raise HeldError(said) from None
+        raise HeldError(said + _others(fd, said)) from None
+
+
+def _others(fd: int, said: str) -> str:
+    """Name who holds the file by the kernel's table, if that is not who the file says it is.
+
+    Anybody may write into the file, and hold it.
+    """
+    inode = str(os.fstat(fd).st_ino)
+    try:
+        # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
+        rows = [line.split() for line in _LOCKS.read_text("ascii").splitlines()]
+    except OSError:
+        return ""
+    found = ""
+    for row in rows:
+        if len(row) < 6 or row[1] != "FLOCK" or row[5].rpartition(":")[2] != inode:
+            continue
+        if re.search(rf"\bprocess {row[4]}\b", said):
+            return ""
+        with suppress(OSError):
+            found = f"; held by process {row[4]} of user {Path('/proc', row[4]).stat().st_uid}"
+    return found

@@ -72,6 +72,19 @@ def reality(rig: RigParameters) -> Reality:
     return Reality.LOCK_STEP if simulator.lock_step else Reality.SIMULATOR
 
 
+def what_moves(rig: RigParameters, moving: Reality) -> str:
+    """Say what will move, hardware as loudly as what stands in for it."""
+    if moving is not Reality.HARDWARE:
+        how = "in this process" if moving is Reality.SIMULATED else moving.value
+        return f"No hardware: {rig.name} is simulated ({how})."
+    assert rig.can is not None
+    assert rig.cia402 is not None
+    return (
+        f"HARDWARE: {rig.name} moves the drive on {rig.can.interface} {rig.can.channel}, node "
+        f"{rig.cia402.node_id}."
+    )
+
+
 def simulated_differently(rig: RigParameters) -> list[str]:
     """Say in what the running simulated rig, if any stands in, differs from the profile's."""
     simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)

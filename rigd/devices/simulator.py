@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters
 
+_SOCKETS = Path("/proc/net/unix")
+_LISTENS = 0x10000
+
 
 @dataclass(frozen=True, slots=True)
 class SimulatorAddress:
@@ -90,6 +93,26 @@ def find_simulator(rig_name: str) -> SimulatorAddress | None:
         except (OSError, TypeError, ValueError):
             return None
     return address
+
+
+def unreachable_simulators(rig_name: str) -> list[Path]:
+    """Return the control sockets on which any simulator of a rig listens on this computer.
+
+    The kernel lists them whoever runs the simulator, and wherever its runtime folder is. Ask only
+    if `find_simulator` finds none: those that are listed then cannot be reached from here.
+    """
+    found = set()
+    try:
+        # Num RefCount Protocol Flags Type St Inode Path
+        lines = _SOCKETS.read_text("utf-8", errors="surrogateescape").splitlines()[1:]
+    except OSError:
+        return []
+    for fields in (line.split(maxsplit=7) for line in lines):
+        if len(fields) == 8 and int(fields[3], 16) & _LISTENS:
+            path = Path(fields[7])
+            if path.name == f"{rig_name}.control":
+                found.add(path)
+    return sorted(found)
 
 
 def _flat(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:

@@ -28,7 +28,7 @@ from rigd.engine.reference import map_reference
 from rigd.engine.rest import AXES, Rest, observe_rest
 from rigd.engine.signals import StopRequest
 from rigd.engine.standstill import Standstill
-from rigd.engine.watch import make_watch
+from rigd.engine.watch import make_watch, recalled_heat_nm2, remember_heat
 from rigd.profile import Profile
 from rigd.safety import LOOK_EVERY
 
@@ -136,10 +136,17 @@ class _Attendance:
         self._zero_rad = 0.0
         self._silent = 0
         self._on_lines = devices.drive.health().bits is not None
-        self._watch = make_watch(profile)
+        # A simulated motor is as cold as it was made.
+        warm = not devices.simulated
+        self._watch = make_watch(profile, recalled_heat_nm2(profile) if warm else 0.0)
         self._standstill = Standstill(profile)
         self._display = Display(channels.board, devices)
         self._cycle = self._make_cycle(profile)
+
+    def remember(self) -> None:
+        """Keep how warm the motor is for whoever connects next, once nothing hurries."""
+        if not self._devices.simulated:
+            remember_heat(self._profile, self._watch.heat_nm2)
 
     def take_up_standstill(self) -> None:
         """Read where the motor stands, unless that is known: virtual time stands still from now on.
@@ -164,7 +171,10 @@ class _Attendance:
         """
         while (message := self._await_order()) is not None:
             if "session" in message:
-                self._run_session(message["session"])
+                try:
+                    self._run_session(message["session"])
+                finally:
+                    self.remember()
                 self.take_up_standstill()
                 gc.collect()  # the torque is off: the only time for it
             elif "tare" in message:

@@ -65,7 +65,9 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
             rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error.reason}).") from error
+    except csv.Error as error:
         raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error}).") from error
     header = [cell.strip() for cell in rows[0][1]] if rows else []
     if "angle_rad" in header:
@@ -73,8 +75,8 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
         time_column = header.index("time_s") if "time_s" in header else None
         if time_column is None and len(header) > 1:
             raise ExcitationError(
-                f"{path}: has the columns {', '.join(header)} but no time_s; name the column of "
-                "times in seconds so, or leave angle_rad alone."
+                f"{path}: line 1 has {len(header)} columns, angle_rad among them, but no time_s; "
+                "name the column of times in seconds so, or leave angle_rad alone."
             )
         rows = rows[1:]
     elif len(header) == 1 and ";" in header[0]:
@@ -94,8 +96,8 @@ def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
             times.append(_cell(path, number, row, time_column, "time_s"))
             if len(times) > 1 and times[-1] <= times[-2]:
                 raise ExcitationError(
-                    f"{path}: line {number}: time_s = {times[-1]:g} s does not come after the "
-                    f"{times[-2]:g} s before it; times must increase."
+                    f"{path}: line {number}: time_s does not come after the one before it; times "
+                    "must increase."
                 )
     if len(angles) < 2:
         raise ExcitationError(f"{path}: has {len(angles)} angles; a reference needs at least two.")
@@ -111,6 +113,7 @@ def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> floa
         value = float("nan")
     if not isfinite(value):
         raise ExcitationError(
-            f"{path}: line {line}: {name} = '{row[column].strip()}' is not a finite number."
+            # Not quoted: the daemon reads files that whoever commands it may not be allowed to.
+            f"{path}: line {line}: {name} is not a finite number."
         )
     return value

@@ -138,6 +138,15 @@ class LimitWatch:
         self.tared_nm: float | None = None
         self.reset(0.0)
 
+    @property
+    def heat_nm2(self) -> float:
+        """Mean square of the motor's torque over its thermal time constant, at the last look."""
+        return self._heat_nm2
+
+    @heat_nm2.setter
+    def heat_nm2(self, heat_nm2: float) -> None:
+        self._heat_nm2 = heat_nm2
+
     def reset(self, angle_rad: float) -> None:
         """Start from rest at ``angle_rad``; the motor is as warm as it was."""
         self._previous_angle_rad = angle_rad

@@ -262,7 +262,8 @@ def stop_session(path: Path) -> Document:
     Returns
     -------
     dict
-        Its reply.
+        Its reply, and ``signalled``: whether its process was sent the signal before. Then what ran
+        may have ended before it replied.
 
     Raises
     ------
@@ -274,11 +275,12 @@ def stop_session(path: Path) -> Document:
     began_s = time.monotonic()
     seen: tuple[int, int] | None = None
     signalled = False
+    answer_s = _STOP_ANSWER_S
     while True:
         try:
-            with Client(path, _STOP_ANSWER_S, _STOP_ANSWER_S) as client:
+            with Client(path, answer_s, answer_s) as client:
                 seen = client.pid, client.uid
-                return client.ask("stop")
+                return client.ask("stop") | {"signalled": signalled}
         except (DaemonGoneError, _CrowdedError) as error:
             failure = str(error)
         waited_s = time.monotonic() - began_s
@@ -286,6 +288,8 @@ def stop_session(path: Path) -> Document:
             signalled = _signal_stop(seen[0])
         if waited_s > _STOP_PATIENCE_S or not path.exists():
             break
+        # A daemon that is starved of processor time obeys, and answers late.
+        answer_s = min(2.0 * answer_s, _STOP_PATIENCE_S)
         time.sleep(_PAUSE_S)
     if seen is None:
         raise DaemonGoneError(failure)

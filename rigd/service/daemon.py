@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from rigd.devices.registry import Reality, reality, simulated_differently
+from rigd.devices.registry import Reality, reality, simulated_differently, what_moves
 from rigd.profile import Profile
 from rigd.service.address import COMMON, bind, socket_path
 from rigd.service.client import STOP_SIGNAL
@@ -75,7 +75,7 @@ def run_daemon(
             fast=fast,
             live=live,
         )
-        _log.info("%s: %s; listening on %s", profile.name, moving.value, path)
+        _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):
             _log.warning("the simulated rig has %s", difference)
         return asyncio.run(_run(server, service))

@@ -153,7 +153,15 @@ def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Doc
 
 
 def daemon_document(
-    profile: str, output: str, *, moving: str, fast: bool, live: bool, began_utc_ns: int
+    profile: str,
+    output: str,
+    *,
+    moving: str,
+    hardware: bool,
+    told: str,
+    fast: bool,
+    live: bool,
+    began_utc_ns: int,
 ) -> Document:
     """Tell which daemon this is."""
     from rigd import __version__
@@ -163,6 +171,8 @@ def daemon_document(
         "version": __version__,
         "profile": profile,
         "moving": moving,
+        "hardware": hardware,
+        "what_moves": told,
         "output": output,
         "fast": fast,
         "live": live,

@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
-from rigd.devices.registry import Reality
+from rigd.devices.registry import Reality, what_moves
 from rigd.engine.events import Event
 from rigd.engine.signals import StopRequest
 from rigd.excitation import Excitation, ExcitationError
@@ -292,6 +292,8 @@ class Service:
                 self._profile.name,
                 str(self._folder),
                 moving=self._began_moving.value,
+                hardware=self._began_moving is Reality.HARDWARE,
+                told=what_moves(self._profile.rig, self._began_moving),
                 fast=self._fast,
                 live=self._live,
                 began_utc_ns=self._began_utc_ns,

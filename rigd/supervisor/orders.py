@@ -10,7 +10,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from rigd.devices.registry import Reality, check_selection, objections, reality
+from rigd.devices.registry import (
+    Reality,
+    check_selection,
+    objections,
+    reality,
+    what_moves,
+)
+from rigd.devices.simulator import unreachable_simulators
 from rigd.excitation import Excitation
 from rigd.planning import RefusedError
 from rigd.profile import Profile, load_profile
@@ -37,7 +44,9 @@ class Order:
     """Operator, specimen, note, number in a series: metadata as given."""
 
 
-def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple[Profile, Reality]:
+def load_rig(
+    name: str, *, fast: bool = False, seed: int | None = None, hardware: bool = False
+) -> tuple[Profile, Reality]:
     """Load a profile and see what would move.
 
     Parameters
@@ -48,13 +57,16 @@ def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple
         Not in real time.
     seed
         Of a simulated rig's noise; None leaves the profile's.
+    hardware
+        The operator says that the hardware is to move.
 
     Raises
     ------
     ProfileError, UnknownDeviceError
         If the profile cannot be used.
     RefusedError
-        If its devices cannot share their bus, or an option does not go with what would move.
+        If its devices cannot share their bus, an option does not go with what would move, or a
+        simulated rig is running that cannot be reached, so that the hardware may not be meant.
     """
     profile = load_profile(name)
     check_selection(profile.rig.devices, profile.path)
@@ -62,6 +74,13 @@ def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
     moving = reality(profile.rig)
+    if hardware and moving is not Reality.HARDWARE:
+        raise RefusedError(
+            f"--hardware: {what_moves(profile.rig, moving)} Leave the option out, or end what "
+            "stands in for the hardware."
+        )
+    if moving is Reality.HARDWARE and not hardware:
+        _refuse_unreachable_simulators(profile)
     if fast and not moving.any_clock:
         raise RefusedError(
             f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
@@ -78,6 +97,22 @@ def load_rig(name: str, *, fast: bool = False, seed: int | None = None) -> tuple
         simulation = replace(profile.rig.simulation, seed=seed)
         profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
     return profile, moving
+
+
+def _refuse_unreachable_simulators(profile: Profile) -> None:
+    """Refuse to move the hardware while somebody simulates it where this command does not look."""
+    for path in unreachable_simulators(profile.rig.name):
+        try:
+            uid = path.stat().st_uid
+            remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
+            whose = "in another environment" if uid == os.getuid() else f"by user {uid}"
+        except OSError:
+            remedy, whose = "run this command as its user to use it", "by another user"
+        raise RefusedError(
+            f"A simulated rig of {profile.name} is run {whose} ({path}), which this command does "
+            f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "
+            "--hardware if the hardware is meant."
+        )
 
 
 def make_folder(folder: Path) -> None:

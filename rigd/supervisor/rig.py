@@ -20,7 +20,7 @@ from rigd.profile import Profile
 from rigd.supervisor.crew import Crew
 from rigd.supervisor.live_view import LiveView
 from rigd.supervisor.orders import Order
-from rigd.supervisor.session import Session, SessionResult, Watcher, always
+from rigd.supervisor.session import Session, SessionFailedError, SessionResult, Watcher, always
 from rigd.supervisor.status import RigStatus, StatusWatch
 
 _POLL_S = 0.05
@@ -153,9 +153,12 @@ class Rig:
         session = Session(order, crew, self._told, self._view, watcher, listens)
         outcome = reason = ""
         try:
-            result = session.run(stop)
+            result = replace(session.run(stop), hardware=not self.simulated)
             outcome, reason = result.outcome, result.reason
             return result
+        except SessionFailedError as error:
+            error.hardware = not self.simulated
+            raise
         finally:
             if self._view is not None:
                 self._view.finish(outcome, reason)

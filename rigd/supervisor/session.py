@@ -63,6 +63,7 @@ class SessionFailedError(Exception):
     path: Path | None = None
     kept: Path | None = None
     counts: Mapping[str, int] = _NO_TICKS
+    hardware: bool | None = None
 
     def result(self) -> "SessionResult":
         """Return how the session ended, once its processes have."""
@@ -83,6 +84,7 @@ class SessionFailedError(Exception):
             lost=None,
             fault=True,
             part=part,
+            hardware=self.hardware,
             **self.counts,
         )
 
@@ -114,6 +116,8 @@ class SessionResult:
     """Samples that the live view did not get."""
     part: Path | None = None
     """What there is of a file that could not be made whole."""
+    hardware: bool | None = None
+    """Whether it was the hardware that moved, and nothing simulated; None: not known."""
 
     @property
     def went_well(self) -> bool:
@@ -134,6 +138,7 @@ class SessionResult:
             "lost": self.lost,
             "stale_angles": self.stale_angles,
             "stale_wrenches": self.stale_wrenches,
+            "hardware": self.hardware,
         }
 
 

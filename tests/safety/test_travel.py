@@ -127,3 +127,20 @@ def test_what_nothing_ends_is_told_and_takes_no_time(profile):
 def test_a_speed_that_stays_is_not_followed_step_by_step(profile):
     travel = worst_travel(profile.rig, profile.limits, 10.0, 5.0)
     assert travel.driven_rad == pytest.approx(50.0, abs=0.02)
+
+
+def test_a_drive_that_is_accepted_without_a_watchdog_has_no_bound(profile):
+    drive = replace(profile.rig.cia402, accept_without=("watchdog",))
+    rows = list(travel_rows(replace(profile, rig=replace(profile.rig, cia402=drive))))
+    worst, *others = rows
+    assert (worst.what, worst.verdict) == ("worst, if the loop fails", Verdict.WARNING)
+    assert "without bound" in worst.found
+    assert "cia402.accept_without" in worst.detail
+    assert [row.verdict for row in others] == [Verdict.OK, Verdict.OK]
+    assert not any(row.what.startswith("worst") for row in others)
+
+
+def test_the_watchdog_of_the_maker_counts_where_it_is_slower(profile):
+    drive = replace(profile.rig.cia402, own_watchdog_s=0.06)
+    row = worst_row(replace(profile, rig=replace(profile.rig, cia402=drive)))
+    assert "60 ms of the drive's watchdog (cia402.own_watchdog_s)" in row.found

@@ -81,7 +81,8 @@ def test_a_refusal_is_not_asked_again(path, answer):
 
 def test_a_stop_is_asked_for_until_it_is_answered(path, answer):
     heard = answer(None, CROWDED, None, {"reply": "stop", "ok": True, "stopping": True})
-    assert stop_session(path)["stopping"]
+    told = stop_session(path)
+    assert (told["stopping"], told["signalled"]) == (True, False)
     assert [request["command"] for request in heard] == ["stop"] * 4
 
 

@@ -140,11 +140,13 @@ def test_what_cannot_be_served_is_refused_at_once(ask, profile, tmp_path):
 
 def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
     daemon = serve("--fast")
-    code, out, _ = ask("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2", "--json",
-                       "--operator", "Ada")  # fmt: skip
+    code, out, err = ask("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2", "--json",
+                         "--operator", "Ada")  # fmt: skip
     assert code == 0
+    assert err.startswith("No hardware: sim is simulated (in this process).\n")
     sessions = json.loads(out)["sessions"]
     assert [s["outcome"] for s in sessions] == ["complete", "complete"]
+    assert [s["hardware"] for s in sessions] == [False, False]
     record = read_session(Path(sessions[1]["path"]))
     assert record.metadata["operator"] == "Ada"
     assert record.metadata["series"] == "2 of 2"

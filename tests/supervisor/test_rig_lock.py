@@ -1,6 +1,8 @@
 """One program at a time runs a rig."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 
@@ -42,6 +44,24 @@ def test_hardware_is_locked_for_all_users_of_the_computer(runtime_folder, monkey
             RigLock("antenna 1", "rigd run", hardware=True).acquire()
         with RigLock("antenna 1", "rigd run", hardware=False):
             pass
+
+
+def test_who_holds_a_lock_without_saying_so_is_named_by_the_kernel(runtime_folder):
+    with RigLock("antenna", "rigd run", hardware=False) as lock:
+        path = lock._file.path
+    path.write_text("rigd serve, process 1")
+    code = "import fcntl, time; fcntl.flock(0, fcntl.LOCK_EX); print(1, flush=True); time.sleep(60)"
+    with path.open() as stolen:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code], stdin=stolen, stdout=subprocess.PIPE
+        )
+    try:
+        assert process.stdout.readline() == b"1\n"
+        with pytest.raises(RigBusyError, match=rf"process {process.pid} of user {os.getuid()}\b"):
+            RigLock("antenna", "rigd run", hardware=False).acquire()
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_a_folder_that_cannot_be_used_is_named(monkeypatch, tmp_path):

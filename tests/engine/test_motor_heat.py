@@ -1,0 +1,89 @@
+"""How warm the motor is outlives a connection to hardware, and cools down meanwhile."""
+
+import json
+from dataclasses import replace
+from math import exp
+
+import pytest
+
+from rigd.engine import watch
+from rigd.engine.watch import make_watch, recalled_heat_nm2, remember_heat
+from rigd.excitation import chirp
+from rigd.profile import load_profile
+
+
+@pytest.fixture
+def profile(runtime_folder):
+    return load_profile("antenna_can")
+
+
+@pytest.fixture
+def at(monkeypatch):
+    """Set the time since the computer was started, s."""
+
+    def move(now_s):
+        monkeypatch.setattr(watch.time, "clock_gettime", lambda _: now_s)
+
+    move(1000.0)
+    yield move
+    monkeypatch.undo()
+
+
+def test_a_motor_cools_down_by_its_time_constant(profile, at):
+    assert recalled_heat_nm2(profile) == 0.0
+    remember_heat(profile, 0.5)
+    assert recalled_heat_nm2(profile) == pytest.approx(0.5)
+    at(1007.0)
+    time_constant_s = profile.rig.motor.thermal_time_constant_s
+    assert recalled_heat_nm2(profile) == pytest.approx(0.5 * exp(-7.0 / time_constant_s))
+    assert make_watch(profile, 0.25).heat_nm2 == 0.25
+
+
+def test_one_of_before_a_restart_is_cold_and_none_is_warmer_than_can_be(profile, at):
+    remember_heat(profile, 1e9)
+    assert recalled_heat_nm2(profile) == profile.rig.motor.peak_torque_nm**2
+    at(999.0)
+    assert recalled_heat_nm2(profile) == 0.0
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "null", '{"heat_nm2": "x", "boot_s": 1}', '{"heat_nm2": 1}',
+             '{"heat_nm2": NaN, "boot_s": 1}', '{"heat_nm2": 1, "boot_s": NaN}'],
+)  # fmt: skip
+def test_a_file_that_says_nothing_is_a_cold_motor(profile, text):
+    remember_heat(profile, 1.0)
+    watch._heat_file(profile).write_text(text)
+    assert recalled_heat_nm2(profile) == 0.0
+
+
+def test_without_a_folder_a_motor_is_cold(profile, monkeypatch, tmp_path):
+    (tmp_path / "rigd").touch()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    remember_heat(profile, 1.0)
+    assert recalled_heat_nm2(profile) == 0.0
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_connections_in_a_row_add_up_on_hardware_alone(make_session, runtime_folder, simulated):
+    """Sessions of torque, each on a connection of its own: as with `rigd run` again and again."""
+    heat = []
+    for _ in range(2):
+        session = make_session()
+        session.devices = replace(session.devices, simulated=simulated)
+        sweep = chirp(
+            rate_hz=session.profile.rig.rate_hz,
+            amplitude_rad=0.02,
+            start_hz=1.0,
+            stop_hz=10.0,
+            duration_s=1.0,
+            rest_s=0.1,
+            ring_down_s=0.0,
+        )
+        session.obey(session.order(sweep))
+        assert session.parent.said("finished")[0]["finished"] == "complete"
+        if not simulated:
+            heat.append(json.loads(watch._heat_file(session.profile).read_text())["heat_nm2"])
+    if simulated:
+        assert not watch._heat_file(session.profile).exists()
+    else:
+        assert heat[1] > 1.2 * heat[0] > 0.0
