@@ -41,8 +41,11 @@ if TYPE_CHECKING:
 
 __all__ = ["MAX_FILLED_SHARE", "MAX_GAP_S", "Gaps", "Record", "RecordError", "load_record"]
 
-MAX_SESSION_BYTES = 150 * MAX_TICKS
-"""Most memory for the messages of a session, which take so much a sample."""
+MAX_SAMPLES = MAX_TICKS
+"""Most samples of a session that are read."""
+
+_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
+"""Of the samples, what an analysis needs."""
 
 _REPORTED_FLAGS = (
     (Status.TORQUE_SATURATED, "torque command saturated"),
@@ -170,7 +173,7 @@ def load_record(path: Path) -> Record:
     RecordError
         It was read, but its samples cannot be analysed.
     """
-    session = read_session(path, max_bytes=MAX_SESSION_BYTES)
+    session = read_session(path, fields=_FIELDS, max_samples=MAX_SAMPLES)
     samples = session.samples
     if len(samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
