@@ -29,7 +29,7 @@ from analysis.stated_values import (
     stated_rate_hz,
     stated_tool_inertia_kg_m2,
 )
-from rigd.session import Session, Status, read_session
+from rigd.session import Session, Status, read_session, readable_texts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -209,7 +209,8 @@ def load_record(path: Path) -> Record:
         sweep_stale_torques=int(stale_torque[sweep].sum()),
     )
     flags = _flag_counts(status[sweep])
-    outcome = session.outcome or {}
+    metadata, unread = readable_texts(session.metadata, "keys of the metadata")
+    outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
     return Record(
         path=path,
         time_s=(first_tick + np.arange(length)) / rate_hz,
@@ -227,8 +228,11 @@ def load_record(path: Path) -> Record:
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
         flags=flags,
-        warnings=_warnings(gaps, flags, cut, outcome, rate_hz, sweep),
-        metadata=session.metadata,
+        warnings=(
+            *_warnings(gaps, flags, cut, outcome, rate_hz, sweep),
+            *(f"Of the file: {sentence}." for sentence in (*unread, *unread_outcome)),
+        ),
+        metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
     )
 

@@ -15,6 +15,7 @@ from rigd.session.format import Status
 from rigd.session.reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
 
 _RECOVERED: Final = "recovered_"
+_MOST_CHARACTERS: Final = 200_000
 _AROUND: Final = 120
 """Characters around an entry, whatever it says."""
 _LONGEST_KEY: Final = 200
@@ -147,7 +148,7 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         missing_ticks=span - len(ticks),
         status_counts=_status_counts(session),
         segments=_Shown("segments", 50_000, left_out).mapping(session.segments),
-        metadata=_Shown("keys", 200_000, left_out).texts(session.metadata),
+        metadata=_Shown("keys", _MOST_CHARACTERS, left_out).texts(session.metadata),
         outcome=None
         if session.outcome is None
         else _Shown("keys of the outcome", 100_000, left_out).texts(session.outcome),
@@ -165,6 +166,23 @@ def _cut(text: str, most: int) -> str:
     if len(text) <= most:
         return text
     return f"{text[:most]}… and {len(text) - most} more characters"
+
+
+def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str], list[str]]:
+    """Cut texts of a file to what can be read, and make them harmless to a terminal.
+
+    Parameters
+    ----------
+    values : by their keys, of any number and length
+    what : they are, in the plural
+
+    Returns
+    -------
+    The first of them, and a line on the others if there are any.
+    """
+    left_out: list[str] = []
+    shown = _Shown(what, _MOST_CHARACTERS, left_out).texts(values)
+    return {one_line(key): one_line(value) for key, value in shown.items()}, left_out
 
 
 class _Shown:
