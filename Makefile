@@ -26,7 +26,7 @@ bench: $(VENV)/ready
 	for file in benchmarks/bench_*.py; do $(BIN)/python $$file || exit 1; done
 
 # The long run of what the tests do briefly: other examples of each property, a million frames at
-# each parser, and 1200 damaged session files; some minutes.
+# each parser, 1200 damaged session files, and 1000 that are hostile; half an hour.
 fuzz: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m hypothesis --hypothesis-profile=others
 	$(BIN)/python tests/devices/cia402/fuzz_cia402.py 1000000
@@ -34,6 +34,7 @@ fuzz: $(VENV)/ready
 	$(BIN)/python tests/sim/wire/drive/fuzz_drive_node.py 1000000
 	$(BIN)/python tests/sim/wire/ati/fuzz_ati_nodes.py 1000000
 	$(BIN)/python tests/recovery/fuzz_recovery.py 200
+	$(BIN)/python tests/recovery/fuzz_hostile.py 1000
 
 # The processes of a hundred sessions killed and suspended at random moments: a quarter of an hour.
 chaos: $(VENV)/ready

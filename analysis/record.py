@@ -29,7 +29,7 @@ from analysis.stated_values import (
     stated_rate_hz,
     stated_tool_inertia_kg_m2,
 )
-from rigd.session import Session, Status, read_session
+from rigd.session import Session, Status, read_session, readable_texts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,8 +41,11 @@ if TYPE_CHECKING:
 
 __all__ = ["MAX_FILLED_SHARE", "MAX_GAP_S", "Gaps", "Record", "RecordError", "load_record"]
 
-MAX_SESSION_BYTES = 150 * MAX_TICKS
-"""Most memory for the messages of a session, which take so much a sample."""
+MAX_SAMPLES = MAX_TICKS
+"""Most samples of a session that are read."""
+
+_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
+"""Of the samples, what an analysis needs."""
 
 _REPORTED_FLAGS = (
     (Status.TORQUE_SATURATED, "torque command saturated"),
@@ -170,7 +173,7 @@ def load_record(path: Path) -> Record:
     RecordError
         It was read, but its samples cannot be analysed.
     """
-    session = read_session(path, max_bytes=MAX_SESSION_BYTES)
+    session = read_session(path, fields=_FIELDS, max_samples=MAX_SAMPLES)
     samples = session.samples
     if len(samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
@@ -206,7 +209,8 @@ def load_record(path: Path) -> Record:
         sweep_stale_torques=int(stale_torque[sweep].sum()),
     )
     flags = _flag_counts(status[sweep])
-    outcome = session.outcome or {}
+    metadata, unread = readable_texts(session.metadata, "keys of the metadata")
+    outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
     return Record(
         path=path,
         time_s=(first_tick + np.arange(length)) / rate_hz,
@@ -224,8 +228,11 @@ def load_record(path: Path) -> Record:
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
         flags=flags,
-        warnings=_warnings(gaps, flags, cut, outcome, rate_hz, sweep),
-        metadata=session.metadata,
+        warnings=(
+            *_warnings(gaps, flags, cut, outcome, rate_hz, sweep),
+            *(f"Of the file: {sentence}." for sentence in (*unread, *unread_outcome)),
+        ),
+        metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
     )
 

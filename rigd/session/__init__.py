@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rigd.session.errors import SessionError, SessionExistsError
     from rigd.session.format import SAMPLE_DTYPE, SAMPLE_SIZE, Status
-    from rigd.session.info import SessionInfo, describe
+    from rigd.session.info import SessionInfo, describe, readable_texts
     from rigd.session.reader import (
         Event,
         Session,
@@ -40,13 +40,14 @@ __all__ = [
     "read_controls",
     "read_session",
     "read_timings",
+    "readable_texts",
     "recover",
 ]
 
 _HOMES = {
     "errors": ("SessionError", "SessionExistsError"),
     "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "Status"),
-    "info": ("SessionInfo", "describe"),
+    "info": ("SessionInfo", "describe", "readable_texts"),
     "reader": (
         "Event",
         "Session",

@@ -10,6 +10,7 @@ The control process imports this module: numpy and the standard library only.
 """
 
 import struct
+from collections.abc import Iterable
 from enum import IntFlag
 from typing import Final
 
@@ -221,9 +222,9 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
     return fixed
 
 
-def to_native(wire: npt.NDArray[np.void], types: dict[str, str], out: npt.NDArray[np.void]) -> None:
-    """Copy messages (n,) of a wire dtype into the array `out` (n,) of the decoded dtype."""
-    for name in types:
+def to_native(wire: npt.NDArray[np.void], names: Iterable[str], out: npt.NDArray[np.void]) -> None:
+    """Copy fields of messages (n,) of a wire dtype into the array `out` (n,) of a decoded dtype."""
+    for name in names:
         out[name] = wire[name]
 
 

@@ -2,14 +2,16 @@
 
 The data section is walked from its beginning, which takes a millisecond for the chunks of a
 session. So one way of reading serves files of any chunking, with or without a summary, and tells
-for a file that was cut off how far it can be read. Messages of equal length that follow one
-another, as those of a session do, are taken as one run of bytes.
+for a file that was cut off how far it can be read. Messages are handed on stretch by stretch and
+not kept: those of equal length that follow one another, as a session's do, as one run of bytes.
 
-Nothing in the file is believed before it is checked: what a chunk claims to decompress to is
-bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`, and what is kept of it
-by what the caller allows: a few kilobytes may unpack to as many records as there is memory for.
+Nothing in the file is believed before it is checked, and none can take more than its share of
+memory and time, however few bytes unpack to however many records: what a chunk claims to hold is
+bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked
+piece by piece; and all that takes a step of the program is counted against `MAX_STEPS`.
 """
 
+import mmap
 import struct
 import zlib
 from collections import defaultdict
@@ -32,17 +34,30 @@ from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
 
 MAX_CHUNK_BYTES: Final = 256 << 20
 MAX_TOTAL_BYTES: Final = 2 << 30
+"""Most bytes of all chunks, unpacked: two hours and a half at 1 kHz."""
+MAX_FILE_BYTES: Final = 2 << 30
 MAX_DECLARED_BYTES: Final = 64 << 20
 """Most memory for schemas, channels, metadata and attachments together."""
+MAX_TEXT_BYTES: Final = 32 << 20
+"""Most of that for all but the attachments: as text it takes up to four times as much."""
+MAX_ENTRIES: Final = 100_000
+"""Most keys in all metadata."""
+MAX_MESSAGE_BYTES: Final = 16 << 20
+"""Longest message that is read where it is wanted."""
+MAX_STEPS: Final = 6_000_000
+"""Most work on a file, in what a run of messages costs: about a microsecond."""
+MAX_SKIPPED: Final = 20
+"""Most damaged records that are told one by one."""
+
+_CHUNK_STEPS: Final = 20
+_DECLARATION_STEPS: Final = 15
 
 _DECLARED_COST: Final = 1000
 """Bytes that an object for one of them takes, about, however small its record."""
-_MESSAGE_COST: Final = 112
-_RUN_COST: Final = 500
-"""Likewise of a message, decoded, and of a run of messages."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
+_RUN_HEAD: Final = struct.Struct("<BQH")
 _RUN_KEY: Final = np.dtype(
     {"names": ["head", "tail"], "formats": ["<u8", "<u8"], "offsets": [0, 3], "itemsize": 11}
 )
@@ -52,11 +67,23 @@ _CHANNEL_ID: Final = struct.Struct("<H")
 _FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
 _BARE_MESSAGES: Final = 250
-"""Messages outside of chunks that are kept together."""
+"""Messages outside of chunks that belong together."""
+_SHORT_RUN: Final = 8
+"""Messages that are compared one by one before an array of them pays."""
 _FIRST_STRETCH: Final = 256
-_BLOCK_BYTES: Final = 1 << 18
+_MOST_RUNS: Final = 1 << 16
+"""Runs that are handed on at once."""
+_PIECE_BYTES: Final = 4 << 20
+"""Longest chunk that is unpacked at once, and length of a piece of a longer one."""
+_FEED_BYTES: Final = 1 << 18
+_PASSED_BYTES: Final = 32 << 20
+"""After so much of the file what was read of it is given back to the system."""
+_MAX_ZSTD_WINDOW: Final = 32 << 20
 
 _Record = TypeVar("_Record")
+Run = tuple[int, int, int, int]
+"""Messages of equal length that follow one another: channel, bytes of a record with its head, byte
+at which the first begins, and how many there are."""
 
 
 class McapError(Exception):
@@ -64,52 +91,36 @@ class McapError(Exception):
 
 
 class McapTooLargeError(McapError):
-    """The file holds more messages than may be kept; the message likewise."""
+    """The file takes more memory or time than it may; the message likewise."""
 
 
-@dataclass(slots=True)
-class Run:
-    """Message records of one channel that are equally long, in the order of the file."""
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Message records that stand in one stretch of a file."""
 
-    channel: int
-    size: int
-    """Bytes of a record, head and all."""
-    pieces: list[Buffer] = field(default_factory=list)
-
-    def blocks(self) -> Iterator[bytes]:
-        """Yield the records, joined to blocks that stay in a processor's cache."""
-        joined: list[Buffer] = []
-        length = 0
-        most = max(_BLOCK_BYTES // self.size, 1) * self.size
-        for piece in self.pieces:
-            for start in range(0, len(piece), most):
-                part = piece[start : start + most]
-                joined.append(part)
-                length += len(part)
-                if length >= _BLOCK_BYTES:
-                    yield b"".join(joined)
-                    joined, length = [], 0
-        yield b"".join(joined)
+    records: Buffer
+    """In which the runs lie; it is not kept by the reader."""
+    runs: list[Run]
+    """Of the wanted topics, in the order of the file."""
+    unit: int
+    """Byte of the file at which their chunk begins, or that of some messages without chunk."""
 
 
 @dataclass(slots=True)
 class McapContents:
-    """What was read of a file, as far as it could be."""
+    """What was read of a file, as far as it could be, but for the messages."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
-    runs: dict[str, list[Run]] = field(default_factory=lambda: defaultdict(list))
-    """Wanted topic → its messages in the order of the file."""
     message_counts: dict[int, int] = field(default_factory=lambda: defaultdict(int))
     """Channel → how many messages were read, wanted or not."""
-    chunks: list[list[Run]] = field(default_factory=list)
-    """Messages of all topics as they stood together in chunks, if that was asked for."""
     declared_in_chunks: set[int] = field(default_factory=set)
     """Channels that were declared where a checksum covers them and their schemas."""
     skipped: list[str] = field(default_factory=list)
-    """Damaged records that were skipped: sentences' predicates, as `damage`."""
+    """Damaged records that were skipped: sentences' predicates, as `damage`. The last one tells
+    how many more there are than `MAX_SKIPPED`."""
     stated_counts: dict[int, int] = field(default_factory=dict)
     """Channel → how many messages the file had, by its statistics; empty if they are not sound."""
     sound_bytes: int = 0
@@ -127,24 +138,49 @@ class McapContents:
         return sum(self.message_counts[channel] for channel in channels)
 
 
+def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return where each message begins if runs stand one behind the other.
+
+    Parameters
+    ----------
+    runs : (n, 3), channel, bytes of a record, and count
+
+    Returns
+    -------
+    array (sum of the counts,) of bytes from the beginning of the first
+    """
+    _, sizes, counts = runs.T
+    lengths = sizes * counts
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.asarray(
+        np.repeat(np.cumsum(lengths) - lengths, counts) + number * np.repeat(sizes, counts)
+    )
+
+
+Taker = Callable[[McapContents, Stretch], None]
+"""Takes messages as they are read, with what was read before them."""
+
+
 def read_mcap(
     data: memoryview,
-    topics: Collection[str],
+    topics: Collection[str] | None,
     *,
+    take: Taker | None = None,
     salvage: bool = False,
-    max_bytes: int = MAX_TOTAL_BYTES,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Read an MCAP file as far as it is sound.
 
     Parameters
     ----------
-    data : the file
-    topics : of which the messages are wanted
+    data : the file; pages of an ``mmap`` are given back when they have been read
+    topics : of which the messages are wanted; None for all
+    take
+        Called with the wanted messages, stretch by stretch in the order of the file. What is wrong
+        with it may only turn out behind them.
     salvage
-        Get as much as there is: keep `McapContents.chunks`, skip damaged records outside of
-        chunks, which no message depends on, and look for the statistics of a damaged file.
-    max_bytes : most memory for the messages wanted, raw or decoded, about
+        Get as much as there is: skip damaged records outside of chunks, which no message depends
+        on, and look for the statistics of a damaged file.
     on_progress : called now and then with the share of the file that is done
 
     Returns
@@ -157,11 +193,15 @@ def read_mcap(
         If the file does not begin as an MCAP file does, or declares more than
         `MAX_DECLARED_BYTES`.
     McapTooLargeError
-        If it holds more than `max_bytes` of messages.
+        If it, or a message of those wanted, is too long, or is made of too many parts.
     """
     if bytes(data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
-    reader = _Reader(data, topics, salvage=salvage, max_bytes=max_bytes)
+    if len(data) > MAX_FILE_BYTES:
+        raise McapTooLargeError(
+            f"has {len(data) >> 20} MiB, more than the {MAX_FILE_BYTES >> 20} MiB that are read"
+        )
+    reader = _Reader(data, topics, take, salvage=salvage)
     contents = reader.contents
     contents.complete = _has_end(data)
     try:
@@ -169,7 +209,7 @@ def read_mcap(
     except _DamageError as error:
         contents.damage = str(error)
         if salvage and contents.complete:
-            contents.stated_counts = _stated_counts(data)
+            contents.stated_counts = reader.stated_counts()
     except MemoryError:
         contents.damage = "does not fit into the memory of this machine"
     return contents
@@ -187,36 +227,57 @@ def _has_end(data: memoryview) -> bool:
     return _RECORD_HEAD.unpack_from(data, start) == (Opcode.FOOTER, _FOOTER_CONTENT_SIZE)
 
 
-def _record_at(data: memoryview, position: int, where: str) -> tuple[int, int, int]:
+def _record_at(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
     """Return the opcode of the record at `position`, where its content begins and where it ends."""
     content = position + _RECORD_HEAD.size
     if content > len(data):
-        raise _DamageError(f"ends in the middle of a record, at byte {position}{where}")
+        raise _torn(position, where)
     opcode, length = _RECORD_HEAD.unpack_from(data, position)
     if opcode == 0:
-        raise _DamageError(f"has no record where one must be, at byte {position}{where}")
+        raise _no_record(position, where)
     end = content + length
     if end > len(data):
-        raise _DamageError(f"ends in the middle of a record, at byte {position}{where}")
+        raise _torn(position, where)
     return opcode, content, end
+
+
+def _torn(position: int, where: str) -> _DamageError:
+    return _DamageError(f"ends in the middle of a record, at byte {position}{where}")
+
+
+def _no_record(position: int, where: str) -> _DamageError:
+    return _DamageError(f"has no record where one must be, at byte {position}{where}")
 
 
 class _Reader:
     """One pass over a file."""
 
     def __init__(
-        self, data: memoryview, topics: Collection[str], *, salvage: bool, max_bytes: int
+        self,
+        data: memoryview,
+        topics: Collection[str] | None,
+        take: Taker | None,
+        *,
+        salvage: bool,
     ) -> None:
         self.contents = McapContents(sound_bytes=len(MAGIC))
         self._salvage = salvage
         self._data = data
         self._topics = topics
-        self._wanted: dict[int, str | None] = {}  # channel → its topic if wanted
+        self._take = take
+        self._wanted: dict[int, bool] = {}  # channel → whether its messages are
         self._uncompressed = 0
-        self._max_bytes = max_bytes
-        self._kept = 0
+        self._steps = 0
         self._declared = 0
-        self._zstd = zstandard.ZstdDecompressor()
+        self._declared_text = 0
+        self._entries = 0
+        self._skipped = 0
+        self._unit = 0  # of messages without chunk: first byte, and how many go into it
+        self._unit_room = 0
+        self._declarations: dict[tuple[int, bytes], bytes] = {}  # opcode and number → content
+        self._crc = 0
+        self._passed = 0  # how far the checksum was computed, and the file given back
+        self._zstd = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
 
     def read(self, on_progress: Callable[[float], None] | None) -> None:
         data, contents = self._data, self.contents
@@ -224,12 +285,15 @@ class _Reader:
         while end < len(data):
             start = end
             opcode, content, end = _record_at(data, start, "")
+            self._spend(1)
             if opcode == Opcode.CHUNK:
                 self._read_chunk(data[content:end], start)
                 if on_progress is not None:
                     on_progress(end / len(data))
             elif opcode == Opcode.MESSAGE:
-                self._read_bare_message(data[start:end], start)
+                end = self._read_bare_messages(start, end)
+                if on_progress is not None:
+                    on_progress(end / len(data))
             elif opcode == Opcode.DATA_END:
                 self._check_data_end(data[content:end], start)
                 contents.sound_bytes = end
@@ -244,40 +308,88 @@ class _Reader:
                 except _DamageError as error:
                     if not self._salvage:
                         raise
-                    contents.skipped.append(str(error))
+                    self._skip(str(error))
             contents.sound_bytes = end
+            if end - self._passed > _PASSED_BYTES:
+                self._give_back(end)
         raise _DamageError("has no end of its data section")
 
-    def _read_bare_message(self, record: memoryview, start: int) -> None:
-        where = f" at byte {start}"
-        if self._salvage:
-            channel = MESSAGE_HEAD.unpack_from(record)[2] if len(record) >= MESSAGE_HEAD.size else 0
-            if channel in self.contents.declared_in_chunks:
-                # Its writer uses chunks: this is another record, with a damaged opcode.
-                raise _DamageError(f"has a message outside of a chunk{where}")
-            if not self.contents.chunks or len(self.contents.chunks[-1]) >= _BARE_MESSAGES:
-                self.contents.chunks.append([])
-        self._take_run(record, 1, len(self._data), where)
+    def _spend(self, steps: int) -> None:
+        self._steps += steps
+        if self._steps > MAX_STEPS:
+            raise McapTooLargeError(
+                "is made of so many small parts that reading it would take too long: more than "
+                f"{MAX_STEPS} runs of messages, chunks and other records, each weighed by its work"
+            )
 
-    def _read_other(self, opcode: int, content: memoryview, where: str) -> None:
+    def _skip(self, damage: str) -> None:
+        """Note a damaged record that is left out; of very many, how many they are."""
+        self._skipped += 1
+        skipped = self.contents.skipped
+        if self._skipped > MAX_SKIPPED:
+            del skipped[MAX_SKIPPED:]
+            damage = f"has {self._skipped - MAX_SKIPPED} more damaged records"
+        skipped.append(damage)
+
+    def _give_back(self, end: int) -> None:
+        """Compute the checksum up to `end`, and let go of the file up to there."""
+        self._crc = self._crc_of(self._passed, end, self._crc)
+        self._passed = end
+
+    def _crc_of(self, start: int, end: int, crc: int = 0) -> int:
+        for position in range(start, end, _PASSED_BYTES):
+            crc = zlib.crc32(self._data[position : min(position + _PASSED_BYTES, end)], crc)
+            self._let_go()
+        return crc
+
+    def _let_go(self) -> None:
+        """Give the file's pages back to the system: they would count as memory of the process."""
+        mapped = self._data.obj
+        if len(self._data) > _PASSED_BYTES and isinstance(mapped, mmap.mmap):
+            mapped.madvise(mmap.MADV_DONTNEED)
+
+    def _read_bare_messages(self, start: int, first_end: int) -> int:
+        """Take the messages from `start` on that stand outside of chunks; return their end."""
+        where = f" at byte {start}"
+        if first_end - start < MESSAGE_HEAD.size:
+            raise _DamageError(f"has a message that is too short{where}")
+        if self._is_stray(_RUN_HEAD.unpack_from(self._data, start)[2]):
+            # Its writer uses chunks: this is another record, with a damaged opcode.
+            raise _DamageError(f"has a message outside of a chunk{where}")
+        if self._unit_room == 0:
+            self._unit, self._unit_room = start, _BARE_MESSAGES
+        limit = min(len(self._data), max(first_end, start + _PIECE_BYTES))
+        end, count = self._read_messages(
+            self._data, start, limit, self._unit, where, self._unit_room
+        )
+        self._unit_room -= count
+        return end
+
+    def _is_stray(self, channel: int) -> bool:
+        return self._salvage and channel in self.contents.declared_in_chunks
+
+    def _read_other(self, opcode: int, content: Buffer, where: str) -> None:
         """Take a record that is neither chunk nor message; skip what is not needed."""
         contents = self.contents
-        if opcode in _DECLARATIONS:
-            self._declared += len(content) + _DECLARED_COST
-            if self._declared > MAX_DECLARED_BYTES:
-                raise McapError(
-                    f"declares channels, schemas, metadata and attachments without end: more than "
-                    f"{MAX_DECLARED_BYTES >> 20} MiB of them{where}"
-                )
+        if opcode not in _DECLARATIONS:
+            return
+        self._spend(_DECLARATION_STEPS)
+        # Many writers repeat schemas and channels in every chunk, which takes no room again.
+        number = (opcode, bytes(content[: _CHANNEL_ID.size]))
+        if self._declarations.get(number) == content:
+            return
+        self._declare(opcode, content, where)
         if opcode == Opcode.SCHEMA:
             schema = _parsed(Schema.read, content, where)
             if contents.schemas.setdefault(schema.id, schema) != schema:
                 raise _DamageError(f"declares schema {schema.id} twice, differently{where}")
+            self._declarations[number] = bytes(content)
         elif opcode == Opcode.CHANNEL:
             channel = _parsed(Channel.read, content, where)
             if contents.channels.setdefault(channel.id, channel) != channel:
                 raise _DamageError(f"declares channel {channel.id} twice, differently{where}")
-            self._wanted[channel.id] = channel.topic if channel.topic in self._topics else None
+            self._wanted[channel.id] = self._topics is None or channel.topic in self._topics
+            self._declarations[number] = bytes(content)
         elif opcode == Opcode.METADATA:
             contents.metadata.append(_parsed(Metadata.read, content, where))
         elif opcode == Opcode.ATTACHMENT:
@@ -287,7 +399,27 @@ class _Reader:
                     raise _DamageError(f"has an attachment with a wrong checksum{where}")
             contents.attachments.append(_parsed(Attachment.read, content, where))
 
+    def _declare(self, opcode: int, content: Buffer, where: str) -> None:
+        """Count what a declaration takes before it is parsed."""
+        self._declared += len(content) + _DECLARED_COST
+        if opcode != Opcode.ATTACHMENT:
+            self._declared_text += len(content)
+        if opcode in (Opcode.METADATA, Opcode.CHANNEL):
+            self._entries += _entries(content, opcode, MAX_ENTRIES)
+        for amount, most, of_what in (
+            (self._declared, MAX_DECLARED_BYTES, "MiB of channels, schemas, metadata and files"),
+            (self._declared_text, MAX_TEXT_BYTES, "MiB of channels, schemas and metadata"),
+        ):
+            if amount > most:
+                raise McapError(
+                    "declares channels, schemas, metadata and attachments without end: more than "
+                    f"{most >> 20} {of_what}{where}"
+                )
+        if self._entries > MAX_ENTRIES:
+            raise McapError(f"has more than {MAX_ENTRIES} keys in its metadata{where}")
+
     def _read_chunk(self, content: memoryview, start: int) -> None:
+        self._spend(_CHUNK_STEPS)
         where = f" in the chunk at byte {start}"
         try:
             *_, size, crc = _CHUNK_HEAD.unpack_from(content)
@@ -301,25 +433,34 @@ class _Reader:
                 f"claims {size} bytes{where}, which is more than the {MAX_CHUNK_BYTES >> 20} MiB "
                 f"for a chunk or the {MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
             )
-        records = memoryview(self._decompressed(bytes(name), packed, size, where))
-        if crc not in (0, zlib.crc32(records)):
+        compression = bytes(name[:20])
+        if size <= _PIECE_BYTES:
+            records = self._decompressed(compression, packed, size, where)
+            if crc not in (0, zlib.crc32(records)):
+                raise _DamageError(f"has a wrong checksum{where}")
+            end = self._read_records(records, 0, start, where)
+            if end < len(records):
+                raise _torn(end, where)
+            return
+        # Too long to be held: unpacked once to be checked, and once more to be read.
+        found, found_crc = 0, 0
+        for piece in self._pieces(compression, packed, size, where):
+            found += len(piece)
+            found_crc = zlib.crc32(piece, found_crc)
+            self._let_go()
+        if found != size:
+            raise _DamageError(f"decompresses to a wrong size{where}")
+        if crc not in (0, found_crc):
             raise _DamageError(f"has a wrong checksum{where}")
-        if self._salvage:
-            self.contents.chunks.append([])
-        self._read_chunk_records(records, where)
+        self._read_pieces(self._pieces(compression, packed, size, where), start, where)
 
     def _decompressed(self, compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
         """Decompress a chunk to exactly `size` bytes, never allocating more."""
         try:
             if compression == b"":
-                records = bytes(packed)
+                records = bytes(packed[: size + 1])
             elif compression == b"zstd":
-                # The frame may state a size of its own, which the decompressor would believe.
-                if zstandard.get_frame_parameters(packed).content_size not in (
-                    size,
-                    zstandard.CONTENTSIZE_UNKNOWN,
-                ):
-                    raise _DamageError(f"states two different sizes{where}")
+                _check_zstd_size(packed, size, where)
                 records = self._zstd.decompress(packed, max_output_size=size)
             elif compression == b"lz4":
                 # One byte more than is right, so that what is too long is seen.
@@ -332,53 +473,177 @@ class _Reader:
             raise _DamageError(f"decompresses to a wrong size{where}")
         return records
 
-    def _read_chunk_records(self, records: memoryview, where: str) -> None:
+    def _pieces(
+        self, compression: bytes, packed: memoryview, size: int, where: str
+    ) -> Iterator[Buffer]:
+        """Yield a chunk piece by piece, and at most one piece more than its `size`."""
+        done = 0
+        try:
+            if compression == b"":
+                for start in range(0, len(packed), _PIECE_BYTES):
+                    yield packed[start : start + _PIECE_BYTES]
+            elif compression == b"zstd":
+                _check_zstd_size(packed, size, where)
+                stream = self._zstd.stream_reader(packed)
+                while done <= size and (piece := stream.read(_PIECE_BYTES)):
+                    done += len(piece)
+                    yield piece
+            elif compression == b"lz4":
+                lz4_stream = lz4.frame.LZ4FrameDecompressor()
+                for start in range(0, len(packed), _FEED_BYTES):
+                    feed: Buffer = packed[start : start + _FEED_BYTES]
+                    while not lz4_stream.eof and done <= size:
+                        piece = lz4_stream.decompress(feed, max_length=_PIECE_BYTES)
+                        done += len(piece)
+                        if piece:
+                            yield piece
+                        if lz4_stream.needs_input:
+                            break
+                        feed = b""
+            else:
+                raise _DamageError(f"uses the unknown compression {compression!r}{where}")
+        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError):
+            raise _DamageError(f"does not decompress{where}") from None
+
+    def _read_pieces(self, pieces: Iterator[Buffer], unit: int, where: str) -> None:
+        """Read records that begin in one piece and end in another, and skip what is not wanted."""
+        rest = b""
+        base = 0  # where `rest` begins in the chunk
+        skip = 0  # bytes of a record that is not wanted
+        for piece in pieces:
+            self._let_go()
+            if skip >= len(piece):
+                skip -= len(piece)
+                base += len(piece)
+                continue
+            rest += piece[skip:]
+            base += skip
+            skip = 0
+            used = self._read_records(rest, base, unit, where)
+            rest = rest[used:]
+            base += used
+            if len(rest) >= _RUN_HEAD.size:
+                skip = self._needless_bytes(rest, base, where)
+                if skip:
+                    base += len(rest)
+                    skip -= len(rest)
+                    rest = b""
+        if rest or skip:
+            raise _torn(base, where)
+
+    def _needless_bytes(self, records: bytes, base: int, where: str) -> int:
+        """Return the length of the record that `records` begin with if it is not needed, else 0."""
+        opcode, length, channel = _RUN_HEAD.unpack_from(records)
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            if length > MAX_TEXT_BYTES:
+                raise _torn(base, where)
+            return 0
+        if opcode == Opcode.MESSAGE:
+            if self._wanted.get(channel, True) and self._is_short(length, where):
+                return 0
+            self.contents.message_counts[channel] += 1
+        return int(length) + _RECORD_HEAD.size
+
+    def _is_short(self, length: int, where: str) -> bool:
+        """Tell whether a message can be taken; what cannot is left out to save the others."""
+        if length <= MAX_MESSAGE_BYTES:
+            return True
+        damage = (
+            f"has a message of {length} bytes{where}, more than the {MAX_MESSAGE_BYTES >> 20} MiB "
+            "that are accepted"
+        )
+        if not self._salvage:
+            raise _DamageError(damage)
+        self._skip(damage)
+        return False
+
+    def _read_records(self, records: bytes, base: int, unit: int, where: str) -> int:
+        """Read what is whole of the records of a chunk; return where the rest begins.
+
+        `base` is where they begin in the chunk.
+        """
         end = 0
         while end < len(records):
             start = end
-            opcode, content, end = _record_at(records, start, where)
+            end, count = self._read_messages(records, start, len(records), unit, where)
+            if count:
+                continue
+            if start + _RECORD_HEAD.size > len(records):
+                return start
+            opcode, length = _RECORD_HEAD.unpack_from(records, start)
+            if opcode == 0:
+                raise _no_record(base + start, where)
+            content = start + _RECORD_HEAD.size
+            end = content + length
+            if end > len(records):
+                return start
+            self._spend(1)
             if opcode == Opcode.MESSAGE:
-                count = _run_length(records, start, end - start)
-                end = start + count * (end - start)
-                self._take_run(records[start:end], count, len(records), where)
-            else:
-                self._read_other(opcode, records[content:end], where)
-                if opcode == Opcode.CHANNEL:
-                    (channel,) = _CHANNEL_ID.unpack_from(records, content)
-                    self.contents.declared_in_chunks.add(channel)
+                raise _DamageError(f"has a message that is too short{where}")
+            self._read_other(opcode, records[content:end], where)
+            if opcode == Opcode.CHANNEL:
+                (channel,) = _CHANNEL_ID.unpack_from(records, content)
+                self.contents.declared_in_chunks.add(channel)
+        return end
 
-    def _take_run(self, run: memoryview, count: int, total: int, where: str) -> None:
-        """Take `count` message records of equal length and channel out of `total` bytes."""
-        size = len(run) // count
-        if size < MESSAGE_HEAD.size:
-            raise _DamageError(f"has a message that is too short{where}")
-        channel = MESSAGE_HEAD.unpack_from(run)[2]
-        if channel not in self._wanted:
-            raise _DamageError(f"has a message of an undeclared channel {channel}{where}")
-        self.contents.message_counts[channel] += count
-        if self._salvage:
-            self.contents.chunks[-1].append(Run(channel, size, [run]))
-        topic = self._wanted[channel]
-        if topic is None:
-            return
-        runs = self.contents.runs[topic]
-        self._kept += max(len(run), count * _MESSAGE_COST)
-        if not runs or (runs[-1].channel, runs[-1].size) != (channel, size):
-            runs.append(Run(channel, size))
-            self._kept += _RUN_COST
-        if self._kept > self._max_bytes:
-            raise McapTooLargeError(
-                f"holds more than the {self._max_bytes >> 20} MiB of messages that are accepted in "
-                f"{' and '.join(sorted(self._topics))}"
-            )
-        # A slice keeps the chunk in memory, which is well where it is most of it.
-        runs[-1].pieces.append(run if 2 * len(run) > total else bytes(run))
+    def _read_messages(
+        self,
+        records: Buffer,
+        start: int,
+        limit: int,
+        unit: int,
+        where: str,
+        most: int | None = None,
+    ) -> tuple[int, int]:
+        """Hand on the messages that follow one another from `start` on and end before `limit`.
+
+        Of those outside of chunks `most` at most. Returns where the first other record begins, and
+        how many they were.
+        """
+        unpack = _RUN_HEAD.unpack_from
+        wanted, counts = self._wanted, self.contents.message_counts
+        runs: list[Run] = []
+        position = start
+        taken = passed = 0  # messages, and runs of them
+        try:
+            while position + MESSAGE_HEAD.size <= limit and passed < _MOST_RUNS:
+                key = unpack(records, position)
+                opcode, length, channel = key
+                size = length + _RECORD_HEAD.size
+                if opcode != Opcode.MESSAGE or size < MESSAGE_HEAD.size or position + size > limit:
+                    break
+                is_wanted = wanted.get(channel)
+                if is_wanted is None:
+                    raise _DamageError(f"has a message of an undeclared channel {channel}{where}")
+                if most is not None and (taken == most or self._is_stray(channel)):
+                    break
+                end = position + size
+                count = 1
+                while end + size <= limit and unpack(records, end) == key:
+                    end += size
+                    count += 1
+                    if count == _SHORT_RUN:
+                        count = _run_length(records, position, size, limit)
+                        break
+                if most is not None:
+                    count = min(count, most - taken)
+                if is_wanted and self._is_short(length, where):
+                    runs.append((channel, size, position, count))
+                counts[channel] += count
+                position += size * count
+                taken += count
+                passed += 1
+        finally:
+            if runs and self._take is not None:
+                self._take(self.contents, Stretch(records, runs, unit))
+        self._spend(passed)
+        return position, taken
 
     def _check_data_end(self, content: memoryview, start: int) -> None:
         if len(content) < 4:
             raise _DamageError(f"has a malformed end of its data section at byte {start}")
         (crc,) = struct.unpack_from("<I", content)
-        if crc not in (0, zlib.crc32(self._data[:start])):
+        if crc != 0 and crc != self._crc_of(self._passed, start, self._crc):
             raise _DamageError("has a wrong checksum over its data section")
         self.contents.verified = crc != 0
 
@@ -391,40 +656,56 @@ class _Reader:
         *_, summary_start, _, crc = _FOOTER.unpack_from(data, footer)
         if summary_start not in (0, start) or (summary_start == 0 and footer != start):
             raise _DamageError(f"has a footer that contradicts its data section at byte {footer}")
-        if crc not in (0, zlib.crc32(data[start : footer + _FOOTER.size - 4])):
+        if crc not in (0, self._crc_of(start, footer + _FOOTER.size - 4)):
             raise _DamageError("has a wrong checksum over its summary")
-        end = start
-        while end < footer:
-            opcode, content, end = _record_at(data[:footer], end, " of the summary")
+        for opcode, content in self._summary_records(start, footer):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # Those of channels without messages may stand here only.
-                self._read_other(opcode, data[content:end], " in the summary")
+                self._read_other(opcode, content, " in the summary")
             elif opcode == Opcode.STATISTICS:
-                statistics = _parsed(Statistics.read, data[content:end], " in the summary")
+                statistics = _parsed(Statistics.read, content, " in the summary")
                 found = self.contents.message_counts
                 counts = statistics.channel_message_counts
                 if any(found[channel] != count for channel, count in counts.items()):
                     raise _DamageError("has not the messages that its statistics count")
 
-
-def _stated_counts(data: memoryview) -> dict[int, int]:
-    """Return the statistics' message counts, if the summary has a checksum that is right."""
-    footer = len(data) - len(MAGIC) - _FOOTER.size
-    *_, start, _, crc = _FOOTER.unpack_from(data, footer)
-    if not len(MAGIC) <= start <= footer:
-        return {}
-    if crc == 0 or crc != zlib.crc32(data[start : footer + _FOOTER.size - 4]):
-        return {}
-    end = start
-    try:
+    def _summary_records(self, start: int, footer: int) -> Iterator[tuple[int, memoryview]]:
+        """Yield opcode and content of the summary's records."""
+        data, end, passed = self._data[:footer], start, start
         while end < footer:
-            opcode, content, end = _record_at(data[:footer], end, "")
-            if opcode == Opcode.STATISTICS:
-                statistics = _parsed(Statistics.read, data[content:end], "")
-                return dict(statistics.channel_message_counts)
-    except _DamageError:
-        pass
-    return {}
+            opcode, content, end = _record_at(data, end, " of the summary")
+            if end - passed > _PASSED_BYTES:
+                passed = end
+                self._let_go()
+            # Each channel that statistics count takes its time.
+            is_statistics = opcode == Opcode.STATISTICS
+            self._spend(1 + (end - content) // 4 if is_statistics else 1)
+            yield opcode, data[content:end]
+
+    def stated_counts(self) -> dict[int, int]:
+        """Return the statistics' message counts, if the summary has a checksum that is right."""
+        data = self._data
+        footer = len(data) - len(MAGIC) - _FOOTER.size
+        *_, start, _, crc = _FOOTER.unpack_from(data, footer)
+        if not len(MAGIC) <= start <= footer:
+            return {}
+        if crc == 0 or crc != self._crc_of(start, footer + _FOOTER.size - 4):
+            return {}
+        try:
+            for opcode, content in self._summary_records(start, footer):
+                if opcode == Opcode.STATISTICS:
+                    statistics = _parsed(Statistics.read, content, "")
+                    return dict(statistics.channel_message_counts)
+        except _DamageError:
+            pass
+        return {}
+
+
+def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:
+    """Compare the size that the frame may state, which the decompressor would believe."""
+    stated = zstandard.get_frame_parameters(packed).content_size
+    if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+        raise _DamageError(f"states two different sizes{where}")
 
 
 def _prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
@@ -436,7 +717,31 @@ def _prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryvi
     return content[start : start + length], start + length
 
 
-def _parsed(read: Callable[[ReadDataStream], _Record], content: memoryview, where: str) -> _Record:
+def _entries(content: Buffer, opcode: int, most: int) -> int:
+    """Count the entries of the map at the end of a metadata or channel record, up to `most` + 1.
+
+    What is malformed has none: it is found out when the record is parsed.
+    """
+    view = memoryview(content)
+    count = 0
+    try:
+        if opcode == Opcode.METADATA:
+            _, position = _prefixed(view, 0, "<I")
+        else:
+            _, position = _prefixed(view, 4, "<I")
+            _, position = _prefixed(view, position, "<I")
+        entries, _ = _prefixed(view, position, "<I")
+        position = 0
+        while position < len(entries) and count <= most:
+            _, position = _prefixed(entries, position, "<I")
+            _, position = _prefixed(entries, position, "<I")
+            count += 1
+    except struct.error:
+        pass
+    return count
+
+
+def _parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
     """Parse a record with the ``mcap`` package."""
     try:
         stream = ReadDataStream(BytesIO(content))
@@ -446,22 +751,17 @@ def _parsed(read: Callable[[ReadDataStream], _Record], content: memoryview, wher
     return record
 
 
-def _run_length(records: memoryview, start: int, size: int) -> int:
-    """Count the records of equal opcode, length and channel from `start` on.
+def _run_length(records: Buffer, start: int, size: int, limit: int) -> int:
+    """Count the records of equal opcode, length and channel from `start` on, up to `limit`.
 
     The stretch examined at once grows, so that short runs in long chunks stay cheap.
     """
-    key = bytes(records[start : start + _RUN_KEY.itemsize])
-    most = (len(records) - start) // size
-    if most < 2 or bytes(records[start + size : start + size + _RUN_KEY.itemsize]) != key:
-        return 1
-    (head, tail) = np.frombuffer(key, _RUN_KEY)[0]
+    (head, tail) = np.frombuffer(records[start : start + _RUN_KEY.itemsize], _RUN_KEY)[0]
+    most = (limit - start) // size
     known, stretch = 1, _FIRST_STRETCH
     while known < most:
         count = min(stretch, most - known)
-        keys: npt.NDArray[np.void] = np.ndarray(
-            count, _RUN_KEY, records, start + known * size, (size,)
-        )
+        keys = np.ndarray(count, _RUN_KEY, records, start + known * size, (size,))
         equal = (keys["head"] == head) & (keys["tail"] == tail)
         first = int(equal.argmin())
         if not equal[first]:

@@ -1,6 +1,7 @@
 """Reader of session files: the whole file to arrays, or an error that says what is wrong."""
 
 import mmap
+import shlex
 import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,46 +15,50 @@ import numpy.typing as npt
 
 from rigd.session.durable import is_being_written
 from rigd.session.errors import SessionError
-from rigd.session.format import (
-    CONTROL_DTYPE,
-    CONTROL_TYPES,
-    CONTROL_WIRE_DTYPE,
-    SAMPLE_DTYPE,
-    SAMPLE_TYPES,
-    SAMPLE_WIRE_DTYPE,
-    TIMING_DTYPE,
-    TIMING_TYPES,
-    TIMING_WIRE_DTYPE,
-    is_fixed_layout,
-    to_native,
-)
+from rigd.session.format import to_native
 from rigd.session.mcap_reader import (
-    MAX_TOTAL_BYTES,
     McapContents,
     McapError,
     McapTooLargeError,
+    Stretch,
+    Taker,
     read_mcap,
 )
 from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
-from rigd.session.schema import (
-    CONTROL_SCHEMA,
-    CONTROL_TOPIC,
-    EVENT_LEVELS,
-    EVENT_TOPIC,
-    FORMAT_VERSION,
-    SAMPLE_SCHEMA,
-    SAMPLE_TOPIC,
-    TIMING_SCHEMA,
-    TIMING_TOPIC,
-    message_class,
-    schema_data,
+from rigd.session.message_decoder import (
+    CONTROLS,
+    MAX_CHANNELS,
+    SAMPLES,
+    TIMINGS,
+    Layout,
+    MessageDecoder,
+    class_of_channel,
+    decoded_message,
+    quoted,
 )
+from rigd.session.schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
+MAX_SAMPLES: Final = 2_400_000
+"""Most samples that are read into memory: 40 minutes at 1 kHz, 0.27 GB."""
+SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
+"""Of the samples, what tells how many there are, whether they are in order, and their flags."""
+MAX_SURVEYED: Final = 7_200_000
+"""Most samples of which only that is read: two hours at 1 kHz, the longest of `rigd run`."""
 MAX_EVENTS: Final = 100_000
 """Most lines of a session's log that are read."""
+MAX_EVENT_BYTES: Final = 1 << 20
+"""Longest message of the log that is read; of a longer one its length is told."""
+MAX_LOG_BYTES: Final = 16 << 20
+"""Most of the log that is read."""
+
+_GROWTH: Final = 1 << 16
+_BYTES_A_SAMPLE: Final = 60
+"""Fewest that a sample takes in the file, unless it repeats itself."""
+_LONGEST_NUMBER: Final = 400
+"""Characters: the longest finite number in decimal, without its fraction, has 309."""
 
 _UNITS: Final = {
     "_kg_m2": "kg·m²",
@@ -67,52 +72,6 @@ _UNITS: Final = {
     "_s": "s",
 }
 """Suffix of a key → its unit, the longer suffixes first."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """A channel of fixed-layout messages."""
-
-    topic: str
-    schema_name: str
-    types: dict[str, str]
-    required: tuple[str, ...]
-    """Fields that a schema cannot leave out; any other absent one reads as 0."""
-    record_dtype: np.dtype[np.void]
-    """A message record in the file: its ``head``, then the ``wire`` form."""
-    dtype: np.dtype[np.void]
-
-
-def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
-    return np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", wire_dtype)])
-
-
-_SAMPLES: Final = _Layout(
-    SAMPLE_TOPIC,
-    SAMPLE_SCHEMA,
-    SAMPLE_TYPES,
-    ("t_ns", "tick", "angle_rad", "coupling_torque_nm"),
-    _record_dtype(SAMPLE_WIRE_DTYPE),
-    SAMPLE_DTYPE,
-)
-_CONTROLS: Final = _Layout(
-    CONTROL_TOPIC,
-    CONTROL_SCHEMA,
-    CONTROL_TYPES,
-    ("t_ns", "tick"),
-    _record_dtype(CONTROL_WIRE_DTYPE),
-    CONTROL_DTYPE,
-)
-
-
-_TIMINGS: Final = _Layout(
-    TIMING_TOPIC,
-    TIMING_SCHEMA,
-    TIMING_TYPES,
-    ("t_ns", "tick"),
-    _record_dtype(TIMING_WIRE_DTYPE),
-    TIMING_DTYPE,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +104,8 @@ class Session:
     """How the session ended, None if the file does not tell."""
     events: list[Event]
     attachments: dict[str, bytes]
+    events_left_out: int = 0
+    """Further lines of the log, for which there was no room."""
 
     def number(self, key: str, default: float | None = None) -> float:
         """Return a number of the metadata.
@@ -169,24 +130,32 @@ class Session:
                 f"state it as a number{unit}."
             )
         try:
-            value = float(text)
+            value = float(text) if len(text) <= _LONGEST_NUMBER else float("nan")
         except ValueError:
             value = float("nan")
         if not isfinite(value):
             raise SessionError(
-                f"{self.path}: {key} in the metadata 'session' is {_quoted(text)}, which is not a "
+                f"{self.path}: {key} in the metadata 'session' is {quoted(text)}, which is not a "
                 f"finite number. Whoever writes the file must state it as a number{unit}."
             )
         return value
 
 
-def read_session(path: str | PathLike[str], *, max_bytes: int = MAX_TOTAL_BYTES) -> Session:
+def read_session(
+    path: str | PathLike[str],
+    *,
+    fields: Sequence[str] | None = None,
+    max_samples: int = MAX_SAMPLES,
+    on_samples: Callable[[npt.NDArray[np.void]], None] | None = None,
+) -> Session:
     """Read a whole session file.
 
     Parameters
     ----------
     path : a complete file as docs/session_format.md defines it
-    max_bytes : most memory that its messages may take, about; a sample takes 150 bytes
+    fields : of the samples, those that are wanted, ``tick`` and ``t_ns`` among them; default all
+    max_samples : most that are kept; they take up to 112 bytes each
+    on_samples : called with all fields of the samples, block by block, as they are read
 
     Raises
     ------
@@ -195,25 +164,34 @@ def read_session(path: str | PathLike[str], *, max_bytes: int = MAX_TOTAL_BYTES)
         format version, or no session.
     """
     path = Path(path)
-    contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC), max_bytes=max_bytes)
+    log = _Log()
+    samples = Kept(path, SAMPLES, fields, max_samples, on_samples)
+
+    def take(contents: McapContents, stretch: Stretch) -> None:
+        samples.decoder.take(contents, stretch)
+        log.take(contents, stretch)
+
+    contents = _load(path, (SAMPLE_TOPIC, EVENT_TOPIC), take)
     metadata = merged_metadata(contents, "session") or {}
     version = metadata.get("format_version", FORMAT_VERSION)
     if version != FORMAT_VERSION:
         raise SessionError(
-            f"{path} is of session format version {_quoted(version)}, and this program reads "
+            f"{path} is of session format version {quoted(version)}, and this program reads "
             f"version {FORMAT_VERSION}. Use a newer version of it."
         )
-    samples = load_samples(path, contents)
-    start_utc_ns = _start_utc_ns(path, metadata, contents, samples)
+    array = samples.finish(contents)
+    _check_ticks(path, array)
+    start_utc_ns = _start_utc_ns(path, metadata, log.first_log_time, array)
     return Session(
         path=path,
-        samples=samples,
+        samples=array,
         start_utc_ns=start_utc_ns,
         metadata=metadata,
         segments=_segments(path, merged_metadata(contents, "segments") or {}),
         outcome=merged_metadata(contents, "outcome"),
-        events=_events(path, contents, start_utc_ns),
+        events=log.events(path, contents, start_utc_ns),
         attachments={attachment.name: attachment.data for attachment in contents.attachments},
+        events_left_out=log.left_out,
     )
 
 
@@ -229,8 +207,7 @@ def read_timings(path: str | PathLike[str]) -> npt.NDArray[np.void]:
     SessionError
         As `read_session` does.
     """
-    path = Path(path)
-    return _decode_topic(path, _load(path, (TIMING_TOPIC,)), _TIMINGS)
+    return _read_topic(Path(path), TIMINGS)
 
 
 def read_controls(path: str | PathLike[str]) -> npt.NDArray[np.void]:
@@ -245,18 +222,148 @@ def read_controls(path: str | PathLike[str]) -> npt.NDArray[np.void]:
     SessionError
         As `read_session` does.
     """
-    path = Path(path)
-    return _decode_topic(path, _load(path, (CONTROL_TOPIC,)), _CONTROLS)
+    return _read_topic(Path(path), CONTROLS)
 
 
-def _quoted(text: str) -> str:
-    """Quote a value of the file, which may be of any length and contain anything."""
-    return repr(text if len(text) <= 40 else text[:40] + "…")
+def _read_topic(path: Path, layout: Layout) -> npt.NDArray[np.void]:
+    kept = Kept(path, layout, None, MAX_SAMPLES)
+    return kept.finish(_load(path, (layout.topic,), kept.decoder.take))
 
 
-def _load(path: Path, topics: Sequence[str], *, max_bytes: int = MAX_TOTAL_BYTES) -> McapContents:
+class Kept:
+    """Decoded messages of a topic, in an array that grows with the file.
+
+    Parameters
+    ----------
+    path : the file, for messages
+    layout : what the messages hold
+    fields : of those the ones that are wanted; None for all
+    most : messages that may be kept
+    on_messages : called with all fields of the messages, block by block
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        layout: Layout,
+        fields: Sequence[str] | None,
+        most: int,
+        on_messages: Callable[[npt.NDArray[np.void]], None] | None = None,
+    ) -> None:
+        self.decoder = MessageDecoder(path, layout, self, None if on_messages else fields)
+        self._path = path
+        self._topic = layout.topic
+        self._most = most
+        self._on_messages = on_messages
+        # Room that is not used takes no memory, and most files need no more.
+        expected = min(_file_size(path) // _BYTES_A_SAMPLE, most)
+        self._array = np.empty(expected, layout.dtype_of(fields))
+        self._length = 0
+
+    def room(self, count: int) -> npt.NDArray[np.void]:
+        """Return room for messages; see `rigd.session.message_decoder.Keeper`."""
+        end = self._length + count
+        if end > self._most:
+            raise SessionError(
+                f"{self._path} holds more than the {self._most} messages of {self._topic} that fit "
+                "into the memory that reading a session may take. Give a shorter session."
+            )
+        if end > len(self._array):
+            # In place, and by a part that hardly counts: two arrays at once would be too many.
+            grown = max(end, len(self._array) + max(_GROWTH, len(self._array) // 8))
+            self._array.resize(min(grown, self._most), refcheck=False)
+        if self._on_messages is not None:
+            return np.empty(count, self.decoder.dtype)
+        return self._array[self._length : end]
+
+    def keep(self, messages: npt.NDArray[np.void]) -> None:
+        """Count the messages, which stand in the array already unless all fields were asked for."""
+        end = self._length + len(messages)
+        if self._on_messages is not None:
+            self._on_messages(messages)
+            to_native(messages, self._array.dtype.names or (), self._array[self._length : end])
+        self._length = end
+
+    def finish(self, contents: McapContents) -> npt.NDArray[np.void]:
+        """Return what was kept.
+
+        Raises
+        ------
+        SessionError
+            If the messages are not what the format asks for, or too many.
+        """
+        self.decoder.finish(contents)
+        self._array.resize(self._length, refcheck=False)
+        return self._array
+
+
+def _file_size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:  # which is told when it is opened
+        return 0
+
+
+class _Log:
+    """Messages of the session's log as they are read, as many as fit into its share of memory."""
+
+    def __init__(self) -> None:
+        self.first_log_time: int | None = None
+        """That of the first sample."""
+        self.left_out = 0
+        """Messages of the log that were not kept."""
+        self._kept: list[tuple[int, int, bytes | int]] = []  # channel, log time, data or its length
+        self._bytes = 0
+
+    def take(self, contents: McapContents, stretch: Stretch) -> None:
+        """Take the messages of the log."""
+        records = stretch.records
+        for channel, size, start, count in stretch.runs:
+            topic = contents.channels[channel].topic
+            if topic == SAMPLE_TOPIC:
+                if self.first_log_time is None:
+                    self.first_log_time = int(MESSAGE_HEAD.unpack_from(records, start)[4])
+                continue
+            room = MAX_EVENTS - len(self._kept)
+            for first in range(start, start + size * min(count, room), size):
+                log_time = int(MESSAGE_HEAD.unpack_from(records, first)[4])
+                length = size - MESSAGE_HEAD.size
+                if length > MAX_EVENT_BYTES:
+                    self._kept.append((channel, log_time, length))
+                elif self._bytes + length > MAX_LOG_BYTES:
+                    self.left_out += 1
+                else:
+                    self._bytes += length
+                    data = bytes(records[first + MESSAGE_HEAD.size : first + size])
+                    self._kept.append((channel, log_time, data))
+            self.left_out += max(count - room, 0)
+
+    def events(self, path: Path, contents: McapContents, start_utc_ns: int) -> list[Event]:
+        """Decode the log; one that is not protobuf is left out, because no reader needs one."""
+        events: list[Event] = []
+        decoders: dict[int, Callable[[bytes], Message]] = {}
+        for channel, log_time, data in self._kept:
+            if contents.channels[channel].message_encoding != "protobuf":
+                continue
+            t_ns = log_time - start_utc_ns
+            if isinstance(data, int):
+                events.append(Event(t_ns, "unknown", "", f"(a message of {data} bytes, not read)"))
+                continue
+            if channel not in decoders:
+                if len(decoders) == MAX_CHANNELS:
+                    raise SessionError(
+                        f"{path} has more than {MAX_CHANNELS} channels {EVENT_TOPIC}. Whoever "
+                        "writes the file must put all such messages into one."
+                    )
+                decoders[channel] = class_of_channel(path, contents, channel).FromString
+            message = decoded_message(path, EVENT_TOPIC, decoders[channel], data)
+            events.append(_event(message, t_ns))
+        return events
+
+
+def _load(path: Path, topics: Sequence[str], take: Taker) -> McapContents:
     """Read the container of a session file that must be complete and sound."""
-    contents = load_contents(path, topics, max_bytes=max_bytes)
+    contents = load_contents(path, topics, take=take)
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:
@@ -269,10 +376,10 @@ def _load(path: Path, topics: Sequence[str], *, max_bytes: int = MAX_TOTAL_BYTES
 
 def load_contents(
     path: Path,
-    topics: Sequence[str],
+    topics: Sequence[str] | None,
     *,
+    take: Taker | None = None,
     salvage: bool = False,
-    max_bytes: int = MAX_TOTAL_BYTES,
     on_progress: Callable[[float], None] | None = None,
 ) -> McapContents:
     """Read the container of a file as far as it is sound.
@@ -280,7 +387,7 @@ def load_contents(
     Parameters
     ----------
     path : the file
-    topics, salvage, max_bytes, on_progress : as `rigd.session.mcap_reader.read_mcap` takes them
+    topics, take, salvage, on_progress : as `rigd.session.mcap_reader.read_mcap` takes them
 
     Raises
     ------
@@ -292,9 +399,8 @@ def load_contents(
         with path.open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
-            memoryview(mapped), topics, salvage=salvage, max_bytes=max_bytes,
-            on_progress=on_progress,
-        )  # fmt: skip
+            memoryview(mapped), topics, take=take, salvage=salvage, on_progress=on_progress
+        )
     except OSError as error:
         raise _unreadable(path, error) from None
     except McapTooLargeError as error:
@@ -339,19 +445,6 @@ def _foreign(path: Path, error: McapError) -> SessionError:
     return SessionError(f"{path} {error}. Give a session file (*.mcap).")
 
 
-def load_samples(path: Path, contents: McapContents) -> npt.NDArray[np.void]:
-    """Decode the samples of a file that was read with their topic.
-
-    Raises
-    ------
-    SessionError
-        If they are not what the format asks for.
-    """
-    samples = _decode_topic(path, contents, _SAMPLES)
-    _check_ticks(path, samples)
-    return samples
-
-
 def _damage_message(path: Path, contents: McapContents) -> str:
     from rigd.session.remedy import remedy  # it reads files, too
 
@@ -371,158 +464,31 @@ def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:
     return {key: value for record in records for key, value in record.items()} if records else None
 
 
-def _message_class(path: Path, contents: McapContents, channel_id: int) -> "type[Message]":
-    """Return the class that decodes the messages of a channel, by the schema in the file."""
-    channel = contents.channels[channel_id]
-    schema = contents.schemas.get(channel.schema_id)
-    if channel.message_encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
-        raise SessionError(
-            f"{path}: {channel.topic} has the encoding {_quoted(channel.message_encoding)} and the "
-            f"schema encoding {_quoted(schema.encoding if schema else '')}. A session file has "
-            "protobuf there, for both."
-        )
-    try:
-        return message_class(schema.name, schema.data)
-    except ValueError as error:
-        raise SessionError(
-            f"{path}: {channel.topic} cannot be decoded, because its {error}. Whoever writes the "
-            "file must put a FileDescriptorSet with all it needs there."
-        ) from None
-
-
-def _has_fixed_schema(path: Path, contents: McapContents, channel_id: int, layout: _Layout) -> bool:
-    """Tell whether a channel's schema gives every field the number and type of the fixed layout.
-
-    Raises
-    ------
-    SessionError
-        If by that schema messages cannot be decoded to the layout's fields at all.
-    """
-    channel = contents.channels[channel_id]
-    schema = contents.schemas.get(channel.schema_id)
-    if (
-        channel.message_encoding == "protobuf"
-        and schema is not None
-        and (schema.name, schema.encoding) == (layout.schema_name, "protobuf")
-        and schema.data == schema_data(layout.schema_name)
-    ):
-        return True
-    decoding = _message_class(path, contents, channel_id)
-    empty = decoding()
-    fixed = True
-    for number, (name, kind) in enumerate(layout.types.items(), start=1):
-        declared = decoding.DESCRIPTOR.fields_by_name.get(name)
-        if declared is None:
-            if name in layout.required:
-                raise SessionError(
-                    f"{path}: the schema of {layout.topic} has no field {name}, which is required "
-                    f"there, of type {kind}."
-                )
-            fixed = False
-            continue
-        # What an empty message holds tells singular numbers from everything else.
-        if not isinstance(getattr(empty, name), float | int if kind == "double" else int):
-            raise SessionError(
-                f"{path}: the field {name} of {layout.topic} is not of a type that can be read as "
-                f"{kind}, which it should be."
-            )
-        expected = getattr(declared, f"TYPE_{kind.upper()}")
-        fixed = fixed and declared.number == number and declared.type == expected
-    return fixed
-
-
-def _decode_topic(path: Path, contents: McapContents, layout: _Layout) -> npt.NDArray[np.void]:
-    """Decode all messages of a channel, in the order of the file.
-
-    Messages of the fixed layout, under a schema that says so, are taken as they are; any other is
-    decoded with protobuf by the schema in the file.
-    """
-    has_fixed_schema = {
-        channel.id: _has_fixed_schema(path, contents, channel.id, layout)
-        for channel in contents.channels.values()
-        if channel.topic == layout.topic
-    }
-    native = np.empty(contents.count(layout.topic), layout.dtype)
-    start = 0
-    for run in contents.runs[layout.topic]:
-        is_fixed = has_fixed_schema[run.channel] and run.size == layout.record_dtype.itemsize
-        for block in run.blocks():
-            out = native[start : start + len(block) // run.size]
-            places = _take_fixed(block, layout, out) if is_fixed else range(len(out))
-            if len(places):
-                decode = _message_class(path, contents, run.channel).FromString
-                heads = [i * run.size + MESSAGE_HEAD.size for i in places]
-                tail = run.size - MESSAGE_HEAD.size
-                messages = [block[head : head + tail] for head in heads]
-                out[places] = _decoded_fields(path, layout, decode, messages)
-            start += len(out)
-    return native
-
-
-def _take_fixed(block: bytes, layout: _Layout, out: npt.NDArray[np.void]) -> Sequence[int]:
-    """Decode message records of the fixed length into `out`; return the places of wrong layout."""
-    wire = np.frombuffer(block, layout.record_dtype)["wire"]
-    to_native(wire, layout.types, out)
-    fixed = is_fixed_layout(wire, layout.types)
-    return () if fixed.all() else np.flatnonzero(~fixed).tolist()
-
-
-def _decoded_fields(
-    path: Path, layout: _Layout, decode: "Callable[[bytes], Message]", messages: list[bytes]
-) -> npt.NDArray[np.void]:
-    """Decode messages with protobuf to the layout's fields, absent ones as 0."""
-    decoded = [_decoded(path, layout.topic, decode, data) for data in messages]
-    try:
-        return np.array(
-            [tuple([getattr(each, name, 0) for name in layout.types]) for each in decoded],
-            layout.dtype,
-        )
-    except OverflowError as error:
-        raise SessionError(
-            f"{path}: a message of {layout.topic} holds a number that its field cannot take "
-            f"({error}). Whoever writes the file must keep to the types of the format."
-        ) from None
-
-
-def _decoded(
-    path: Path, topic: str, decode: "Callable[[bytes], Message]", data: bytes
-) -> "Message":
-    from google.protobuf.message import DecodeError
-
-    try:
-        return decode(data)
-    except DecodeError:
-        raise SessionError(
-            f"{path}: a message of {topic} is not what its schema says. The file is damaged or was "
-            "not written as the format asks."
-        ) from None
-
-
 def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
-    ticks = samples["tick"].astype(np.int64)
-    backward = np.flatnonzero(np.diff(ticks) <= 0)
+    ticks = samples["tick"]
+    backward = np.flatnonzero(ticks[1:] <= ticks[:-1])
     if len(backward):
         first = int(backward[0])
         raise SessionError(
             f"{path}: tick {ticks[first + 1]} follows tick {ticks[first]} in {SAMPLE_TOPIC}, but "
-            "ticks must increase from sample to sample. The file was not written as the format "
-            "asks."
+            "ticks must increase from sample to sample. Those that do are saved with `rigd recover "
+            f"{shlex.quote(str(path))}`."
         )
 
 
 def _start_utc_ns(
-    path: Path, metadata: dict[str, str], contents: McapContents, samples: npt.NDArray[np.void]
+    path: Path, metadata: dict[str, str], log_time: int | None, samples: npt.NDArray[np.void]
 ) -> int:
+    """Return the wall clock at tick 0; `log_time` is that of the first sample."""
     text = metadata.get("start_utc_ns")
     if text is not None:
         if text.isascii() and text.isdigit() and len(text) < 20:
             return int(text)
         raise SessionError(
-            f"{path}: start_utc_ns in the metadata 'session' is {_quoted(text)}. Whoever writes "
+            f"{path}: start_utc_ns in the metadata 'session' is {quoted(text)}. Whoever writes "
             "the file must state it as a whole number of ns since 1970, or leave it out."
         )
-    if len(samples):
-        log_time = int(MESSAGE_HEAD.unpack_from(contents.runs[SAMPLE_TOPIC][0].pieces[0])[4])
+    if log_time is not None and len(samples):
         return log_time - int(samples["t_ns"][0])
     return 0
 
@@ -536,39 +502,17 @@ def _segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
             or len(text) > 40
         ):
             raise SessionError(
-                f"{path}: the segment {_quoted(name)} is {_quoted(text)}. Whoever writes the file "
+                f"{path}: the segment {quoted(name)} is {quoted(text)}. Whoever writes the file "
                 "must state it as 'first,end', two whole numbers of ticks."
             )
         first, end = (int(n) for n in numbers)
         if end < first:
             raise SessionError(
-                f"{path}: the segment {_quoted(name)} ends at tick {end}, before its first, "
+                f"{path}: the segment {quoted(name)} ends at tick {end}, before its first, "
                 f"{first}. Whoever writes the file must correct it."
             )
         segments[name] = (first, end)
     return segments
-
-
-def _events(path: Path, contents: McapContents, start_utc_ns: int) -> list[Event]:
-    """Decode the log; a log that is not protobuf is left out, because no reader needs one."""
-    events: list[Event] = []
-    if contents.count(EVENT_TOPIC) > MAX_EVENTS:
-        raise SessionError(
-            f"{path} has {contents.count(EVENT_TOPIC)} messages in {EVENT_TOPIC}, more than the "
-            f"{MAX_EVENTS} that are read. Whoever writes the file must log less."
-        )
-    for run in contents.runs[EVENT_TOPIC]:
-        if contents.channels[run.channel].message_encoding != "protobuf":
-            continue
-        decode = _message_class(path, contents, run.channel).FromString
-        records = b"".join(run.pieces)
-        for start in range(0, len(records), run.size):
-            log_time = int(MESSAGE_HEAD.unpack_from(records, start)[4])
-            data = records[start + MESSAGE_HEAD.size : start + run.size]
-            events.append(
-                _event(_decoded(path, EVENT_TOPIC, decode, data), log_time - start_utc_ns)
-            )
-    return events
 
 
 def _event(message: "Message", t_ns: int) -> Event:

@@ -7,6 +7,7 @@ right. A file of another writer may lack some of this; it is recovered and marke
 """
 
 import contextlib
+import hashlib
 import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping
@@ -21,16 +22,19 @@ from mcap.records import Channel
 import rigd
 from rigd.session.durable import copy_new, fsync_directory, is_being_written, rename_new
 from rigd.session.errors import SessionError, SessionExistsError
-from rigd.session.format import Status
-from rigd.session.mcap_reader import McapContents, Run
+from rigd.session.format import SAMPLE_DTYPE, SAMPLE_FIELDS, Status
+from rigd.session.mcap_reader import McapContents, Stretch, message_starts
 from rigd.session.mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
+from rigd.session.message_decoder import SAMPLES, MessageDecoder
 from rigd.session.reader import (
+    MAX_SURVEYED,
+    SURVEY_FIELDS,
+    Kept,
     load_contents,
-    load_samples,
     merged_metadata,
     read_session,
 )
-from rigd.session.schema import SAMPLE_TOPIC, protected_metadata, unprotected_metadata
+from rigd.session.schema import OWN_TOPICS, SAMPLE_TOPIC, protected_metadata, unprotected_metadata
 from rigd.session.writer import PART_SUFFIX
 
 RECOVERED_FROM: Final = "recovered_from"
@@ -38,6 +42,12 @@ RECOVERED_FROM: Final = "recovered_from"
 
 _SESSION_SUFFIX: Final = ".mcap"
 _RECOVERED_SUFFIX: Final = ".recovered.mcap"
+_LEAST_CHUNK_BYTES: Final = 1 << 14
+_LONG_CHUNK: Final = 4 << 20
+_MOST_CHUNKS: Final = 10_000
+"""About so many chunks are written before they are made longer."""
+MAX_CHANNELS: Final = 32
+"""Most channels that are taken over, of the session's own topics and of others each."""
 _READING_SHARE: Final = 0.3
 """Of the time that recovering takes."""
 
@@ -129,27 +139,35 @@ def recover(
     target = recovered_path(path)
     if is_being_written(path):
         raise SessionError(f"{path} is still being recorded. Wait for the end of the session.")
+    survey = _Survey(path)
     contents = load_contents(
-        path, (SAMPLE_TOPIC,), salvage=True, on_progress=_part(on_progress, 0.0, _READING_SHARE)
-    )
-    if contents.damage is None and not contents.skipped:
+        path, None, take=survey.take, salvage=True,
+        on_progress=_part(on_progress, 0.0, _READING_SHARE),
+    )  # fmt: skip
+    survey.finish(contents)
+    if contents.damage is None and not contents.skipped and survey.left_out is None:
         return _recover_sound(path, target)
-    damage = contents.damage or contents.skipped[0]
-    samples = load_samples(path, contents)
-    if len(samples) == 0:
+    found = [contents.damage, *contents.skipped, survey.left_out]
+    damage, *others = [each for each in found if each is not None]
+    if not survey.kept.any():
         raise SessionError(
             f"{path} {damage}; no sample is intact before that, so there is nothing to recover."
         )
-    recovery = _plan(path, target, contents, samples, damage)
+    recovery = _plan(path, target, contents, survey, damage, others)
     _refuse_taken(path, target)
     with _new_file(path, target) as temporary:
-        _write(temporary, contents, recovery, _part(on_progress, _READING_SHARE, 1.0))
+        expected = _write(
+            temporary, path, contents, survey, recovery, _part(on_progress, _READING_SHARE, 1.0)
+        )
+        written = SampleDigest()
         try:
-            written = read_session(temporary).samples
+            read_session(
+                temporary, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED, on_samples=written.take
+            )
         except SessionError as error:
             named = str(error).replace(str(temporary), str(path))
             raise SessionError(f"{path} cannot be recovered to a session. {named}") from None
-        if not _identical(written, samples):
+        if written.digest() != expected.digest():
             raise SessionError(
                 f"{target} was not made: what was written for it does not read back as it is in "
                 f"{path}. Check the disk."
@@ -157,10 +175,85 @@ def recover(
     return recovery
 
 
-def _identical(first: npt.NDArray[np.void], second: npt.NDArray[np.void]) -> bool:
-    """Compare bit by bit, but not what lies between the fields."""
-    names = first.dtype.names or ()
-    return all(first[name].tobytes() == second[name].tobytes() for name in names)
+class SampleDigest:
+    """Checksum of samples, all fields and bit by bit, however they are cut into blocks."""
+
+    def __init__(self) -> None:
+        self._sums = {name: hashlib.blake2b() for name in SAMPLE_FIELDS}
+
+    def take(self, samples: npt.NDArray[np.void]) -> None:
+        """Add samples."""
+        for name, checksum in self._sums.items():
+            checksum.update(samples[name].tobytes())
+
+    def digest(self) -> bytes:
+        """Return the checksum of the samples so far."""
+        return b"".join(checksum.digest() for checksum in self._sums.values())
+
+
+class _Survey:
+    """What there is to be recovered: the samples that follow one another, and where they stand."""
+
+    def __init__(self, path: Path) -> None:
+        self.left_out: str | None = None
+        """What is wrong with the order of the samples, a sentence's predicate."""
+        self.kept: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
+        """Of each sample in the file, whether it is kept."""
+        self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
+        """Tick and status of those that are."""
+        self._samples = Kept(path, SAMPLES, SURVEY_FIELDS, MAX_SURVEYED)
+        self._units: dict[int, int] = {}
+
+    def take(self, contents: McapContents, stretch: Stretch) -> None:
+        """Take messages as they are read."""
+        self._samples.decoder.take(contents, stretch)
+        is_sample = self._samples.decoder.is_of_topic
+        count = sum(run[3] for run in stretch.runs if is_sample(contents, run[0]))
+        self._units[stretch.unit] = self._units.get(stretch.unit, 0) + count
+
+    def finish(self, contents: McapContents) -> None:
+        """Decide which samples are kept.
+
+        Raises
+        ------
+        SessionError
+            If they cannot be decoded.
+        """
+        samples = self._samples.finish(contents)
+        ticks = samples["tick"]
+        self.kept = _increasing(ticks)
+        (others,) = np.nonzero(~self.kept)
+        if len(others):
+            self.left_out = (
+                f"has {len(others)} samples that repeat or precede others, the first of them with "
+                f"tick {ticks[others[0]]}"
+            )
+            samples = samples[self.kept]
+        self.samples = samples
+
+    def dropped_units(self) -> set[int]:
+        """Return the units that hold samples, but none that is kept: they stand there twice."""
+        counts = np.array(list(self._units.values()), np.int64)
+        # How many are kept up to the end of each unit, and so in it.
+        kept = np.append(0, np.cumsum(self.kept))
+        ends = np.cumsum(counts)
+        kept_in = kept[ends] - kept[ends - counts]
+        dropped = (counts > 0) & (kept_in == 0)
+        return {unit for unit, is_dropped in zip(self._units, dropped, strict=True) if is_dropped}
+
+
+def _increasing(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
+    """Tell which ticks to keep so that they increase.
+
+    Those above all before them; or, if there are more, those below all behind them: a single tick
+    that is far too high takes nothing with it.
+    """
+    above, below = np.ones((2, len(ticks)), np.bool_)
+    above[1:] = ticks[1:] > np.maximum.accumulate(ticks)[:-1]
+    if above.all():
+        return above
+    below[:-1] = ticks[:-1] < np.minimum.accumulate(ticks[::-1])[::-1][1:]
+    return below if below.sum() > above.sum() else above
 
 
 def _part(
@@ -174,7 +267,7 @@ def _part(
 
 def _recover_sound(path: Path, target: Path) -> Recovery:
     """Give a file that is complete its name, if it has not got one."""
-    session = read_session(path)
+    session = read_session(path, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED)
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
         _refuse_taken(path, target)
@@ -226,11 +319,15 @@ def _plan(
     path: Path,
     target: Path,
     contents: McapContents,
-    samples: npt.NDArray[np.void],
+    survey: _Survey,
     damage: str,
+    skipped: list[str],
 ) -> Recovery:
     """Decide what the new file says of itself."""
+    samples = survey.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
+    # What it says of its end is of all its samples.
+    is_whole = contents.verified and survey.left_out is None
     recovery = Recovery(
         source=path,
         path=target,
@@ -238,11 +335,11 @@ def _plan(
         outcome={},
         damage=damage,
         bytes_lost=bytes_lost,
-        skipped=tuple(contents.skipped if contents.damage else contents.skipped[1:]),
+        skipped=tuple(skipped),
         protected=contents.verified or bool(_protected_records(contents)),
     )
     outcome: dict[str, str] = {}
-    if contents.verified:
+    if is_whole:
         outcome |= merged_metadata(contents, "outcome") or {}
     else:
         outcome["outcome"] = "fault"
@@ -319,10 +416,13 @@ def _records(contents: McapContents) -> dict[str, dict[str, str]]:
 
 def _write(
     path: Path,
+    source: Path,
     contents: McapContents,
+    survey: _Survey,
     recovery: Recovery,
     on_progress: Callable[[float], None] | None,
-) -> None:
+) -> SampleDigest:
+    """Write the new file; return the checksum of the samples that went into it."""
     records = _records(contents)
     channels = _channels(contents, records)
     schema_ids = {channel.schema_id for channel in channels}
@@ -337,45 +437,137 @@ def _write(
         mcap.declare(
             [schema for schema in contents.schemas.values() if schema.id in schema_ids], channels
         )
-        wanted = {channel.id for channel in channels}
-        for number, chunk in enumerate(contents.chunks, start=1):
-            _write_chunk(mcap, [run for run in chunk if run.channel in wanted])
-            if on_progress is not None:
-                on_progress(number / len(contents.chunks))
+        copy = _Copy(source, mcap, survey, {channel.id for channel in channels})
+        # Read once more, as far as the first time: what was to be kept was not known then.
+        again = load_contents(source, None, take=copy.take, salvage=True, on_progress=on_progress)
+        digest = copy.finish(again)
+        if on_progress is not None:
+            on_progress(1.0)  # what is damaged at the end was not read
         mcap.add_metadata("outcome", recovery.outcome)
         mcap.finish()
         stream.flush()
         os.fsync(stream.fileno())
+    return digest
+
+
+class _Copy:
+    """Copies messages as they are read, those that are kept.
+
+    Parameters
+    ----------
+    source : the file, for messages
+    mcap : where the channels are declared
+    survey : what is kept
+    channels : that are declared
+    """
+
+    def __init__(self, source: Path, mcap: McapWriter, survey: _Survey, channels: set[int]) -> None:
+        self._source = source
+        self._mcap = mcap
+        self._kept = survey.kept
+        self._dropped = survey.dropped_units()
+        self._channels = channels
+        self._digest = SampleDigest()
+        self._decoder = MessageDecoder(source, SAMPLES, self)
+        self._read = 0  # samples of the file
+        self._decoded = 0
+        self._pieces: list[bytes] = []
+        self._runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
+        self._length = 0
+        self._written = 0
+        self._unit = 0
+
+    def room(self, count: int) -> npt.NDArray[np.void]:
+        """Return room for samples; see `rigd.session.message_decoder.Keeper`."""
+        return np.empty(count, SAMPLE_DTYPE)
+
+    def keep(self, messages: npt.NDArray[np.void]) -> None:
+        """Add the samples that are kept to the checksum."""
+        end = self._decoded + len(messages)
+        kept = self._kept[self._decoded : end]
+        self._digest.take(messages if kept.all() else messages[: len(kept)][kept])
+        self._decoded = end
+
+    def take(self, contents: McapContents, stretch: Stretch) -> None:
+        """Copy messages."""
+        # Small chunks are put together, the more the longer the file: each takes room in its index.
+        least = max(_LEAST_CHUNK_BYTES, self._written // _MOST_CHUNKS)
+        if self._length >= least and (stretch.unit != self._unit or self._length > _LONG_CHUNK):
+            self._flush()
+        self._unit = stretch.unit
+        self._decoder.take(contents, stretch)
+        is_dropped = stretch.unit in self._dropped
+        records = memoryview(stretch.records)
+        for channel, size, start, count in stretch.runs:
+            parts = [(start, count)]
+            if self._decoder.is_of_topic(contents, channel):
+                kept = self._kept[self._read : self._read + count]
+                self._read += count
+                if not kept.all():
+                    parts = [(start + size * first, n) for first, n in _stretches(kept)]
+            if is_dropped or channel not in self._channels:
+                continue
+            for first, number in parts:
+                self._pieces.append(bytes(records[first : first + size * number]))
+                self._runs.append((channel, size, number))
+                self._length += size * number
+
+    def finish(self, contents: McapContents) -> SampleDigest:
+        """Write what is left; return the checksum of the samples.
+
+        Raises
+        ------
+        SessionError
+            If the file is no longer what it was.
+        """
+        self._flush()
+        self._decoder.finish(contents)
+        if not self._read == self._decoded == len(self._kept):
+            raise SessionError(
+                f"{self._source} has changed while it was read. Recover it when nothing writes it."
+            )
+        return self._digest
+
+    def _flush(self) -> None:
+        """Write a chunk, with an index made anew."""
+        if not self._runs:
+            return
+        data = b"".join(self._pieces)
+        runs = np.array(self._runs, np.int64)
+        self._written += len(data)
+        self._pieces, self._runs, self._length = [], [], 0
+        starts = message_starts(runs)
+        index = np.empty(len(starts), INDEX_DTYPE)
+        times = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))
+        index["log_time"] = times[starts + LOG_TIME_OFFSET]
+        index["offset"] = starts
+        channels = np.repeat(runs[:, 0], runs[:, 2])
+        order = np.argsort(channels, kind="stable")
+        numbers, firsts = np.unique(channels[order], return_index=True)
+        parts = np.split(index[order], firsts[1:])
+        self._mcap.add_chunk(data, dict(zip(numbers.tolist(), parts, strict=True)))
+
+
+def _stretches(kept: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return where each stretch of what is kept begins, and how long it is."""
+    edges = np.flatnonzero(np.diff(kept, prepend=False, append=False))
+    return list(zip(edges[::2].tolist(), (edges[1::2] - edges[::2]).tolist(), strict=True))
 
 
 def _channels(contents: McapContents, records: Mapping[str, Mapping[str, str]]) -> list[Channel]:
     """Return the channels to take over, that of the samples with what a reader needs."""
     only_proven = bool(_protected_records(contents)) and not contents.verified
     metadata = protected_metadata(records.get("session", {}), records.get("segments", {}))
+    proven = [
+        channel
+        for channel in contents.channels.values()
+        if channel.id in contents.declared_in_chunks or not only_proven
+    ]
+    ours = [channel for channel in proven if channel.topic in OWN_TOPICS]
+    others = [channel for channel in proven if channel.topic not in OWN_TOPICS]
     return [
         replace(channel, metadata={**channel.metadata, **metadata})
         if channel.topic == SAMPLE_TOPIC
         else channel
-        for channel in contents.channels.values()
-        if channel.id in contents.declared_in_chunks or not only_proven
+        for channel in (*ours[:MAX_CHANNELS], *others[:MAX_CHANNELS])
     ]
-
-
-def _write_chunk(mcap: McapWriter, runs: list[Run]) -> None:
-    """Write message records as they are, with an index made anew."""
-    pieces = [piece for run in runs for piece in run.pieces]
-    indexes: dict[int, list[npt.NDArray[np.void]]] = {}
-    offset = 0
-    for run in runs:
-        for piece in run.pieces:
-            count = len(piece) // run.size
-            index = np.empty(count, INDEX_DTYPE)
-            index["log_time"] = np.ndarray(count, "<u8", piece, LOG_TIME_OFFSET, (run.size,))
-            index["offset"] = offset + run.size * np.arange(count)
-            indexes.setdefault(run.channel, []).append(index)
-            offset += len(piece)
-    if indexes:
-        mcap.add_chunk(
-            b"".join(pieces),
-            {channel: np.concatenate(parts) for channel, parts in indexes.items()},
-        )

@@ -27,7 +27,7 @@ def holds_samples(path: Path) -> bool:
     except OSError:
         return True
     try:
-        contents = read_mcap(memoryview(beginning), (SAMPLE_TOPIC,), salvage=True)
+        contents = read_mcap(memoryview(beginning), (), salvage=True)
     except McapError:
         return False
     return longer or contents.count(SAMPLE_TOPIC) > 0
@@ -46,7 +46,7 @@ def remedy(path: Path, *, was_whole: bool) -> str:
     What goes on behind what is wrong with it, from the mark after that on.
     """
     try:
-        count = load_contents(path, (SAMPLE_TOPIC,), salvage=True).count(SAMPLE_TOPIC)
+        count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
     except SessionError:
         count = 0
     again = ". Copy it again from where it was recorded"

@@ -21,10 +21,15 @@ CONTROL_TOPIC: Final = "/rig/control"
 TIMING_TOPIC: Final = "/rig/timing"
 EVENT_TOPIC: Final = "/rig/event"
 
+OWN_TOPICS: Final = (SAMPLE_TOPIC, CONTROL_TOPIC, TIMING_TOPIC, EVENT_TOPIC)
+
 SAMPLE_SCHEMA: Final = "rigd.Sample"
 CONTROL_SCHEMA: Final = "rigd.Control"
 TIMING_SCHEMA: Final = "rigd.Timing"
 EVENT_SCHEMA: Final = "foxglove.Log"
+
+MAX_SCHEMA_BYTES: Final = 1 << 17
+"""Longest schema that is interpreted; those of this package take some hundred bytes."""
 
 EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
 """Names of the values 0…5 of ``foxglove.Log.Level``."""
@@ -121,6 +126,11 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.message import DecodeError
 
+    shown = repr(schema_name if len(schema_name) <= 40 else schema_name[:40] + "…")
+    if len(data) > MAX_SCHEMA_BYTES:
+        raise ValueError(
+            f"schema {shown} has {len(data)} bytes, more than the {MAX_SCHEMA_BYTES} that are read"
+        )
     try:
         remaining = {file.name: file for file in FileDescriptorSet.FromString(data).file}
         pool = descriptor_pool.DescriptorPool()
@@ -137,7 +147,7 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
             add(next(iter(remaining)))
         descriptor = pool.FindMessageTypeByName(schema_name)
     except (DecodeError, TypeError, KeyError, RecursionError) as error:
-        raise ValueError(f"schema {schema_name!r} is not a usable protobuf schema") from error
+        raise ValueError(f"schema {shown} is not a usable protobuf schema") from error
     return message_factory.GetMessageClass(descriptor)
 
 

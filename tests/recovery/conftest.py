@@ -1,4 +1,4 @@
-"""Sessions to damage, and the checks of ``fuzz_recovery.py``."""
+"""Sessions to damage, and the scripts of this folder."""
 
 import importlib.util
 import sys
@@ -8,14 +8,22 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def fuzz_recovery():
-    """The module: test modules cannot import it by name."""
-    name = "fuzz_recovery"
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+def load_script():
+    """Return what imports a script of this folder: test modules cannot import it by name."""
+
+    def load(name):
+        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+@pytest.fixture(scope="session")
+def fuzz_recovery(load_script):
+    return load_script("fuzz_recovery")
 
 
 @pytest.fixture(scope="session")

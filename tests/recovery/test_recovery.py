@@ -124,9 +124,9 @@ def test_a_name_that_is_taken_meanwhile_is_refused(torn, monkeypatch):
     target = torn.with_name("a.mcap")
     read = read_session
 
-    def reading_takes_a_while(path):
+    def reading_takes_a_while(path, **options):
         target.write_bytes(b"precious")
-        return read(path)
+        return read(path, **options)
 
     monkeypatch.setattr("rigd.session.recovery.read_session", reading_takes_a_while)
     with pytest.raises(SessionExistsError, match=r"a\.mcap exists and is not overwritten"):

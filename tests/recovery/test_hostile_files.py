@@ -1,0 +1,134 @@
+"""Files made to take memory, time or the terminal: each command stays within its share."""
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigd.session import describe, read_session, read_timings, recover
+from rigd.session.recovery import _increasing
+
+
+@pytest.fixture(scope="session")
+def hostile(load_script):
+    return load_script("fuzz_hostile")
+
+
+def test_sixty_hostile_and_damaged_files(hostile):
+    """In a process of its own, which forks for each command: this one is large, and has threads."""
+    script = Path(hostile.__file__)
+    code = f"import sys; sys.path.insert(0, {str(script.parent)!r}); import fuzz_hostile as f; "
+    code += "wrong = f.fuzz(60, 3, scale=0.02); sys.exit('\\n'.join(wrong))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=1800
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["digits", "long_key", "control_characters", "wide_chunks", "other_topic", "in_turn",
+     "log_flood", "permuted"],
+)  # fmt: skip
+def test_what_once_took_all_memory_or_time(hostile, kind):
+    """At full scale, `rigd info` alone: the others read in the same way."""
+    script = Path(hostile.__file__)
+    code = f"""
+import random, sys, tempfile
+from pathlib import Path
+sys.path.insert(0, {str(script.parent)!r})
+import fuzz_hostile as f
+f.warm_up()
+with tempfile.TemporaryDirectory() as folder:
+    make = lambda: f.{kind}(random.Random(1))
+    sys.exit("".join(o.wrong() for o in f.check_file(make, "", Path(folder), ["info"])))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=1800
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_is_not_shown_is_said(hostile, tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(hostile.long_key(random.Random(1)))
+    info = describe(path)
+    text = "\n".join(info.lines())
+    assert "… and 19999800 more characters" in text
+    shown = sum(line.startswith("key") for line in info.lines())
+    assert shown > 500
+    assert f"… and {20_000 - shown} more keys not shown" in text
+    assert info.as_dict()["left_out"] == info.left_out
+
+
+def test_a_log_of_too_much_is_cut_and_counted(hostile, tmp_path):
+    path = tmp_path / "a.mcap"
+    lines = b"".join(hostile.event(f"line {i}") for i in range(120_000))
+    path.write_bytes(
+        hostile.session_file(
+            hostile.samples(10), hostile.chunk(hostile.event("y" * 2_000_000) + lines)
+        )
+    )
+    session = read_session(path)
+    assert session.events[0].message.endswith("bytes, not read)")
+    assert session.events[1].message == "line 0"
+    assert len(session.events) + session.events_left_out == 120_001
+    shown = describe(path)
+    assert f"… and {120_001 - len(shown.events)} more messages of the log" in shown.left_out[0]
+
+
+def test_samples_in_another_order_of_fields_are_read_as_they_are(hostile, tmp_path):
+    path, plain = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    path.write_bytes(hostile.session_file(hostile.samples(30_000, permuted=True)))
+    plain.write_bytes(hostile.session_file(hostile.samples(30_000)))
+    np.testing.assert_array_equal(read_session(path).samples, read_session(plain).samples)
+
+
+def test_a_chunk_longer_than_a_piece_is_read_like_any_other(hostile, tmp_path):
+    """Records begin in one piece and end in another; a long one that is not wanted is skipped."""
+    filler = hostile.channel(3, "/other", 0) + hostile.message(3, bytes(9_000_000))
+    rows = hostile.sample_records(0, 70_000)
+    records = rows[:1_500_000] + filler + rows[1_500_000:]
+    plain = tmp_path / "plain.mcap"
+    plain.write_bytes(hostile.session_file(hostile.samples(70_000)))
+    for compression in ("lz4", "zstd", ""):
+        path = tmp_path / f"{compression}.mcap"
+        path.write_bytes(hostile.session_file(hostile.chunk(records, compression=compression)))
+        np.testing.assert_array_equal(read_session(path).samples, read_session(plain).samples)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 1, 2, 3), (0, 1, 2, 1, 3), (0, 1, 2, 3, 0, 1)])
+def test_chunks_that_stand_twice_are_recovered_once(hostile, tmp_path, order):
+    path = tmp_path / "a.mcap"
+    chunks = [hostile.chunk(hostile.sample_records(1000 * i, 1000)) for i in range(4)]
+    path.write_bytes(hostile.session_file(*[chunks[i] for i in order]))
+    recovery = recover(path)
+    assert recovery.samples == 4000
+    assert f"has {1000 * (len(order) - 4)} samples that repeat or precede" in recovery.damage
+    session = read_session(recovery.path)
+    assert session.samples["tick"].tolist() == list(range(4000))
+    assert session.outcome["lost"] == "0"
+    assert session.outcome["outcome"] == "fault"
+    assert "repeat or precede" in session.outcome["recovered_damage"]
+
+
+def test_a_doubled_chunk_of_a_whole_session_is_left_out_of_every_channel(original, tmp_path):
+    path = tmp_path / "a.mcap"
+    first, second = original.chunk_ends[1:3]
+    path.write_bytes(original.data[:second] + original.data[first:second] + original.data[second:])
+    recovery = recover(path)
+    samples = read_session(recovery.path).samples
+    np.testing.assert_array_equal(samples["tick"], original.session.samples["tick"])
+    assert len(read_timings(recovery.path)) == len(original.timings)
+
+
+def test_one_tick_far_too_high_takes_nothing_with_it():
+    ticks = np.arange(100, dtype=np.uint32)
+    ticks[40] = 4_000_000_000
+    assert _increasing(ticks).sum() == 99
+    assert not _increasing(ticks)[40]
+    assert _increasing(np.array([], np.uint32)).tolist() == []
+    assert _increasing(np.array([7, 7, 3], np.uint32)).tolist() == [True, False, False]
