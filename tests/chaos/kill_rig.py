@@ -71,7 +71,8 @@ KEPT_S = 0.3
 """No sample older than this at the moment of the kill may be lost."""
 _TRANSPORT_S = 5e-3
 """A torque stands in the drive's log a tick after its sample, on a grid half a tick off."""
-_STARTED_S = 60.0
+_STARTED_S = 180.0
+"""For a process to be there, on a computer that plays several cases at a time."""
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
 _NEXT_S = 90.0
@@ -254,11 +255,23 @@ class Scene:
         self.simulator: subprocess.Popen[str] | None = None
         self.log: DriveLog | None = None
         self._origin_s = 0.0
+        self._started: list[subprocess.Popen[str]] = []
+        self._live = ["--live"] if live else []
+        self._sweep_s = sweep_s
+
+    def begin(self) -> None:
+        """Start rig and session.
+
+        Raises
+        ------
+        HarnessError
+            If they are not there in time.
+        """
+        mode = self.mode
         if mode != "direct":
             self.start_simulator()
-        options = ["--rest", REST_S, "--duration", sweep_s, "--ring-down", RING_DOWN_S]
+        options = ["--rest", REST_S, "--duration", self._sweep_s, "--ring-down", RING_DOWN_S]
         options += ["--stop-hz", 10, "--json"]
-        self._live = ["--live"] if live else []
         if mode == "daemon":
             self.supervisor = self._serve()
             wait_for(lambda: self.state == "ready", _STARTED_S, "daemon that is ready")
@@ -286,7 +299,7 @@ class Scene:
 
     def _start(self, *arguments: object) -> subprocess.Popen[str]:
         telling = "simulate" not in arguments
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [BIN / "rigd", *map(str, arguments)],
             cwd=self.folder,
             env=self._environment,
@@ -296,6 +309,8 @@ class Scene:
             text=True,
             start_new_session=True,
         )
+        self._started.append(process)
+        return process
 
     @property
     def state(self) -> str:
@@ -457,10 +472,8 @@ class Scene:
         for pid in (*self.processes(), *self._simulators):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        self.session.wait()
-        self.supervisor.wait()
-        if self.simulator is not None:
-            self.simulator.wait()
+        for process in self._started:
+            process.wait()
         self._said.close()
         self._json.close()
         shutil.rmtree(self._runtime, ignore_errors=True)
@@ -476,6 +489,7 @@ def play(case: Case, folder: Path) -> Verdict:
     """
     scene = Scene(folder, live=case.live, sweep_s=case.sweep_s, mode=case.mode)
     try:
+        scene.begin()
         return _play(case, scene)
     finally:
         scene.close()
