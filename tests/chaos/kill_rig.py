@@ -75,7 +75,7 @@ _STARTED_S = 180.0
 """For a process to be there, on a computer that plays several cases at a time."""
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
-_NEXT_S = 90.0
+_NEXT_S = 240.0
 _FLUSHED_S = 0.3
 """After which the log of the simulated rig is on the disk."""
 _COMMAND_S = 60.0
@@ -521,7 +521,7 @@ def _play(case: Case, scene: Scene) -> Verdict:
         ends_by = case.afterwards if case.released else signal.SIGCONT
         _send(hit if ends_by == signal.SIGCONT else [scene.supervisor.pid], ends_by)
         from_s = time.monotonic()
-    longest_s = _LONGEST_S + (0.0 if case.timed else case.sweep_s)
+    longest_s = _LONGEST_S + (0.0 if case.timed else 6.0 * case.sweep_s)
     try:
         verdict.exit_code = scene.session.wait(longest_s)
     except subprocess.TimeoutExpired:
@@ -836,7 +836,7 @@ def random_cases(
         how = chooser.choice((signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP, *SIGNALS[1:]))
         anywhere = chooser.random() < 1 / 6
         if mode == "lock-step":  # sweeps as quickly as the two of them can
-            moment_s, sweep_s = chooser.uniform(0.1, 2.0), 60.0
+            moment_s, sweep_s = chooser.uniform(0.1, 1.5), 20.0
         else:
             moment_s, sweep_s = chooser.uniform(0.3, 4.5), 5.0
         yield Case(
