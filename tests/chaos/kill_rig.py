@@ -48,6 +48,10 @@ CHANGES = (
     ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
     # A tick that comes late measures where the motor is by then, which looks like a jump.
     ("acceleration_rad_s2 = { value = 1000.0", "acceleration_rad_s2 = { value = 10000.0"),
+    # The motor goes on with the last torque while the loop stands still.
+    ("\nvelocity_rad_s = { value = 4.0", "\nvelocity_rad_s = { value = 100.0"),
+    ("tracking_error_rad = { value = 0.1", "tracking_error_rad = { value = 1.5"),
+    ("max_speed_rad_s = { value = 5.0", "max_speed_rad_s = { value = 0.0"),
     ("drive_heartbeat_timeout_s = { value = 0.1", "drive_heartbeat_timeout_s = { value = 1.0"),
     ("\nheartbeat_timeout_s = { value = 0.05", "\nheartbeat_timeout_s = { value = 0.3"),
     # Soon enough for a short session to see it.
@@ -55,6 +59,12 @@ CHANGES = (
     ("\ntare_s = { value = 1.0", "\ntare_s = { value = 0.5"),
     ("return_s = { value = 2.0", "return_s = { value = 0.3"),
 )
+DIRECT_CHANGES = (
+    *CHANGES,
+    ("\nvelocity_rad_s = { value = 15.0", "\nvelocity_rad_s = { value = 100.0"),
+    ("tracking_error_rad = { value = 0.5", "tracking_error_rad = { value = 1.5"),
+)
+"""Of which a profile without a bus has but some."""
 REST_S, RING_DOWN_S = 0.2, 0.3
 
 MODULES = {
@@ -78,7 +88,7 @@ _LONGEST_S = 60.0
 _NEXT_S = 240.0
 _FLUSHED_S = 0.3
 """After which the log of the simulated rig is on the disk."""
-_COMMAND_S = 60.0
+_COMMAND_S = 240.0
 """Within which `rigd recover` and `analyze` are done, on a busy computer, too."""
 
 # By when the drive has to be off, after the signal: its own watchdog, or the process that notices.
@@ -248,10 +258,10 @@ class Scene:
         self._said = (folder / "said.txt").open("w+", encoding="utf-8")
         self._json = (folder / "out.json").open("w+", encoding="utf-8")
         self._profile = folder / "rig.toml"
-        source = PROFILES / "sim.toml" if mode == "direct" else PROFILE
-        self._profile.write_text(
-            changed(source.read_text("utf-8"), CHANGES, all_there=mode != "direct"), "utf-8"
-        )
+        direct = mode == "direct"
+        source, changes = (PROFILES / "sim.toml", DIRECT_CHANGES) if direct else (PROFILE, CHANGES)
+        text = changed(source.read_text("utf-8"), changes, all_there=not direct)
+        self._profile.write_text(text, "utf-8")
         self.simulator: subprocess.Popen[str] | None = None
         self.log: DriveLog | None = None
         self._origin_s = 0.0
@@ -318,7 +328,7 @@ class Scene:
         try:
             done = subprocess.run(
                 [BIN / "rigd", "status", "--json"],
-                env=self._environment, capture_output=True, text=True, timeout=30.0, check=False,
+                env=self._environment, capture_output=True, text=True, timeout=_NEXT_S, check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             return "no answer"
@@ -627,7 +637,9 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
         # Unless it had ended before.
         expected = {1} if case.daemon else {-signal.SIGKILL, *({0} if complete else ())}
     elif case.how in _ASKING and case.victim in ("supervisor", "all", "control"):
-        expected = {0} if complete else {130, 1} if case.daemon or case.anywhere else {130}
+        # To rigd run 130 is a stop that was asked of itself.
+        unasked = case.daemon or case.anywhere or case.victim == "control"
+        expected = {0} if complete else {130, 1} if unasked else {130}
     elif case.anywhere or case.how == signal.SIGSTOP:
         expected = ends_by_itself
     else:
@@ -636,7 +648,7 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
         verdict.complaints.append(f"exit code {verdict.exit_code} instead of {sorted(expected)}")
     if "Traceback" in verdict.said:
         verdict.complaints.append("a traceback")
-    words = ("Error: ", "fault: ", "After the record: ")
+    words = ("Error: ", "fault: ", "stopped: ", "After the record: ")
     if verdict.exit_code == 1 and not any(word in verdict.said for word in words):
         verdict.complaints.append("no message")
 
