@@ -36,13 +36,17 @@ fuzz: $(VENV)/ready
 	$(BIN)/python tests/recovery/fuzz_recovery.py 200
 	$(BIN)/python tests/recovery/fuzz_hostile.py 1000
 
-# The processes of a hundred sessions killed and suspended at random moments: a quarter of an hour.
+# The processes of two hundred sessions killed, suspended and asked to end at random moments, each
+# followed by another session: half an hour.
 chaos: $(VENV)/ready
 	$(BIN)/python tests/chaos/kill_rig.py
 
-# Twelve hours of rig time under the virtual clock: ten minutes.
+# Twelve hours of rig time under the virtual clock: ten minutes. Then ten minutes beside four busy
+# programs, and a quarter of an hour of daemon, live view and page.
 endurance: $(VENV)/ready
 	$(BIN)/python tests/endurance/run_campaign.py
+	$(BIN)/python tests/endurance/run_starved.py
+	$(BIN)/python tests/endurance/run_served.py
 
 $(VENV)/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "rigd needs Python 3.11 or newer; set PYTHON=/path/to/it")'

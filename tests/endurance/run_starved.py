@@ -32,7 +32,7 @@ RIGD = Path(sys.executable).parent / "rigd"
 RIG = "sim"
 OPTIONS = ("--rest", "0.2", "--ring-down", "0.2", "--amplitude", "0.01", "--json")
 _LOOK_S = 0.2
-_BEYOND_S = 90.0
+_BEYOND_S = 300.0
 """What a session takes beside its record, on a computer as busy as this one."""
 
 

@@ -1,0 +1,170 @@
+"""The daemon in real time with live view and page, both read all the time: what grows?
+
+`rigd serve --live` runs one chirp after the other; somebody reads the stream of its live view, and
+the page that `rigd live --web` names is fetched every second. After the first minute no process may
+grow by 2 % or more, in memory or in descriptors, and every tick has to be accounted for.
+
+    python tests/endurance/run_served.py --minutes 15
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+from run_campaign import Look, growth_table
+from run_starved import judge
+from run_viewers import Reading, children
+
+from rigd.live.address import find
+
+RIGD = Path(sys.executable).parent / "rigd"
+RIG = "sim"
+OPTIONS = ("--rest", "0.2", "--ring-down", "0.2", "--amplitude", "0.01", "--json")
+NAMES = {
+    "rigd.engine.control": "control",
+    "rigd.live.publisher": "live",
+}
+"""Processes that last as long as the daemon does; a recorder is another one in each session."""
+_READY_S = 60.0
+_LOOK_S = 1.0
+_BETWEEN_S = 6.0
+"""What a session takes beside its record."""
+
+
+class Page:
+    """Somebody who loads the page of the live view again and again."""
+
+    def __init__(self, address: str) -> None:
+        self.loaded = 0
+        self.failed = 0
+        self._address = address
+        self._halt = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def _work(self) -> None:
+        while not self._halt.wait(1.0):
+            try:
+                with urllib.request.urlopen(self._address, timeout=10.0) as answer:
+                    answer.read()
+                self.loaded += 1
+            except OSError:
+                self.failed += 1
+
+    def close(self) -> None:
+        """Leave it."""
+        self._halt.set()
+        self._thread.join()
+
+
+def lasting(supervisor: int) -> dict[str, int]:
+    """Return the processes of the daemon that last, by what they are."""
+    found = {"supervisor": supervisor}
+    for child in children(supervisor):
+        with contextlib.suppress(OSError):
+            command = Path(f"/proc/{child}/cmdline").read_text().split("\0")
+            found |= {name: child for module, name in NAMES.items() if module in command}
+    if "live" in found and (servers := children(found["live"])):
+        found["server"] = servers[0]
+    return found
+
+
+def await_ready() -> None:
+    """Wait until the daemon is ready.
+
+    Raises
+    ------
+    TimeoutError
+        If it is not in time.
+    """
+    deadline = time.monotonic() + _READY_S
+    while time.monotonic() < deadline:
+        done = subprocess.run(
+            [RIGD, "status", "--json"], capture_output=True, text=True, check=False
+        )
+        if done.returncode == 0 and json.loads(done.stdout)["state"] == "ready":
+            return
+        time.sleep(0.5)
+    raise TimeoutError(f"The daemon is not ready after {_READY_S:g} s.")
+
+
+def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
+    """Run the daemon and its readers; print what was seen, and return what is wrong."""
+    complaints: list[str] = []
+    looks: dict[str, list[tuple[float, Look]]] = {}
+    number = max(1, int(60.0 * minutes / (seconds + _BETWEEN_S)))
+    out, said = folder / "out.json", folder / "said.txt"
+    chirps = ["chirp", "--repeat", str(number), "--duration", f"{seconds:g}", *OPTIONS]
+    reading, page = Reading(), None
+    with contextlib.ExitStack() as ending:
+        log = ending.enter_context((folder / "serve.txt").open("w"))
+        stdout, stderr = (ending.enter_context(path.open("w")) for path in (out, said))
+        serve = [RIGD, "serve", "--profile", RIG, "--live", "--output", folder / "sessions"]
+        daemon = subprocess.Popen(serve, stdout=log, stderr=log)
+        ending.callback(daemon.wait)
+        ending.callback(daemon.terminate)
+        ending.callback(reading.close)
+        await_ready()
+        began_s = time.monotonic()
+        client = subprocess.Popen([RIGD, "start", *chirps], stdout=stdout, stderr=stderr)
+        while client.poll() is None:
+            time.sleep(_LOOK_S)
+            if (address := find(RIG)) is not None:
+                reading.look(address, time.monotonic())
+                if page is None:
+                    named = subprocess.run(
+                        [RIGD, "live", "--web"], capture_output=True, text=True, check=True
+                    )
+                    page = Page(named.stdout.strip())
+                    ending.callback(page.close)
+            for name, pid in lasting(daemon.pid).items():
+                look = Look.at(pid)
+                if look is not None:
+                    looks.setdefault(name, []).append((time.monotonic() - began_s, look))
+        connected = reading.connected
+    outcomes = [
+        judge(result, said.read_text("utf-8"), live=True)
+        for result in json.loads(out.read_text("utf-8") or '{"sessions": []}')["sessions"]
+    ]
+    for outcome in outcomes:
+        print(outcome)  # noqa: T201
+        complaints += outcome.complaints
+        if outcome.outcome != "complete":
+            complaints.append(f"{outcome.outcome}: {outcome.reason}")
+    if len(outcomes) < number:
+        complaints.append(f"{len(outcomes)} sessions of {number}")
+    if not connected or page is None or not page.loaded:
+        complaints.append("nobody read the live view and its page")
+    else:
+        print(f"page loaded {page.loaded} times, {page.failed} times not")  # noqa: T201
+    print(growth_table(looks, complaints))  # noqa: T201
+    return complaints
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=15.0)
+    parser.add_argument("--seconds", type=float, default=54.0, help="Of each sweep.")
+    given = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="rigd-served-"))
+    os.environ["XDG_RUNTIME_DIR"] = str(folder)
+    try:
+        complaints = follow(given.minutes, given.seconds, folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    for complaint in complaints:
+        print(f"WRONG {complaint}")  # noqa: T201
+    return 1 if complaints else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
