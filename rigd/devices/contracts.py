@@ -11,6 +11,7 @@ it grows by one period a tick, and by more where ticks were missed. The sensor i
 and the drive right before the first tick: once it is operational it expects one every period.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -84,8 +85,14 @@ class Drive(Protocol):
             If the drive is absent or not what the profile says.
         """
 
-    def enable(self) -> None:
+    def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Bring the drive to operation enabled, at zero torque.
+
+        Parameters
+        ----------
+        stop
+            Whether the session is to be stopped; asked again and again where it takes its time. The
+            drive is then disabled instead.
 
         Raises
         ------

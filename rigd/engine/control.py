@@ -242,7 +242,7 @@ class _Attendance:
         recorded = device_failed = False
         try:
             tare = procedure.tare()
-            devices.drive.enable()
+            devices.drive.enable(procedure.stop_asked)
             procedure.hold()
             self._parent.send(ready=tare)
             procedure.wait_for_go()

@@ -376,6 +376,10 @@ class Procedure:
         reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
         return None if reason is None else SessionEnd("fault", str(reason))
 
+    def stop_asked(self) -> bool:
+        """Whether the session is to end, for what takes its time between two ticks."""
+        return self._stop_reason() is not None
+
     def _stop_reason(self) -> SessionEnd | None:
         stop = self._board[Word.STOP]
         if self._stop.requested or stop == Stop.OPERATOR:

@@ -5,7 +5,7 @@ missed pass with the last torque held, as they do on a real rig.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
 from operator import mul
@@ -101,7 +101,7 @@ class SimulatedDrive:
     def connect(self) -> None:
         """Nothing to connect to."""
 
-    def enable(self) -> None:
+    def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
         """Let commands through."""
         if self._sto_dropped:
             raise wired_stop_dropped(_NAME)

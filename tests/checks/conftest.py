@@ -52,7 +52,7 @@ class StandInDrive:
             "rated_torque_nm": 0.5,
         }
 
-    def enable(self):
+    def enable(self, stop=None):
         self._called("enable")
 
     def latch(self, due_ns):

@@ -51,7 +51,7 @@ class WatchedDrive:
     def connect(self):
         self.inner.connect()
 
-    def enable(self):
+    def enable(self, stop=None):
         self.inner.enable()
         self.enabled = True
 

@@ -124,3 +124,65 @@ def test_a_contradiction_with_the_protocol_is_told(refuse, name, old, new, compl
 def test_a_name_has_to_be_fit_for_files(refuse, name):
     (line,) = refuse("antenna_can", ('name = "antenna_can"', f'name = "{name}"'))
     assert "is not fit for file names" in line
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        (
+            'accept_without = ["watchdogs"]',
+            r'accept_without\[0\] = "watchdogs" .*choose watchdog, '
+            r"torque_limit, abort_option, torque_feedback",
+        ),
+        ('accept_without = "watchdog"', r'accept_without = "watchdog" must be an array of texts'),
+        ("accept_without = [1]", r"accept_without\[0\] = 1 must be text in quotes"),
+        (
+            'set_objects = ["3001:2 2500"]',
+            r'set_objects\[0\] = "3001:2 2500" must be index:sub, type',
+        ),
+        ('set_objects = ["3001:2 f32 2500"]', r"set_objects\[0\] .*unknown type 'f32'"),
+        ('set_objects = ["3001:2 u8 256"]', r"set_objects\[0\] .*u8 does not hold \(0 to 255\)"),
+        ('set_objects = ["3001:2 u8 abc"]', r"set_objects\[0\] .*no whole number"),
+        ('set_objects = ["6072 u16 100"]', r"set_objects\[0\] .*rigd sets itself"),
+        ('set_objects = ["1600:1 u32 1"]', r"set_objects\[0\] .*rigd sets itself"),
+        ('set_objects = ["1010:1 u32 0x65766173"]', r"set_objects\[0\] .*memory at every start"),
+        ('eds = "nowhere.eds"', r'eds = "nowhere.eds": there is no file .*nowhere.eds'),
+        ("sync_gaps = 1", r"sync_gaps = 1 must be true or false"),
+        ("own_watchdog_s = 0.1", r"own_watchdog_s = 0.1 s does not say where it comes from"),
+        ('own_watchdog_s = { value = -1.0, source = "assumed" }', r"own_watchdog_s = -1 s must be"),
+        (
+            'torque_response_s = { value = "x", source = "assumed" }',
+            r"torque_response_s = .x. s must be",
+        ),
+    ],
+)
+def test_a_key_of_a_drive_that_differs(refuse, line, complaint):
+    lines = refuse("antenna_can", ("[cia402]\n", f"[cia402]\n{line}\n"))
+    assert any(re.match(f"cia402.{complaint}", each) for each in lines), lines
+
+
+def test_keys_that_may_be_left_out(tmp_path):
+    text = load_profile("antenna_can").text
+    plain = load_profile("antenna_can").rig.cia402
+    assert (plain.eds, plain.set_objects, plain.accept_without) == ("", (), ())
+    assert (plain.sync_gaps, plain.follows_target_bit) == (True, True)
+    assert (plain.own_watchdog_s, plain.torque_response_s) == (0, 0)
+    (tmp_path / "drive.eds").write_text("")
+    path = tmp_path / "other.toml"
+    lines = (
+        'eds = "drive.eds"',
+        'set_objects = ["3001:2 u32 2500", "0x2005 i16 -3"]',
+        'accept_without = ["torque_limit"]',
+        'own_watchdog_s = { value = 0.1, source = "datasheet" }',
+        "sync_gaps = false",
+        'torque_response_s = { value = 0.0032, source = "measured" }',
+        "follows_target_bit = false",
+    )
+    path.write_text(text.replace("[cia402]\n", "[cia402]\n" + "\n".join(lines) + "\n"))
+    profile = load_profile(path)
+    told = profile.rig.cia402
+    assert told.eds == str(tmp_path.resolve() / "drive.eds")
+    assert told.set_objects == ("3001:2 u32 2500", "0x2005 i16 -3")
+    assert told.accept_without == ("torque_limit",)
+    assert (told.sync_gaps, told.follows_target_bit) == (False, False)
+    assert profile.sources["cia402.torque_response_s"] == "measured"

@@ -65,7 +65,7 @@ class WatchedDrive:
             raise DeviceError("The drive does not answer.")
         self.inner.connect()
 
-    def enable(self):
+    def enable(self, stop=None):
         self.happen()
         self.world.witness("enabled")
         self.inner.enable()

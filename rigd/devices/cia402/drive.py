@@ -5,6 +5,7 @@ where that is in doubt a SYNC is left out. A drive that takes more than a period
 refused by :meth:`Cia402Drive.connect` already.
 """
 
+from collections.abc import Callable
 from math import isnan
 
 from rigd.devices.canbus import CanExchange, CanLink
@@ -28,8 +29,10 @@ from rigd.devices.cia402.states import (
     FAULT_BIT,
     FOLLOWS_TARGET,
     STATE_BITS,
+    DriveState,
+    state_of,
 )
-from rigd.devices.cia402.switching import step_up, switch_off
+from rigd.devices.cia402.switching import StopAskedError, step_up, switch_off
 from rigd.devices.cia402.values import torque_limit_per_mille
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.parameters import RigParameters
@@ -93,7 +96,7 @@ class Cia402Drive:
         self._keeps_deadline = False
         self._enabled = False
         self._may_be_on = False
-        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        self._inbox.guard(FAULT_BIT, 0)
         self._awaiting = False
         self._heard_ns = 0
         self._position = 0
@@ -122,8 +125,8 @@ class Cia402Drive:
         exchange = self._open_link()
         self._node = None
         self._enabled = self._may_be_on = False
-        self._guard_mask, self._guard_value = FAULT_BIT, 0
         self._inbox.clear()
+        self._inbox.guard(FAULT_BIT, 0)
         outfit = self._outfit = set_up(exchange.port, self._rig, self._name)
         has_torque = outfit.has(ACTUAL_TORQUE)
         self._inbox.expect(with_torque=has_torque)
@@ -188,10 +191,15 @@ class Cia402Drive:
                 told[key] = "; ".join(texts)
         return told
 
-    def enable(self) -> None:
+    def enable(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Bring the drive to operation enabled, at zero torque.
 
         Sends SYNC, RPDO and heartbeat itself, once a period; meant to be called between two ticks.
+
+        Parameters
+        ----------
+        stop
+            Asked once a period: the drive is then disabled instead.
 
         Raises
         ------
@@ -204,15 +212,17 @@ class Cia402Drive:
         node.refuse_alarm()
         self._may_be_on = True
         try:
-            step_up(node)
+            step_up(node, stop)
+        except StopAskedError:
+            self.disable()
+            return
         except DeviceError:
             self.disable()
             raise
         self._enabled = True
         self._following.start()
         follows = FOLLOWS_TARGET if node.settings.follows_target_bit else 0
-        self._guard_mask = STATE_BITS | follows
-        self._guard_value = ENABLED | follows
+        self._inbox.guard(STATE_BITS | follows, ENABLED | follows)
         node.resume()
 
     def latch(self, due_ns: int) -> None:
@@ -263,7 +273,7 @@ class Cia402Drive:
             self._heard_ns = node.now_ns
         if (
             inbox.alarm
-            or inbox.statusword & self._guard_mask != self._guard_value
+            or inbox.strayed is not None
             or node.now_ns - self._heard_ns > self._silence_ns
         ):
             self._complain(node)
@@ -323,7 +333,7 @@ class Cia402Drive:
         and last the node is stopped.
         """
         self._enabled = False
-        self._guard_mask, self._guard_value = FAULT_BIT, 0
+        self._inbox.guard(FAULT_BIT, 0)
         node = self._node
         if node is None:
             return
@@ -432,15 +442,16 @@ class Cia402Drive:
     def _complain(self, node: Node) -> None:
         """Say what is wrong with the drive."""
         node.refuse_alarm()
-        statusword = self._inbox.statusword
-        if statusword & self._guard_mask & STATE_BITS != self._guard_value & STATE_BITS:
+        statusword = self._inbox.strayed
+        if statusword is not None and state_of(statusword) is not DriveState.OPERATION_ENABLED:
             node.await_alarm()
             node.refuse_alarm()
             raise left_operation(self._name, statusword)
-        if statusword & self._guard_mask != self._guard_value:
+        if statusword is not None:
             raise DeviceError(
                 f"{self._name}: it ignores the target torque: bit 12 of its statusword "
-                f"0x{statusword:04X} is not set; look at its own diagnosis."
+                f"0x{statusword:04X} is not set; look at its own diagnosis, and if this drive has "
+                "no such bit: cia402.follows_target_bit = false."
             )
         silence_s = (node.now_ns - self._heard_ns) * 1e-9
         raise DeviceError(

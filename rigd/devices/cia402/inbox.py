@@ -30,6 +30,9 @@ class Inbox:
     ----------
     statusword, position, torque
         Of the last TPDO; position in counts, torque in 1/1000 of the rated one.
+    strayed : int or None
+        First statusword that was not as :meth:`guard` asks, in whichever TPDO it came: the drive
+        may be back in the next one.
     replies : int
         TPDOs since somebody set this to zero, whatever was in them.
     legible : bool
@@ -54,6 +57,8 @@ class Inbox:
     """
 
     __slots__ = (
+        "_mask",
+        "_value",
         "alarm",
         "emergency",
         "heard",
@@ -66,6 +71,7 @@ class Inbox:
         "reply",
         "statusword",
         "sto_error_code",
+        "strayed",
         "torque",
         "watching",
         "with_torque",
@@ -85,6 +91,7 @@ class Inbox:
     def clear(self) -> None:
         """Forget everything but the number of malformed frames."""
         self.statusword = 0
+        self.guard(0, 0)
         self.position = 0
         self.torque = 0
         self.replies = 0
@@ -96,6 +103,13 @@ class Inbox:
         self.emergency = False
         self.reply = b""
 
+    def guard(self, mask: int, value: int) -> None:
+        """Have each statusword from the present one on looked at: `value` in the bits of `mask`."""
+        self._mask, self._value = mask, value
+        self.strayed: int | None = None
+        if self.statusword & mask != value:
+            self.strayed = self.statusword
+
     def take_tpdo(self, data: bytes) -> None:
         """Take statusword and position."""
         self.replies += 1
@@ -105,6 +119,8 @@ class Inbox:
             else:
                 self.statusword, self.position = unpack_short_tpdo(data)
             self.legible = True
+            if self.statusword & self._mask != self._value and self.strayed is None:
+                self.strayed = self.statusword
         except LengthError:
             self.legible = False
             self.malformed += 1

@@ -31,11 +31,24 @@ _SILENT_TURNS_IN_LOCK_STEP = 3
 _SWITCH_OFF_NS = 50_000_000
 
 
-def step_up(node: Node) -> None:
+class StopAskedError(Exception):
+    """The operator wants no enabled drive any more."""
+
+
+def step_up(node: Node, stop: Callable[[], bool]) -> None:
     """Bring the drive to operation enabled; RPDO, SYNC and heartbeat go out once a period.
+
+    Parameters
+    ----------
+    node
+        Of the drive.
+    stop
+        Asked once a period whether to give up.
 
     Raises
     ------
+    StopAskedError
+        If it said so. The drive may be enabled then.
     DeviceError
         If a step takes longer than ``cia402.enable_timeout_s``, the drive then ignores the torque,
         or is in another mode. It may be enabled then.
@@ -54,7 +67,7 @@ def step_up(node: Node) -> None:
         def reached(state: DriveState = state) -> bool:
             return state_of(inbox.statusword) is state
 
-        _turn_until(node, controlword, grid_ns, reached, stuck)
+        _turn_until(node, controlword, grid_ns, reached, stuck, stop)
     if node.settings.follows_target_bit:
         _turn_until(
             node,
@@ -66,8 +79,9 @@ def step_up(node: Node) -> None:
                 f"0x{inbox.statusword:04X} is not set; look at its own diagnosis, and if this "
                 "drive has no such bit: cia402.follows_target_bit = false"
             ),
+            stop,
         )
-    _check_mode(node, grid_ns)
+    _check_mode(node, grid_ns, stop)
 
 
 def switch_off(node: Node) -> bool:
@@ -91,7 +105,7 @@ def switch_off(node: Node) -> bool:
     return False
 
 
-def _check_mode(node: Node, grid_ns: int) -> None:
+def _check_mode(node: Node, grid_ns: int, stop: Callable[[], bool]) -> None:
     """Ask the enabled drive for its mode: before, some drives do not show it."""
     inbox, frames, send = node.inbox, node.frames, node.exchange.send
     mode: int | None = None
@@ -117,6 +131,7 @@ def _check_mode(node: Node, grid_ns: int) -> None:
             f"its mode of operation (object 6061) is {mode}, not {CYCLIC_TORQUE} (cyclic "
             "synchronous torque)"
         ),
+        stop,
     )
 
 
@@ -126,6 +141,7 @@ def _turn_until(
     grid_ns: int,
     reached: Callable[[], bool],
     stuck: Callable[[], str],
+    stop: Callable[[], bool],
 ) -> None:
     """Send a controlword with zero torque, period by period, until the drive follows."""
     frame = node.frames.rpdo(controlword, 0)
@@ -133,6 +149,8 @@ def _turn_until(
     limit = _SILENT_TURNS_IN_LOCK_STEP if node.lock_step else _SILENT_TURNS
     silent = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
+        if stop():
+            raise StopAskedError
         node.exchange.send(frame)
         node.await_grid(grid_ns)
         node.now_ns += node.period_ns

@@ -4,6 +4,7 @@ import select
 import socket
 import threading
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import canopen
@@ -170,6 +171,47 @@ def test_what_canopen_itself_reads_of_the_pdos(node, port, rig):
 def test_a_node_without_an_object(node, port, rig):
     del node.object_dictionary[0x6007]
     with pytest.raises(DeviceError, match=r"no object 6007.*\"abort_option\""):
+        set_up(port, rig, "Drive")
+
+
+def test_limits_that_are_read_only_as_elmos(node, port, rig):
+    for index in (0x60E0, 0x60E1):
+        entry = node.object_dictionary[index]
+        node.sdo[index].raw = 50_000
+        entry.access_type = "ro"
+    outfit = set_up(port, rig, "Drive")
+    assert outfit.has(0x60E0)
+    assert outfit.accepted == ()
+
+
+def test_a_limit_that_is_read_only_and_too_low(node, port, rig):
+    node.sdo[0x60E1].raw = 500
+    node.object_dictionary[0x60E1].access_type = "ro"
+    with pytest.raises(DeviceError, match=r"60E1 .*is 500, needed is 1800.*read-only"):
+        set_up(port, rig, "Drive")
+
+
+def test_objects_that_are_missing_as_maxons(node, port, rig):
+    for index in (0x6072, 0x1006):
+        del node.object_dictionary[index]
+    limit = canopen.objectdictionary.ODVariable("Output current limit", 0x3001, 2)
+    limit.data_type = canopen.objectdictionary.UNSIGNED32
+    record = canopen.objectdictionary.ODRecord("Motor data", 0x3001)
+    record.add_member(limit)
+    node.object_dictionary.add_object(record)
+    settings = replace(
+        rig.cia402, accept_without=("torque_limit",), set_objects=("3001:2 u32 2500",)
+    )
+    outfit = set_up(port, replace(rig, cia402=settings), "Drive")
+    assert node.get_data(0x3001, 2).hex(" ") == "c4 09 00 00"
+    assert {row.place for row in outfit.lacks} >= {"6072", "1006"}
+    assert outfit.accepted == ("torque_limit",)
+    assert node.get_data(0x1A00, 0) == b"\x03"
+
+
+def test_a_node_without_any_watchdog(node, port, rig):
+    del node.object_dictionary[0x1016]
+    with pytest.raises(DeviceError, match=r"no object 1016:1.*own_watchdog_s"):
         set_up(port, rig, "Drive")
 
 

@@ -165,6 +165,48 @@ def test_after_a_lost_reply_one_sync_is_left_out_to_see_which_is_whose(make_driv
     assert drive.health().doubt == ""
 
 
+def test_without_gaps_no_sync_is_ever_left_out(make_drive, rig, settings, scripted):
+    slow = replace(
+        rig,
+        rate_hz=10.0,
+        acquisition=Acquisition("same_tick", 5e4),
+        cia402=replace(settings, sync_gaps=False),
+    )
+    drive = make_drive(slow)
+    drive.connect()
+    ticks = Ticks(drive)
+    ticks(3)
+    scripted.drop, syncs = 1, scripted.syncs
+    stale = []
+    for _ in range(6):
+        ticks()
+        stale.append(drive.angle_stale)
+    # Three periods with one reply each, and what is missing is taken for lost.
+    assert stale == [True, True, True, True, False, False]
+    assert scripted.comes_to(lambda it: it.syncs == syncs + 6)  # one a tick
+    assert "cannot be told while cia402.sync_gaps = false" in drive.health().doubt
+
+
+def test_without_gaps_a_late_reply_is_still_not_the_next_ticks(make_drive, rig, settings, scripted):
+    slow = replace(
+        rig,
+        rate_hz=10.0,
+        acquisition=Acquisition("same_tick", 5e4),
+        cia402=replace(settings, sync_gaps=False),
+    )
+    drive = make_drive(slow)
+    drive.connect()
+    ticks = Ticks(drive)
+    scripted.hold = 1
+    got = []
+    for step in range(1, 5):
+        scripted.position = 1000 + step
+        angle = ticks()[0]
+        got.append((drive.angle_stale, round(angle / STEP_RAD)))
+    assert got == [(True, 0), (True, 0), (False, 3), (False, 4)]
+    assert drive.health().doubt == ""
+
+
 def test_in_lock_step_a_lost_reply_leaves_a_doubt(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 2e4)))
     drive.connect()
@@ -410,3 +452,23 @@ def test_what_is_not_connected_says_so(make_drive, rig):
     for call in (lambda: drive.latch(0), drive.read_angle, drive.enable, lambda: drive.command(0)):
         with pytest.raises(DeviceError, match="not connected"):
             call()
+
+
+def test_a_drive_that_leaves_operation_and_is_back_in_the_next_tpdo_is_noticed(
+    ticks, drive, scripted
+):
+    drive.enable()
+    ticks(3, torque_nm=0.1)
+    # Two TPDOs in one tick: the first says "switched on", the second that all is well again.
+    scripted.send(0x185, struct.pack("<Hih", 0x0233, scripted.position, 0))
+    with pytest.raises(DeviceError, match=r'left "operation enabled" for "switched on"'):
+        ticks(3, torque_nm=0.1)
+
+
+def test_a_fault_from_before_does_not_outlive_connecting(ticks, drive, scripted):
+    scripted.state = "fault"
+    with pytest.raises(DeviceError, match="fault"):
+        ticks(2)
+    scripted.state = "switch-on disabled"
+    drive.connect()
+    Ticks(drive)(5)

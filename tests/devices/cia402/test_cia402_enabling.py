@@ -139,6 +139,22 @@ def test_a_fault_while_enabling_is_told(drive, scripted):
         drive.enable()
 
 
+def test_a_stop_is_heard_while_the_drive_takes_its_time(make_drive, rig, settings, scripted):
+    drive = make_drive(replace(rig, cia402=replace(settings, enable_timeout_s=10.0)))
+    drive.connect()
+    scripted.stays_in = "switched on"
+    asked = []
+    drive.enable(lambda: asked.append(1) or len(asked) > 20)
+    assert len(asked) == 21
+    assert scripted.state == "switch-on disabled"
+    scripted.stays_in = None
+    drive.command(0.3)
+    tick(drive, 3)
+    assert (scripted.state, scripted.torque) == ("switch-on disabled", 0)
+    drive.enable()
+    assert scripted.state == "enabled"
+
+
 def test_a_drive_that_falls_silent_while_enabling(make_drive, rig, scripted):
     drive = make_drive(replace(rig, acquisition=Acquisition("same_tick", 5e4)))
     drive.connect()

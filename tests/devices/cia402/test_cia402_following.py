@@ -1,9 +1,16 @@
 """A drive that does not exert what it is told is noticed, by what it says it exerts."""
 
+from functools import cache
+from math import exp
+
+import numpy as np
 import pytest
 
+from rigd.control import close_loop
 from rigd.devices.cia402.following import TorqueFollowing
 from rigd.devices.contracts import DeviceError
+from rigd.excitation import chirp
+from rigd.profile import load_profile
 
 
 @pytest.fixture
@@ -42,3 +49,57 @@ def test_enabling_begins_anew(following):
     run(following, [500] * 9, [0] * 9)
     following.start()
     run(following, [0] * 9, [0] * 9)
+
+
+@cache
+def chirp_commands():
+    """The shipped chirp's torques in per mille, with the sensor's noise on them."""
+    profile = load_profile("antenna_can")
+    loop = close_loop(profile.loop_model())
+    reference_rad = chirp(rate_hz=profile.rig.rate_hz, ring_down_s=1.0).reference_rad
+    torque_nm = loop.simulate(reference_rad).torque_nm
+    noise_nm = np.random.default_rng(1).normal(0, 5e-3, torque_nm.size)
+    per_mille = 1000 * (torque_nm + noise_nm) / profile.rig.motor.rated_torque_nm
+    assert np.abs(per_mille).max() > 700
+    return np.rint(per_mille).astype(int).tolist()
+
+
+class TestADriveThatMeasuresItsTorque:
+    """Object 6077 follows the command with a lag of first order, here of 50 Hz."""
+
+    LAG_S = 3.2e-3
+
+    @pytest.fixture
+    def commands(self):
+        return chirp_commands()
+
+    def drive(self, commands, response_s, lost_from=None):
+        """Return after how many ticks it is found, or None."""
+        following = TorqueFollowing("Drive", 10.0, response_s, 1e-3)
+        share = 1 - exp(-1e-3 / self.LAG_S)
+        held = pending = 0
+        actual = 0.0
+        for tick, command in enumerate(commands):
+            try:
+                following.compare(round(actual))
+            except DeviceError:
+                return tick
+            held = pending  # at SYNC
+            actual += share * (held - actual)
+            following.command(command)
+            if lost_from is None or tick < lost_from:
+                pending = command
+        return None
+
+    def test_without_the_lag_the_chirp_is_ended(self, commands):
+        assert self.drive(commands, 0.0) is not None
+
+    @pytest.mark.parametrize("stated_s", [3.2e-3, 2.6e-3, 4e-3])
+    def test_with_the_lag_stated_about_right_it_runs_through(self, commands, stated_s):
+        assert self.drive(commands, stated_s) is None
+
+    @pytest.mark.parametrize("lost_from", [20_000, 40_000, 80_000, 115_000])
+    def test_lost_commands_are_found_all_the_same(self, commands, lost_from):
+        found = self.drive(commands, self.LAG_S, lost_from)
+        assert found is not None
+        assert found - lost_from < 300
