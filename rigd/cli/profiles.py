@@ -72,7 +72,7 @@ def new(
     try:
         check_new(output)
         draft = Draft(base, read_eds(eds), output)
-        text = _asked(draft) if sys.stdin.isatty() else draft.text()
+        text = _asked(draft) if is_terminal() else draft.text()
         write_new(output, text)
     except ProfileError as error:
         fail(str(error), EXIT_WRONG_USE)
@@ -86,6 +86,11 @@ def new(
     for question in missing:
         typer.echo(f"  {question.key} = {draft.value(question.key)}: {question.text}", err=True)
     typer.echo(f"{output}: written. Next: rigd check --profile {output}")
+
+
+def is_terminal() -> bool:
+    """Whether somebody can be asked."""
+    return sys.stdin.isatty()
 
 
 def _asked(draft: "Draft") -> str:

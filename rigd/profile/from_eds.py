@@ -120,11 +120,12 @@ class Draft:
     @property
     def doubts(self) -> list[str]:
         """What the operator has to know of this drive, in sentences."""
-        told = [f.sentence for f in self._findings if f.grade is Grade.DOUBT]
+        findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
+        told = [f.sentence for f in findings if f.sentence]
         return told + [
             f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
             "rigd check asks the drive."
-            for f in self._findings
+            for f in findings
             if f.grade is Grade.ASK and f.wanted
         ]
 
@@ -146,14 +147,16 @@ class Draft:
         ProfileError
             If its values contradict one another.
         """
+        text = self._body()
+        profile_of(text, self._path)
+        return with_head(text, self._head())
+
+    def _body(self) -> str:
         marked = [
             Setting(question.key, self.value(question.key), reason="TO FILL IN: " + question.text)
             for question in self.unanswered()
         ]
-        text = with_settings(self._base.text, [*self._settings.values(), *marked])
-        text = with_head(text, self._head())
-        profile_of(text, self._path)
-        return text
+        return with_settings(self._base.text, [*self._settings.values(), *marked])
 
     def _lacks(self) -> list[str]:
         """Return the names of what a profile has to accept that this drive has not."""

@@ -37,3 +37,65 @@ def eds_text(table: str, device: str = "VendorName=A vendor\nBaudRate_1000=1") -
             lines.append(f"DefaultValue={default}")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
+
+
+COMPLETE = """
+    1000 u32 ro 0x20192
+    1005 u32 rw 0x80
+    1006 u32 rw 0
+    1008 text const Drive
+    1014 u32 rw $NODEID+0x80
+    1016:0 u8 ro 1
+    1016:1 u32 rw 0
+    1017 u16 rw 0
+    1018:0 u8 ro 2
+    1018:1 u32 ro 0x9A
+    1018:2 u32 ro 7
+    1029:0 u8 ro 1
+    1029:1 u8 rw 0
+    1400:0 u8 ro 2
+    1400:1 u32 rw $NODEID+0x200
+    1400:2 u8 rw 255
+    1600:0 u8 rw 1
+    1600:1 u32 rw 0x60400010
+    1600:2 u32 rw 0
+    1800:0 u8 ro 3
+    1800:1 u32 rw $NODEID+0x40000180
+    1800:2 u8 rw 255
+    1800:3 u16 rw 0
+    1A00:0 u8 rw 1
+    1A00:1 u32 rw 0x60410010
+    1A00:2 u32 rw 0
+    1A00:3 u32 rw 0
+    6007 i16 rw 1
+    603F u16 ro 0
+    6040 u16 rww 0 *
+    6041 u16 ro 0 *
+    6060 i8 rww 0 *
+    6061 i8 ro 0 *
+    6064 i32 ro 0 *
+    6071 i16 rww 0 *
+    6072 u16 rw 1000
+    6076 u32 rw 5
+    6077 i16 ro 0 *
+    6080 u32 rw 3000
+    60B2 i16 rww 0 *
+    60C2:0 u8 ro 2
+    60C2:1 u8 rw 1
+    60C2:2 i8 rw -3
+    6502 u32 ro 0x200
+"""
+"""A drive that has all that rigd works with."""
+
+
+def without(*places: str) -> str:
+    """The complete table without some objects, given as in the table."""
+    lines = COMPLETE.splitlines()
+    kept = [line for line in lines if not line.strip().startswith(tuple(p + " " for p in places))]
+    assert len(kept) == len(lines) - len(places)
+    return "\n".join(kept)
+
+
+def changed(place: str, line: str) -> str:
+    """The complete table with another line for an object: type, access, default and *."""
+    return f"{without(place)}\n{place} {line}"

@@ -365,7 +365,7 @@ def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str
     """Return what 1018 shows of itself: as the object says, else as the head of the file does."""
     entry = entries.get((0x1018, sub))
     value = (entry.default if entry else None) or _integer(stated)
-    return value if 0 <= value <= 0xFFFF_FFFF else 0
+    return value if 0 <= value < 0xFFFF_FFFF else 0  # all bits set is how some say nothing
 
 
 def _integer(text: str) -> int:

@@ -27,6 +27,7 @@ from canopen.sdo.base import SdoVariable
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402.assignments import Assignment
+from rigd.devices.cia402.eds import EdsError, read_eds
 from rigd.devices.cia402.frames import NMT_PRE_OPERATIONAL
 from rigd.devices.contracts import DeviceError
 
@@ -324,22 +325,20 @@ class SdoAccess:
 def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
     """Take the types of whole numbers from a drive's EDS file; return its identity."""
     try:
-        theirs = canopen.import_od(eds, node_id)
-    except Exception as error:  # it raises whatever the parser meets
+        theirs = read_eds(Path(eds), node_id)
+    except EdsError as error:
         raise DeviceError(
-            f"{eds}: this EDS file cannot be read ({error}); get it anew from the maker, or "
-            "remove cia402.eds from the profile."
+            f"{error} Get it anew from the maker, or remove cia402.eds from the profile."
         ) from None
-    for index, sub in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
-        entry, mine = theirs.get_variable(index, sub), own.get_variable(index, sub)
+    for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
+        entry, mine = theirs.get(*place), own.get_variable(*place)
         if (
             entry is not None
             and mine is not None
             and {entry.data_type, mine.data_type} <= set(datatypes.INTEGER_TYPES)
         ):
             mine.data_type = entry.data_type
-    device = theirs.device_information
-    return device.vendor_number or 0, device.product_number or 0
+    return theirs.vendor_id, theirs.product_code
 
 
 def _variables(entry: object) -> list[ODVariable]:

@@ -85,6 +85,7 @@ _COB_IDS: Final = {
     (objects.RPDO_COMMUNICATION, 1): 0x200,
 }
 """Identifiers that CiA 301 sets beforehand; the node id is added to all but that of SYNC."""
+_NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
 _TOLD_BEFORE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
@@ -120,14 +121,13 @@ class _Judge:
             yield self._absent(needed) if entry is None else self._present(needed, entry)
 
     def _identity(self) -> Iterator[Finding]:
-        for key, told, refused in (
-            ("vendor_id", self._eds.vendor_id, True),
-            ("product_code", self._eds.product_code, False),
+        for key, told, name in (
+            ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
+            ("product_code", self._eds.product_code, self._eds.product_name),
         ):
             what = key.replace("_", " ")
             wanted = getattr(self._settings, key) if self._settings else 0
             shown = f"0x{told:08X}" if told else "not told"
-            name = self._eds.vendor_name if refused else self._eds.product_name
             found = f"{shown} ({name})" if name else shown
             if not (told and wanted and told != wanted):
                 yield Finding(what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS)
@@ -136,8 +136,7 @@ class _Judge:
                 f"The file is of another drive than the profile's: cia402.{key} is 0x{wanted:08X}, "
                 f"the file says {shown}."
             )
-            grade = Grade.REFUSED if refused else Grade.DOUBT
-            yield Finding(what, found, f"0x{wanted:08X}", grade, sentence)
+            yield Finding(what, found, f"0x{wanted:08X}", Grade.REFUSED, sentence)
 
     def _bit_rates(self) -> Iterator[Finding]:
         rates = self._eds.bit_rates_bit_s
@@ -179,14 +178,7 @@ class _Judge:
 
     def _watchdog(self) -> Finding:
         """Tell what in the drive takes the torque off when this computer falls silent."""
-        heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
-        deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
-        own_s = self._settings.own_watchdog_s if self._settings else 0.0
-        found = watchdog(
-            heartbeat=heartbeat is not None and heartbeat.writable,
-            rpdo_deadline=deadline is not None and deadline.writable,
-            own=own_s > 0,
-        )
+        found = self._stands()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:
             return Finding(what, found.value, wanted, Grade.FITS)
@@ -194,10 +186,22 @@ class _Judge:
             return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.STANDS_IN)
         return self._to_accept(requirement(objects.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
 
+    def _stands(self) -> Watchdog:
+        heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
+        deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
+        return watchdog(
+            heartbeat=heartbeat is not None and heartbeat.writable,
+            rpdo_deadline=deadline is not None and deadline.writable,
+            own=self._settings is not None and self._settings.own_watchdog_s > 0,
+        )
+
     def _absent(self, needed: Requirement) -> Finding:
         what = f"{needed.place} {needed.name}"
         if needed.core:
             return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
+        if needed.index == objects.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
+            found = "absent; in its place: what the maker's own watchdog does"
+            return Finding(what, found, "", Grade.STANDS_IN)
         if needed.accept:
             return self._to_accept(needed, what, "absent", "")
         if self._is_set_by_profile(needed):
@@ -226,6 +230,7 @@ class _Judge:
         return {
             (objects.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
             (objects.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
+            (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
         }.get((needed.index, needed.sub), False)
 
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
@@ -274,6 +279,9 @@ class _Judge:
         elif (needed.index, needed.sub) in _COB_IDS:
             # Drives are free to set the bit that forbids remote requests.
             does = (entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
+            mapping = needed.index + 0x200
+            if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
+                does = False  # a PDO that cannot be switched off cannot be mapped anew
         else:
             does = needed.fit.allows(entry.default, wanted)
         if does:
@@ -344,9 +352,10 @@ def _default(entry: EdsEntry | None) -> int | None:
 
 def _takes(entry: EdsEntry, value: int) -> bool:
     """Whether a value is within the limits of an object, where it has any that make sense."""
-    low = value if entry.low is None else entry.low
-    high = value if entry.high is None else entry.high
-    return low > high or low <= value <= high
+    low, high = entry.low, entry.high
+    if low is not None and high is not None and low > high:
+        return True
+    return (low is None or low <= value) and (high is None or value <= high)
 
 
 def _shown(needed: Requirement, value: int) -> str:

@@ -1,0 +1,209 @@
+"""``rigd profiles``: a new profile from a drive's EDS, that loads and says what is to be done."""
+
+import re
+
+import pytest
+from eds_files import WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text, without
+from typer.testing import CliRunner
+
+from rigd.cli.app import app
+from rigd.profile import load_profile
+from rigd.profile.from_eds import QUESTIONS
+
+
+@pytest.fixture
+def new(rigd_here):
+    def new(eds, *more, output="my_rig.toml"):
+        return rigd_here("profiles", "new", "--eds", eds, "--output", output, *more)
+
+    return new
+
+
+@pytest.fixture
+def asked(tmp_path, monkeypatch):
+    """Make a profile at a terminal on which somebody gives some answers, and then is gone."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("rigd.cli.profiles.is_terminal", lambda: True)
+
+    def asked(eds, *answers):
+        arguments = ["profiles", "new", "--eds", str(eds), "--output", "my_rig.toml"]
+        lines = "".join(f"{answer}\n" for answer in answers)
+        return CliRunner().invoke(app, arguments, input=lines)
+
+    return asked
+
+
+@pytest.mark.parametrize("start_from", ["antenna_can", "antenna_serial"])
+@pytest.mark.parametrize("name", WITH_TORQUE)
+def test_it_loads_and_has_what_the_file_tells(new, tmp_path, name, start_from):
+    done = new(eds_path(name), "--from", start_from)
+    assert done.returncode == 0, done.stderr
+    assert "my_rig.toml: written." in done.stdout
+    profile = load_profile(tmp_path / "my_rig.toml")
+    settings = profile.rig.cia402
+    assert profile.name == "my_rig"
+    assert settings.eds == str(eds_path(name)) or settings.eds.endswith(f"{name}.eds")
+    vendor = {"elmo_gold": 0x9A, "e35": 0xFF}.get(name, 0xFB)
+    assert settings.vendor_id == vendor
+    assert profile.sources["cia402.vendor_id"] == "datasheet"
+    expected = ("torque_limit",) if name.startswith("epos4") else ()
+    assert settings.accept_without == expected
+
+
+@pytest.mark.parametrize("name", WITH_TORQUE)
+def test_it_gets_past_loading_in_a_check(new, rigd_here, monkeypatch, name):
+    monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)
+    monkeypatch.setattr("rigd.checks.rig.inspect_devices", lambda _: [])
+    new(eds_path(name))
+    done = rigd_here("check", "--profile", "my_rig.toml", "--json")
+    # A drive without any watchdog is not accepted by itself.
+    assert done.returncode == (1 if name == "e35" else 0), done.stdout
+    assert done.stderr == ""
+
+
+def test_what_no_file_tells_is_marked_and_listed(new, tmp_path):
+    done = new(eds_path("epos4_0170"))
+    text = (tmp_path / "my_rig.toml").read_text()
+    profile = load_profile(tmp_path / "my_rig.toml")
+    for question in QUESTIONS:
+        assert f"  {question.key} = " in done.stderr
+        assert profile.sources.get(question.key, "assumed") == "assumed"
+        name = question.key.rpartition(".")[2]
+        assert re.search(rf"^# TO FILL IN: [^\n]*\n(# [^\n]*\n)*{name} = ", text, re.MULTILINE)
+    assert 'accept_without = ["torque_limit"]' in text
+    assert "6072 Max torque: absent, accepted by the profile" in done.stderr
+    assert "3001:2 (Output current limit, 15000)" in text
+    assert "rigd check asks the drive" in done.stderr
+    # The reasons of the profile started from are still there.
+    assert "The measured coupling torque cancels the beam's reaction" in text
+    assert "Written by rigd profiles new from epos4_0170.eds" in text
+
+
+def test_a_watchdog_is_never_accepted_as_missing_by_itself(new, tmp_path):
+    done = new(eds_path("e35"))
+    settings = load_profile(tmp_path / "my_rig.toml").rig.cia402
+    assert "watchdog" not in settings.accept_without
+    assert settings.own_watchdog_s == 0.0
+    assert "cia402.own_watchdog_s" in done.stderr
+
+
+def test_objects_that_are_missing_switch_off_what_needs_them(new, tmp_path):
+    path = tmp_path / "drive.eds"
+    path.write_text(eds_text(without("6080", "6076", "6077"), "BaudRate_500=1\nBaudRate_800=1"))
+    done = new(path)
+    assert done.returncode == 0, done.stderr
+    profile = load_profile(tmp_path / "my_rig.toml")
+    settings = profile.rig.cia402
+    assert settings.max_speed_rad_s == 0.0
+    assert settings.rated_torque_unit_nm == 0.0
+    assert settings.torque_tolerance_percent == 0.0
+    assert settings.accept_without == ("torque_feedback",)
+    assert profile.rig.can.bitrate_bit_s == 800_000
+    assert "rated_torque_unit_nm" not in done.stderr
+    assert 'eds = "drive.eds"' in profile.text
+
+
+def test_a_dcf_tells_its_node_id(new, tmp_path):
+    path = tmp_path / "drive.dcf"
+    path.write_text(eds_path("elmo_gold").read_text() + "\n[DeviceComissioning]\nNodeID=0x11\n")
+    new(path)
+    profile = load_profile(tmp_path / "my_rig.toml")
+    assert profile.rig.cia402.node_id == 17
+    assert profile.sources["cia402.node_id"] == "datasheet"
+
+
+def test_names_with_anything_in_them(new, tmp_path):
+    """A vendor's name neither ends a text nor begins a key of the profile."""
+    path = tmp_path / 'a "drive".eds'
+    device = 'VendorName=A "b" \\ = [x] # ü\x1b[31m\u2028y\nProductName=\'\'\'"""'
+    path.write_text(eds_text(without("6072"), device), encoding="utf-8")
+    done = new(path)
+    assert done.returncode == 0, done.stderr
+    assert "\x1b" not in done.stderr + (tmp_path / "my_rig.toml").read_text()
+    profile = load_profile(tmp_path / "my_rig.toml")
+    assert 'A "b" \\ = [x] # ü' in profile.description
+
+
+@pytest.mark.parametrize("name", WITHOUT_TORQUE)
+def test_no_profile_for_a_drive_that_cannot_be_used(new, tmp_path, name):
+    done = new(eds_path(name))
+    assert done.returncode == 1
+    assert "object 6502 = 0x" in done.stderr
+    assert "no profile was written" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_file_is_overwritten(new, tmp_path):
+    (tmp_path / "my_rig.toml").write_text("mine")
+    done = new(eds_path("elmo_gold"))
+    assert done.returncode == 2
+    assert "my_rig.toml: is there already and is left as it is" in done.stderr
+    assert (tmp_path / "my_rig.toml").read_text() == "mine"
+    (tmp_path / "link.toml").symlink_to("nowhere.toml")
+    assert new(eds_path("elmo_gold"), output="link.toml").returncode == 2
+    assert not (tmp_path / "nowhere.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("eds", "more", "output", "code", "words"),
+    [
+        ("nowhere.eds", (), "a.toml", 1, "nowhere.eds: cannot be read"),
+        (".", (), "a.toml", 1, "is a folder"),
+        (None, (), "a.txt", 2, "ends in .toml"),
+        (None, (), "nowhere/a.toml", 2, "there is no folder nowhere"),
+        (None, ("--from", "sim"), "a.toml", 2, "has no CiA 402 drive"),
+        (None, ("--from", "none"), "a.toml", 2, "There is no profile 'none'"),
+    ],
+)
+def test_wrong_use(new, tmp_path, eds, more, output, code, words):
+    done = new(eds or eds_path("elmo_gold"), *more, output=output)
+    assert done.returncode == code
+    assert words in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_terminal_is_asked(asked, tmp_path):
+    answers = ("can1", "300", "five", "5", "", "1e-6", "0.6", "1.2", "nan", "0.5", "", "")
+    done = asked(eds_path("epos4_0170"), *answers)
+    assert done.exit_code == 0, done.stderr
+    profile = load_profile(tmp_path / "my_rig.toml")
+    assert profile.rig.can.channel == "can1"
+    assert profile.rig.cia402.node_id == 5
+    assert profile.rig.cia402.gear_ratio == 100.0
+    assert profile.rig.cia402.rated_torque_unit_nm == 1e-6
+    assert profile.rig.motor.rated_torque_nm == 0.6
+    assert profile.rig.motor.peak_torque_nm == 1.2
+    assert profile.rig.motor.continuous_torque_nm == 0.5
+    assert profile.sources["motor.peak_torque_nm"] == "datasheet"
+    assert profile.sources["cia402.gear_ratio"] == "assumed"
+    assert "less than or equal to 127" in done.stderr
+    assert "To fill in" in done.stderr
+    assert "  cia402.gear_ratio = 100.0" in done.stderr
+    assert "  cia402.node_id" not in done.stderr
+
+
+def test_answers_that_contradict_each_other_are_asked_for_again(asked, tmp_path):
+    first = ("", "", "", "", "2.0", "", "", "", "")
+    second = ("", "", "", "", "", "4.0", "", "", "")
+    done = asked(eds_path("elmo_gold"), *first, *second)
+    assert done.exit_code == 0, done.stderr
+    assert "motor.peak_torque_nm" in done.stderr
+    assert load_profile(tmp_path / "my_rig.toml").rig.motor.rated_torque_nm == 2.0
+
+
+def test_ctrl_c_at_a_question_leaves_nothing(asked, tmp_path):
+    done = asked(eds_path("elmo_gold"), "can1")
+    assert done.exit_code == 130
+    assert "no profile was written" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_profiles_there_are(rigd_here, tmp_path):
+    folder = tmp_path / "hw_profiles"
+    folder.mkdir()
+    (folder / "broken.toml").write_text("[")
+    done = rigd_here("profiles", "list")
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
+    for name in ("antenna_can: ", "antenna_serial: ", "sim: ", "broken: cannot be used: "):
+        assert any(line.startswith(name) for line in lines), name
