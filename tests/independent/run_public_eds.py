@@ -108,7 +108,12 @@ def play_session_with_fault(scene: Scene) -> str:
     return "ok"
 
 
-def play(name: str, eds: Path, node: dict[str, object] | None = None) -> Verdict:
+def play(
+    name: str,
+    eds: Path,
+    node: dict[str, object] | None = None,
+    left_on: tuple[str, ...] = LEFT_ON,
+) -> Verdict:
     """Put one file to the test."""
     paper = on_paper(eds)
     verdict = Verdict(name, paper)
@@ -133,7 +138,7 @@ def play(name: str, eds: Path, node: dict[str, object] | None = None) -> Verdict
         off = scene.state()["state"] == "switch-on disabled"
         steps["reset"] = "ok" if done.code == 0 and off else f"{done.code}: {done.last}"
         steps["chirp again"] = complete(scene.chirp())
-    for how in LEFT_ON:
+    for how in left_on:
         steps[f"left on, pre-op {how}"] = play_left_on(eds, how, node, profile)
     return verdict
 
