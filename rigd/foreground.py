@@ -184,7 +184,8 @@ def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
 def _tell_result(tell: Tell, result: SessionResult) -> None:
     counts = (
         f"{result.scheduled} ticks scheduled = {result.recorded} recorded + {result.missed} "
-        f"missed + {result.lost} lost; {result.late} late."
+        f"missed + {result.lost} lost; {result.late} late; {result.stale_angles} stale angles, "
+        f"{result.stale_wrenches} stale wrenches."
     )
     if result.path is None:
         tell(f"{result.outcome}: no record. {result.reason}")

@@ -77,6 +77,7 @@ PATIENT = {
     "limits.stale_ticks_in_a_row": "1000000",
     "limits.missed_ticks_in_a_row": "1000000",
     "limits.missed_percent": "100.0",
+    "limits.stale_percent": "100.0",
     "limits.tare_drift_nm": "10.0",
     "cia402.heartbeat_timeout_s": "5.0",
     "cia402.max_speed_rad_s": "0.0",

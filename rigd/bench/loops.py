@@ -77,6 +77,7 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
             profile.limits,
             missed_ticks_in_a_row=_NO_LIMIT,
             missed_percent=100.0,
+            stale_percent=100.0,
             saturated_ticks_in_a_row=_NO_LIMIT,
             tare_drift_nm=inf,
         ),

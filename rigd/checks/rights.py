@@ -14,12 +14,18 @@ from rigd.profile import RealtimeSettings
 _PATIENCE_S = 20.0
 _TRY = """
 import json, sys
-from rigd.engine.realtime import obtain
-print(json.dumps(obtain(priority=int(sys.argv[1]), cpu=int(sys.argv[2]))))
+from rigd.engine.realtime import Precedence, obtain
+priority, below, cpu = map(int, sys.argv[1:])
+beside = Precedence(below, cpu)
+supervision = beside.take()
+beside.release()
+print(json.dumps([obtain(priority=priority, cpu=cpu), supervision]))
 """
+_ROWS = {"supervision": "supervisor and recorder"}
 _WANTED = {
     "memory": "locked, without a limit",
     "scheduling": "SCHED_FIFO {priority}",
+    "supervision": "SCHED_RR {supervision_priority}",
     "cpu": "realtime.cpu: a core of this computer",
     "idle_states": "/dev/cpu_dma_latency may be written to",
 }
@@ -31,16 +37,24 @@ _IDLE_STATES_REMEDY = (
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return what :func:`rigd.engine.realtime.obtain` reports in a process of its own.
+    """Return what the control process is granted, tried in a process of its own.
+
+    Under ``supervision`` stands what supervisor and recorder are.
 
     Raises
     ------
     OSError, subprocess.SubprocessError, ValueError
         If there is no such process, or it fails.
     """
-    command = [sys.executable, "-c", _TRY, str(settings.priority), str(settings.cpu)]
+    numbers = settings.priority, settings.supervision_priority, settings.cpu
+    command = [sys.executable, "-c", _TRY, *map(str, numbers)]
     tried = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
-    obtained: dict[str, str] = json.loads(tried.stdout)
+    obtained: dict[str, str]
+    obtained, supervision = json.loads(tried.stdout)
+    if supervision:
+        cores = supervision.get("cores")
+        where = f" on core {cores}" if cores else ""
+        obtained["supervision"] = supervision["scheduling"] + where
     return obtained
 
 
@@ -54,13 +68,19 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
     if settings.priority == 0:
         yield Row("real time", "scheduling", "not asked for", "", Verdict.OK)
     for name, text in obtained.items():
-        lacking = text.startswith(REFUSED) or (name == "memory" and text != LOCKED)
-        wanted = _WANTED.get(name, "granted").format(priority=settings.priority) if lacking else ""
+        lacking = (
+            text.startswith(REFUSED)
+            or (name == "memory" and text != LOCKED)
+            or (name == "supervision" and not text.startswith("SCHED_RR"))
+        )
+        wanted = _WANTED.get(name, "granted") if lacking else ""
         yield Row(
             "real time",
-            name.replace("_", " "),
+            _ROWS.get(name, name.replace("_", " ")),
             text,
-            wanted,
+            wanted.format(
+                priority=settings.priority, supervision_priority=settings.supervision_priority
+            ),
             grade(fail=False, warn=lacking),
             _remedy(name, settings) if lacking else "",
         )
@@ -73,12 +93,14 @@ def _remedy(name: str, settings: RealtimeSettings) -> str:
     lines = {
         "memory": f"{_user()} - memlock unlimited",
         "scheduling": f"{_user()} - rtprio {settings.priority}",
+        "supervision": f"{_user()} - rtprio {settings.priority}",
     }
     if name not in lines:
         return ""
+    row = _ROWS.get(name, name).capitalize()
     return (
-        f"{name.capitalize()}: put this line into /etc/security/limits.d/rigd.conf and log in "
-        f"again: {lines[name]}"
+        f"{row}: put this line into /etc/security/limits.d/rigd.conf and log in again: "
+        f"{lines[name]}"
     )
 
 

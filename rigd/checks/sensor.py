@@ -17,6 +17,7 @@ _RANGES = ("range_n_nm", "range")
 _SHOWN = ("sensor", "device", "serial_number", "part_number", "calibration")
 _ALWAYS_SHOWN = ("firmware", "calibration_date")
 _STATUS = "status"
+_ASSUMED = "assumed"
 
 
 @runtime_checkable
@@ -35,6 +36,15 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
     for key in _ALWAYS_SHOWN:
         yield Row("sensor", name_of(key), _value(key, found), "", Verdict.OK)
     yield _range_row(found, rig.sensor.range)
+    if found.get(_ASSUMED):
+        yield Row(
+            "sensor",
+            "counts and units",
+            "assumed, below",
+            "told by the sensor",
+            Verdict.WARNING,
+            f"Sensor: assumed are {found[_ASSUMED]}; compare with its calibration certificate.",
+        )
     status = found.get(_STATUS)
     if status is not None:
         yield Row(
@@ -47,7 +57,8 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
     more = [
         f"{name_of(key)} {value_of(key, value)}"
         for key, value in found.items()
-        if key not in (*_SHOWN, *_ALWAYS_SHOWN, *_RANGES, _STATUS, "matrix") and value != ""
+        if key not in (*_SHOWN, *_ALWAYS_SHOWN, *_RANGES, _STATUS, _ASSUMED, "matrix")
+        and value != ""
     ]
     if more:
         detail = f"Sensor: {'; '.join(more)}."

@@ -13,9 +13,12 @@ from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
 from rigd.cli.options import AsJson
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rigd.service.client import Client
 
 _LOOK_S = 0.5
+_END_PATIENCE_S = 10.0
 
 DaemonOf = Annotated[
     str | None,
@@ -26,16 +29,32 @@ DaemonOf = Annotated[
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
     """Connect to the daemon of a profile; whatever goes wrong with it ends the command."""
-    from rigd.service.address import AddressError, find
-    from rigd.service.client import Client, DaemonGoneError, RefusedByDaemonError
+    from rigd.service.client import Client
+
+    with _failing_by_the_daemon(), Client(_socket_of(profile)) as client:
+        yield client
+
+
+@contextmanager
+def _failing_by_the_daemon() -> Iterator[None]:
+    """End the command with what a daemon says, or with what is known of one that is gone."""
+    from rigd.service.address import AddressError
+    from rigd.service.client import DaemonGoneError, RefusedByDaemonError
 
     try:
-        with Client(find(rig_name(profile))) as client:
-            yield client
-    except (AddressError, DaemonGoneError) as error:
+        yield
+    except AddressError as error:
         fail(str(error), EXIT_FAILED)
+    except DaemonGoneError as error:
+        fail(error.after_looking(), EXIT_FAILED)
     except RefusedByDaemonError as error:
         fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+
+
+def _socket_of(profile: str | None) -> "Path":
+    from rigd.service.address import find
+
+    return find(rig_name(profile))
 
 
 def rig_name(profile: str | None) -> str | None:
@@ -83,17 +102,46 @@ def status(
     print_status(told)
 
 
-def stop(profile: DaemonOf = None) -> None:
-    """End the running session safely; its file is kept. Anybody may.
+def stop(
+    profile: DaemonOf = None,
+    no_wait: Annotated[
+        bool, typer.Option("--no-wait", help="Do not wait until the session has ended.")
+    ] = False,
+) -> None:
+    """Stop the running session safely (any user); its file is kept.
+
+    Waits up to 10 s until the session was seen to have ended. It is no emergency stop.
 
     Example: rigd stop
     """
-    with daemon_of(profile) as client:
-        told = client.ask("stop")
-    if told["stopping"]:
-        typer.echo("The session is being stopped; rigd status shows when it has ended.")
+    from rigd.service.client import await_end, stop_session
+
+    with _failing_by_the_daemon():
+        path = _socket_of(profile)
+        told = stop_session(path)
+        if told["stopping"] and no_wait:
+            typer.echo("The session is being stopped; rigd status shows when it has ended.")
+            return
+        status = await_end(path, _END_PATIENCE_S)
+    if status is None:
+        fail(
+            f"The session is being stopped, and has not ended within {_END_PATIENCE_S:g} s; look "
+            "at rigd status and at the rig, and press the wired stop (STO) if anything moves.",
+            EXIT_FAILED,
+        )
+    if status["state"] == "fault":
+        typer.echo(f"No session is running. The rig is in fault: {status['reason']}")
+    elif told["stopping"]:
+        typer.echo(f"The session has ended; the torque is off.{_file_of_last(status)}")
     else:
         typer.echo("No session is running; the torque is off.")
+
+
+def _file_of_last(status: dict[str, Any]) -> str:
+    """Say where the file of the session is that a stop has ended."""
+    sessions = status["series"]["sessions"] if status["series"] is not None else []
+    path = sessions[-1]["path"] if sessions else None
+    return "" if path is None else f" Its file is {path}."
 
 
 def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:

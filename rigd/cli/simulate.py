@@ -27,12 +27,19 @@ def simulate(
         list[str] | None,
         typer.Option("--fault", metavar="SPEC", help="Inject a fault; see rigd inject --help."),
     ] = None,
+    eds: Annotated[
+        Path | None,
+        typer.Option(
+            "--eds", metavar="FILE", help="Simulate the drive that this EDS or DCF file describes."
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing on the terminal.")] = False,
 ) -> None:
     """Put a simulated rig on the wire in place of a profile's devices; Ctrl-C ends it.
 
     Sessions of the same profile find it by themselves. Its drive and its sensor speak the protocols
-    of the real ones, on a socket or a virtual CAN bus and on a pseudo-terminal.
+    of the real ones, on a socket or a virtual CAN bus and on a pseudo-terminal. With --eds the
+    drive has the objects of the manufacturer's file and no others.
 
     Example: rigd simulate --profile antenna_can --fault drop,from=drive,frames=3@10
     """
@@ -45,6 +52,7 @@ def simulate(
             log=log,
             faults=tuple(simulator.parse_fault(spec) for spec in fault or ()),
             quiet=quiet,
+            eds=eds,
         )
         code = simulator.run_simulator(profile_named(profile).rig, options)
     except simulator.WrongUseError as error:
@@ -62,8 +70,8 @@ def inject(
 ) -> None:
     """Inject faults into a running simulated rig; without any, say how it stands.
 
-    A fault happens at once, or with @SECONDS so long after the drive was first enabled. Times are
-    of the simulated rig.
+    A fault happens at once, or with @SECONDS so long after the drive was first enabled. It lasts
+    as long as for= says, else until `end`. Times are of the simulated rig.
 
     \b
     drop,from=drive|sensor|host[,id=0x181][,frames=3]  the next frames are lost
@@ -79,8 +87,14 @@ def inject(
     status,bits=0x0080[,for=0.5]              the sensor reports errors
     jump,counts=-500                          the encoder slips
     cut[,device=bus|sensor]                   the bus, or a sensor's serial line, is cut
+    restart,device=drive|sensor               its supply fails for a moment
+    lag,ms=3.2[,for=0.5]                      the drive's actual torque (6077) is late
+    no_bit_12[,for=0.5]                       its statusword does not say that it follows
+    no_pre_operational[,for=0.5]              it does not take NMT pre-operational
+    no_watch[,for=0.5]                        it does not notice a silent host
+    end[,fault=sto]                           faults of one kind, or all, are over
 
-    Example: rigd inject --profile antenna_can freeze,device=drive,for=0.5
+    Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
     """  # noqa: D301 - the mark that keeps lines apart is no raw text
     from rigd.devices import registry
 

@@ -149,7 +149,8 @@ def _result_text(session: dict[str, Any]) -> str:
     return (
         f"{session['outcome']}: {session['scheduled']} ticks scheduled = {session['recorded']} "
         f"recorded + {session['missed']} missed + {session['lost']} lost; "
-        f"{session['late']} late.{reason}"
+        f"{session['late']} late; {session['stale_angles']} stale angles, "
+        f"{session['stale_wrenches']} stale wrenches.{reason}"
     )
 
 

@@ -14,8 +14,10 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rigd.devices.parameters import RigParameters
+if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
+    from rigd.devices.parameters import RigParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +37,12 @@ class SimulatorAddress:
     """What it simulates: the rig's parameters by dotted key, as `described` gives them."""
 
 
-def described(rig: RigParameters) -> dict[str, object]:
+def described(rig: "RigParameters") -> dict[str, object]:
     """Return a rig's parameters by dotted key, as JSON has them."""
     return json.loads(json.dumps(dict(_flat(asdict(rig), ""))))  # type: ignore[no-any-return]
 
 
-def differences(rig: RigParameters, simulator: SimulatorAddress) -> list[str]:
+def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
     """Say in what the rig that is simulated differs from a profile's: one phrase a key."""
     ours, theirs = described(rig), simulator.rig
     return [

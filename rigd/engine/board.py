@@ -85,6 +85,10 @@ class Word(IntEnum):
     LIVE_BEAT = 16
     LIVE_SEEN = 20
     """Samples up to this one of the ring have been shown, or counted as dropped."""
+    # Written by the control process
+    STALE_ANGLES = 21
+    """Recorded ticks whose angle is an old one; likewise:"""
+    STALE_WRENCHES = 22
 
 
 UNKNOWN = -1

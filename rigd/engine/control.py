@@ -222,9 +222,17 @@ class _Attendance:
             If a device failed: the message has been sent all the same.
         """
         board, devices = self._board, self._devices
-        for word in (Word.START_UTC_NS, Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST):
+        for word in (
+            Word.START_UTC_NS,
+            Word.SCHEDULED,
+            Word.MISSED,
+            Word.LATE,
+            Word.LOST,
+            Word.STALE_ANGLES,
+            Word.STALE_WRENCHES,
+        ):
             board[word] = 0
-        self._warn_of_refusals()
+        self._warn_of_refusals(job)
         cycle = self._cycle = self._make_cycle(job.profile)
         procedure = Procedure(
             job.profile,
@@ -354,13 +362,16 @@ class _Attendance:
         cycle.zero_rad = self._zero_rad
         return cycle
 
-    def _warn_of_refusals(self) -> None:
-        refused = [
-            f"{name} ({text})" for name, text in self._obtained.items() if text.startswith(REFUSED)
-        ]
-        if refused:
-            message = f"The system did not grant {', '.join(refused)}: more ticks will be late."
-            write_event(self._channels.events, Event(0, "warning", message))
+    def _warn_of_refusals(self, job: SessionJob) -> None:
+        own = {name: text for name, text in self._obtained.items() if text.startswith(REFUSED)}
+        for refused, what_follows in (
+            (own, "more ticks will be late"),
+            (job.refused, "a computer that is busy with other programs may end the session"),
+        ):
+            if refused:
+                names = ", ".join(f"{name} ({text})" for name, text in refused.items())
+                message = f"The system did not grant {names}: {what_follows}."
+                write_event(self._channels.events, Event(0, "warning", message))
 
 
 def _controller(profile: Profile) -> PidController:

@@ -1,12 +1,13 @@
 """What the processes of a rig are told: at their start, and for each session."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rigd.devices.registry import Reality
 from rigd.engine.channels import ChannelSpecs
 from rigd.engine.reference import ReferenceSpec
-from rigd.profile import Profile
+from rigd.profile import Profile, RealtimeSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,8 @@ class SessionJob:
     """The rig's; its controller and limits may be others."""
     reference: ReferenceSpec
     """Angles relative to the one at the start."""
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """What the system did not grant supervisor and recorder, and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,3 +40,5 @@ class RecorderJob:
 
     path: Path
     channels: ChannelSpecs
+    realtime: RealtimeSettings | None = None
+    """What it may ask of the scheduler; None: nothing, for it is not in real time."""

@@ -26,7 +26,7 @@ from rigd.engine.signals import StopRequest
 from rigd.engine.standstill import Standstill
 from rigd.profile import Profile
 from rigd.safety import LOOK_EVERY
-from rigd.safety.interlocks import BY_NAME
+from rigd.safety.interlocks import BY_NAME, OVERLOADED
 
 _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002
@@ -217,7 +217,9 @@ class Procedure:
         while not self._board[Word.GO]:
             if time.monotonic() > deadline:
                 raise SessionEnd(
-                    "fault", f"The supervisor did not start the record within {_GO_PATIENCE_S:g} s."
+                    "fault",
+                    f"The supervisor did not start the record within {_GO_PATIENCE_S:g} s. "
+                    "Check CPU load.",
                 )
             if self._clock.virtual:
                 self._display.show(self._cycle, self._metronome.due_ns)
@@ -263,6 +265,8 @@ class Procedure:
                 if tick >= total:
                     last = total - 1
                     break
+            if end is None and cycle.stale:  # in the tick before
+                end = self._stale_too_many(tick)
             if end is None and (
                 stop[0] or counts.lost or signals.requested or tick % LOOK_EVERY == 0
             ):
@@ -324,7 +328,7 @@ class Procedure:
                 "fault",
                 f"The loop stood still for {missed} ticks with the torque held, more than "
                 "limits.missed_ticks_in_a_row = "
-                f"{self._profile.limits.missed_ticks_in_a_row}; see what else this computer does.",
+                f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED}",
             )
         self._check_stop()
         end = self._step(reference_rad)
@@ -337,7 +341,9 @@ class Procedure:
             violation = self._cycle.step(self._metronome.due_ns, reference_rad)
         except (DeviceError, OSError) as error:
             self._cycle.lose_readings()
-            return SessionEnd("fault", str(error), device_failed=True)
+            # A drive whose host stood still ends by its own watchdog.
+            reason = f"{error} {self._cycle.watch.after_missed}".strip()
+            return SessionEnd("fault", reason, device_failed=True)
         if violation is None:
             return None
         # The zero is void then, and with it the limits of every further session.
@@ -380,6 +386,13 @@ class Procedure:
         """Whether the session is to end, for what takes its time between two ticks."""
         return self._stop_reason() is not None
 
+    def _stale_too_many(self, scheduled: int) -> SessionEnd | None:
+        counts = self.counts
+        reason = self._cycle.watch.check_stale_share(
+            counts.stale_angles, counts.stale_wrenches, scheduled
+        )
+        return None if reason is None else SessionEnd("fault", str(reason))
+
     def _stop_reason(self) -> SessionEnd | None:
         stop = self._board[Word.STOP]
         if self._stop.requested or stop == Stop.OPERATOR:
@@ -421,8 +434,8 @@ class Procedure:
             if self._looks_unanswered * LOOK_EVERY > _SUPERVISOR_PATIENCE_S * self._rate_hz:
                 return SessionEnd(
                     "fault",
-                    "The supervising process has not moved for "
-                    f"{_SUPERVISOR_PATIENCE_S:g} s: nobody could have stopped the session.",
+                    f"Supervisor watchdog timeout ({_SUPERVISOR_PATIENCE_S:g} s); session aborted. "
+                    "Check CPU load.",
                 )
         return self._stop_reason()
 

@@ -16,7 +16,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from rigd.engine.signals import held_back
@@ -47,6 +47,8 @@ class Child:
         Run as ``python -m module``; it starts importing at once and waits for its job.
     fds
         Descriptors it inherits.
+    cores
+        Those that it may use, where they are others than this process's own.
 
     Raises
     ------
@@ -54,7 +56,9 @@ class Child:
         If the system does not start it.
     """
 
-    def __init__(self, name: str, module: str, fds: Sequence[int]) -> None:
+    def __init__(
+        self, name: str, module: str, fds: Sequence[int], cores: Collection[int] = ()
+    ) -> None:
         self.name = name
         try:
             with held_back():
@@ -71,6 +75,9 @@ class Child:
                 f"The {name} process cannot be started ({error.strerror}); see what else this "
                 "computer runs, and its limits (ulimit -a)."
             ) from None
+        if cores:
+            with contextlib.suppress(OSError):  # it has ended already: poll() tells
+                os.sched_setaffinity(self._process.pid, cores)
         os.set_blocking(self._stdin_fd, False)
         self._lines = LineReader(self._stdout_fd)
 

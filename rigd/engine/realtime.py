@@ -1,5 +1,11 @@
-"""Real-time settings of the control process: each is tried, and what was obtained is recorded."""
+"""What the processes of a rig ask of the scheduler: each is tried, and what was obtained recorded.
 
+The control process gets all that a 1 kHz loop wants (:func:`obtain`). Supervisor and recorder get a
+priority below the loop's and above that of every ordinary program (:class:`Precedence`), for nobody
+stops a session whose supervisor waits for the processor behind a viewer.
+"""
+
+import contextlib
 import ctypes
 import gc
 import os
@@ -15,6 +21,9 @@ LOCKED = "locked"
 WAKE_UP_US = 2
 """Idle states that take longer to leave are kept away. Halting is quicker than that; with 0 an idle
 core would poll, and a rig that waits for its operator would heat the room."""
+
+NICE = -10
+"""For supervisor and recorder where the system grants no real-time priority."""
 
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
@@ -61,6 +70,104 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
     if priority > 0:
         wanted["scheduling"] = lambda: _schedule(priority)
     return {name: _attempt(setting) for name, setting in wanted.items()}
+
+
+class Precedence:
+    """Puts this process before the ordinary ones and behind the loop, until it is released.
+
+    Where the real-time priority is granted the process also keeps off the loop's core if it may use
+    another one. Whatever it starts meanwhile is an ordinary process again, but for the cores: who
+    starts one hands it :attr:`cores_before`.
+
+    Parameters
+    ----------
+    priority
+        Of SCHED_RR; 0 leaves the scheduling policy as it is.
+    loop_cpu
+        ``realtime.cpu``, which says where the loop runs.
+    root
+        Of the file system.
+
+    Attributes
+    ----------
+    cores_before
+        Those that this process might use before it kept off the loop's.
+    """
+
+    def __init__(self, priority: int, loop_cpu: int, *, root: Path = Path("/")) -> None:
+        self._priority = priority
+        self.cores_before = frozenset(os.sched_getaffinity(0))
+        self._others = self.cores_before - {_core_of_loop(loop_cpu, root)}
+        self._put: Callable[[int], None] | None = None
+
+    def take(self) -> dict[str, str]:
+        """Ask for it and report what was granted.
+
+        Returns
+        -------
+        dict
+            ``scheduling`` and ``cores``: what was obtained, or "refused: " and the reason; empty if
+            nothing was to be asked for.
+        """
+        if self._priority == 0:
+            return {}
+        obtained = _attempt(self._try_realtime)
+        if not obtained.startswith(REFUSED):
+            return {"scheduling": obtained, "cores": _list_of(self._others or self.cores_before)}
+        nice = _attempt(self._try_nice)
+        if not nice.startswith(REFUSED):
+            return {"scheduling": f"{nice} (SCHED_RR {obtained})"}
+        return {"scheduling": obtained}
+
+    def cover(self) -> None:
+        """Extend it to threads that were started since: they share the interpreter's lock."""
+        if self._put is None:
+            return
+        for thread in Path("/proc/self/task").iterdir():
+            with contextlib.suppress(OSError):  # one that has just ended
+                self._put(int(thread.name))
+
+    def release(self) -> None:
+        """Be an ordinary process again; harmless when repeated."""
+        if self._put is None:
+            return
+        self._put = self._put_back
+        self.cover()
+        self._put = None
+
+    def _try_realtime(self) -> str:
+        self._put_first(0)
+        self._put = self._put_first
+        self.cover()
+        return f"SCHED_RR {self._priority}"
+
+    def _try_nice(self) -> str:
+        self._put_nicely(0)
+        self._put = self._put_nicely
+        self.cover()
+        return f"nice {NICE}"
+
+    def _put_first(self, thread: int) -> None:
+        # What is forked, a thread as well, starts with the ordinary policy.
+        policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(thread, policy, os.sched_param(self._priority))
+        if self._others:
+            os.sched_setaffinity(thread, self._others)
+
+    def _put_nicely(self, thread: int) -> None:
+        os.setpriority(os.PRIO_PROCESS, thread, NICE)
+        _be_ordinary(thread)
+
+    def _put_back(self, thread: int) -> None:
+        _be_ordinary(thread)
+        os.setpriority(os.PRIO_PROCESS, thread, max(0, os.getpriority(os.PRIO_PROCESS, thread)))
+        os.sched_setaffinity(thread, self.cores_before)
+
+
+def _be_ordinary(thread: int) -> None:
+    # The mark stays: without a privilege it cannot be taken away, and it harms nobody.
+    policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
+    os.sched_setscheduler(thread, policy, os.sched_param(0))
 
 
 def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
@@ -112,6 +219,17 @@ def _lock_memory(libc: ctypes.CDLL) -> str:
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
     _call(libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0))
     return "1 ns"
+
+
+def _core_of_loop(cpu: int, root: Path) -> int:
+    """Return the core that a control process of this computer is going to choose."""
+    if cpu >= 0:
+        return cpu
+    return max(isolated_cores(root) or os.sched_getaffinity(0))
+
+
+def _list_of(cores: frozenset[int]) -> str:
+    return ",".join(map(str, sorted(cores)))
 
 
 def _pin(cpu: int, root: Path) -> str:

@@ -19,6 +19,7 @@ from rigd.engine.channels import Channels, attach_channels
 from rigd.engine.events import read_events
 from rigd.engine.jobs import RecorderJob
 from rigd.engine.process import Message, Parent
+from rigd.engine.realtime import Precedence
 from rigd.engine.topics import CONTROL, EVENT, SAMPLE, TIMING, TOPICS, Topic
 from rigd.session import SessionError, SessionExistsError, SessionWriter
 from rigd.session.format import SAMPLE_SIZE
@@ -35,13 +36,16 @@ def main() -> None:
     parent = Parent()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)
+    obtained = {}
+    if job.realtime is not None:
+        obtained = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
         parent.send(error=str(error), taken=isinstance(error, SessionExistsError))
         raise SystemExit(1) from None
     _show_free_space(channels.board, job.path.parent)
-    parent.send(opened=str(job.path))
+    parent.send(opened=str(job.path), realtime=obtained)
     try:
         _record(parent, channels, writer, job.path.parent)
     except SessionError as error:
@@ -208,6 +212,8 @@ class Recorder:
                 "scheduled": str(scheduled),
                 "missed": str(board[Word.MISSED]),
                 "late": str(board[Word.LATE]),
+                "stale_angles": str(board[Word.STALE_ANGLES]),
+                "stale_wrenches": str(board[Word.STALE_WRENCHES]),
             }
         )
 

@@ -21,6 +21,9 @@ from rigd.session.format import (
 _AFTER_MISSED = int(Status.AFTER_MISSED)
 _AFTER_LOST = int(Status.AFTER_LOST)
 _LATE = int(Status.LATE)
+_ANGLE_STALE = int(Status.ANGLE_STALE)
+_WRENCH_STALE = int(Status.WRENCH_STALE)
+_STALE = _ANGLE_STALE | _WRENCH_STALE
 
 _TERMS_EVERY = CONTROL.every
 _ROOM_PATIENCE_S = 2.0
@@ -29,12 +32,18 @@ _ROOM_POLL_S = 0.0002
 
 @dataclass(slots=True)
 class Counts:
-    """The bookkeeping of a record: scheduled = recorded + missed + lost."""
+    """The bookkeeping of a record: scheduled = recorded + missed + lost.
+
+    Of what was recorded, `late` ticks woke late, and `stale_angles` and `stale_wrenches` hold a
+    reading that is not of their own tick.
+    """
 
     scheduled: int = 0
     missed: int = 0
     late: int = 0
     lost: int = 0
+    stale_angles: int = 0
+    stale_wrenches: int = 0
 
 
 class SampleLog:
@@ -52,7 +61,7 @@ class SampleLog:
     Attributes
     ----------
     counts
-        Ticks that were late, and samples that were lost, are counted here.
+        Ticks that were late, readings that were stale and samples that were lost are counted here.
     """
 
     def __init__(
@@ -106,6 +115,8 @@ class SampleLog:
             flags |= _LATE
             self.counts.late += 1
             self._board[Word.LATE] = self.counts.late
+        if flags & _STALE:
+            self._count_stale(flags)
         t_ns = metronome.t_ns
         fx, fy, fz, tx, ty, tz = cycle.wrench
         pack_sample_into(
@@ -132,6 +143,15 @@ class SampleLog:
             self._write_ages(self._timing_ring, tick, t_ns)
         if tick % _TERMS_EVERY == 0:
             self._write_terms(tick, t_ns)
+
+    def _count_stale(self, flags: int) -> None:
+        counts, board = self.counts, self._board
+        if flags & _ANGLE_STALE:
+            counts.stale_angles += 1
+            board[Word.STALE_ANGLES] = counts.stale_angles
+        if flags & _WRENCH_STALE:
+            counts.stale_wrenches += 1
+            board[Word.STALE_WRENCHES] = counts.stale_wrenches
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
         offset = ring.slot()

@@ -48,16 +48,25 @@ class SessionSettings:
 
 @dataclass(frozen=True, slots=True)
 class RealtimeSettings:
-    """What the control process asks of the operating system, where it is granted."""
+    """What the processes of a rig ask of the operating system, where it is granted."""
 
     priority: Annotated[int, Ge(0), Le(99)]
-    """SCHED_FIFO priority; 0 leaves the ordinary scheduler."""
+    """SCHED_FIFO priority of the control process; 0 leaves all to the ordinary scheduler."""
     cpu: Annotated[int, Ge(-1)]
     """Core the process is bound to; -1 takes the last one it may use."""
     spin_us: Annotated[float, Ge(0), Le(200)]
     """Last part of each wait that is spent polling the clock instead of sleeping."""
     late_us: Annotated[float, Gt(0)]
     """Lateness above which a tick is flagged as late."""
+
+    @property
+    def supervision_priority(self) -> int:
+        """SCHED_RR priority of supervisor and recorder: a quarter of the loop's.
+
+        That is before every ordinary program, and behind the loop and the kernel's own threads (50
+        for interrupts on a real-time kernel).
+        """
+        return self.priority // 4
 
 
 @dataclass(frozen=True, slots=True)

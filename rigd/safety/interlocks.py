@@ -47,6 +47,9 @@ class Interlock:
         What the operator is told to do.
     below
         The limit is the least that the value may be.
+    follows_missed_ticks
+        A loop that stood still can set it off, though nothing is wrong with the rig: the drive goes
+        on exerting the last torque meanwhile.
     """
 
     name: str
@@ -58,7 +61,11 @@ class Interlock:
     action: Action
     remedy: str
     below: bool = False
+    follows_missed_ticks: bool = False
 
+
+OVERLOADED: Final = "The computer is overloaded: close other programs."
+"""Said of whatever came of a computer that was too busy."""
 
 INTERLOCKS: Final = (
     Interlock(
@@ -70,6 +77,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "Turn the motor back towards its zero, or lower the amplitude.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "velocity",
@@ -80,6 +88,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "Look for what disturbed the loop, or lower the amplitude.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "tracking error",
@@ -90,6 +99,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "See that nothing holds the beam, or lower the amplitude.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "encoder jump",
@@ -100,6 +110,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "No motor moves like this: look at encoder, its cable and shield, and set the zero anew.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "torque command",
@@ -110,6 +121,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "See that nothing holds the beam, and check the loop with rigd check.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "i²t",
@@ -130,6 +142,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "See that nothing holds or pulls the beam.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "gauge saturation",
@@ -160,6 +173,7 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "Look at drive, cable and bus.",
+        follows_missed_ticks=True,
     ),
     Interlock(
         "stale wrench",
@@ -170,6 +184,28 @@ INTERLOCKS: Final = (
         Checked.TICK,
         Action.FAULT,
         "Look at sensor, cable and line.",
+        follows_missed_ticks=True,
+    ),
+    Interlock(
+        "stale angle share",
+        "part of ticks without a new angle",
+        "%",
+        "limits.stale_percent",
+        0.5,
+        Checked.TICK,
+        Action.FAULT,
+        "Look at drive (inhibit time of its TPDO), cable and bus, or allow the replies more time "
+        "(acquisition.deadline_us).",
+    ),
+    Interlock(
+        "stale wrench share",
+        "part of ticks without a new wrench",
+        "%",
+        "limits.stale_percent",
+        0.5,
+        Checked.TICK,
+        Action.FAULT,
+        "Look at sensor, cable and line, or allow the replies more time (acquisition.deadline_us).",
     ),
     Interlock(
         "missed ticks",
@@ -179,7 +215,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "See what else this computer does.",
+        OVERLOADED,
     ),
     Interlock(
         "missed share",
@@ -189,7 +225,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        "See what else this computer does.",
+        OVERLOADED,
     ),
     Interlock(
         "bus-off",
@@ -229,7 +265,7 @@ INTERLOCKS: Final = (
         0.5,
         Checked.LOOK,
         Action.FAULT,
-        "The disk is too slow: see what else writes to it.",
+        "The disk is too slow, or the computer is overloaded: see what else writes to it.",
     ),
     Interlock(
         "disk space",

@@ -1,6 +1,6 @@
 """The limits of a profile."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
@@ -43,3 +43,8 @@ class Limits:
     """Time by which the recorder may be behind the loop."""
     disk_free_mb: Positive
     """Free space of the disk that the session goes to, below which it ends; 1 MB is 10⁶ bytes."""
+    stale_percent: Annotated[float, Gt(0), Le(100)] = field(
+        default=1.0, metadata={"optional": True}
+    )
+    """Of all ticks scheduled so far, counted as `missed_percent` is: those whose angle is an old
+    one, and likewise those whose wrench is. ``analyze`` takes no record with more than 1 %."""

@@ -1,23 +1,28 @@
 """The checks of the loop, and the notices of what comes near a limit."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import exp, inf, isfinite, sqrt
 
-from rigd.safety.interlocks import BY_NAME
+from rigd.safety.interlocks import BY_NAME, OVERLOADED
 from rigd.safety.limits import Limits
 from rigd.safety.violation import Violation
 
 LOOK_EVERY = 64
 """Ticks between two checks of what changes slowly."""
 
-MISSED_WINDOW_S = 10.0
-"""Missed ticks are counted against at least this much time, so that one early burst is no fault."""
+SHARE_WINDOW_S = 10.0
+"""Missed ticks and old readings are counted against at least this much time, so that one early
+burst is no fault."""
 
 REARM_S = 1.0
 """How long a channel has to stay clear of its limit before it is announced as near it again."""
 
 _UNSURE_TICKS = 3
 """After missed ticks the next latches come unevenly, and no jump can be told from that."""
+
+_BLAMED_S = 0.005
+"""A standstill of the loop as long as this explains what a limit finds right after it."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _FORCES = 3
@@ -69,8 +74,8 @@ class LimitWatch:
         "_last_look_ns",
         "_limits",
         "_looks",
-        "_missed_near",
-        "_missed_window",
+        "_missed_lately",
+        "_missed_look",
         "_notices",
         "_peak_nm",
         "_per_tick2_rad",
@@ -80,6 +85,8 @@ class LimitWatch:
         "_rate_hz",
         "_rearm_looks",
         "_saturated",
+        "_share_near",
+        "_share_window",
         "_slowly_near",
         "_stale_angles",
         "_stale_wrenches",
@@ -121,7 +128,7 @@ class LimitWatch:
         self._jump_warning = _part("encoder jump") * (self._per_tick2_rad + self._jump_rad)
         self._wrench_limits = tuple(limits.sensor_range_percent / 100 * r for r in sensor_range)
         self._wrench_warnings = tuple(_part("wrench range") * w for w in self._wrench_limits)
-        self._missed_window = MISSED_WINDOW_S * rate_hz
+        self._share_window = SHARE_WINDOW_S * rate_hz
         self._rearm_looks = max(1, round(REARM_S * rate_hz / LOOK_EVERY))
         self._heat_nm2 = 0.0
         self._last_look_ns: int | None = None
@@ -140,13 +147,31 @@ class LimitWatch:
         self._stale_wrenches = 0
         self._saturated = 0
         self._unsure = 0
-        self._missed_near = False
+        self._missed_lately = self._missed_look = 0
+        self._share_near = False
         self._slowly_near = False
         self.warning = False
 
     def skip(self, missed: int) -> None:
         """Tell the next check that ``missed`` ticks passed unseen: the speed is taken over them."""
         self._elapsed += missed
+        if missed:
+            self._missed_lately = missed + (self._missed_lately if self.after_missed else 0)
+            self._missed_look = self._looks
+
+    @property
+    def after_missed(self) -> str:
+        """Say how many ticks were missed just before, for who reports what came of it; or nothing.
+
+        Just before is within the last 64 to 128 ticks.
+        """
+        missed = self._missed_lately
+        if not missed or self._looks - self._missed_look > 1:
+            return ""
+        ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
+        if missed < _BLAMED_S * self._rate_hz:
+            return f"It came after {ticks}."
+        return f"It came after {ticks}. {OVERLOADED}"
 
     def check(
         self,
@@ -211,8 +236,8 @@ class LimitWatch:
         wrench: Sequence[float],
         angle_stale: bool,
     ) -> Violation | None:
-        self.warning = self._slowly_near or self._missed_near
-        self._missed_near = False
+        self.warning = self._slowly_near or self._share_near
+        self._share_near = False
         limits = self._limits
         error_rad = reference_rad - angle_rad
         readings: list[_Reading] = [
@@ -273,6 +298,8 @@ class LimitWatch:
         self._stale_angles = self._stale_angles + 1 if angle_stale else 0
         self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0
         self._saturated = self._saturated + 1 if saturated else 0
+        if self._share_near:  # by a wrench alone, which the check of the angle has not seen
+            self._share_near, self.warning = False, True
         limits = self._limits
         return self._judge(
             (
@@ -299,16 +326,42 @@ class LimitWatch:
         """
         self.skip(missed)
         limits = self._limits
-        percent = 100.0 * missed_so_far / max(scheduled, self._missed_window)
-        before, self.warning = self.warning, False
-        violation = self._judge(
-            (
-                _reading("missed ticks", missed, limits.missed_ticks_in_a_row),
-                _reading("missed share", percent, limits.missed_percent),
-            )
+        return self._judge_share(
+            _reading("missed ticks", missed, limits.missed_ticks_in_a_row),
+            _reading(
+                "missed share", self._percent(missed_so_far, scheduled), limits.missed_percent
+            ),
         )
+
+    def check_stale_share(
+        self, stale_angles: int, stale_wrenches: int, scheduled: int
+    ) -> Violation | None:
+        """Check how many readings did not come, after a tick in which one did not.
+
+        No run of them need be long: a drive that answers every third SYNC has none of more than
+        two ticks, and yet the loop runs on old angles and the record is worth nothing.
+
+        Parameters
+        ----------
+        stale_angles, stale_wrenches, scheduled
+            Ticks with an old angle, ticks with an old wrench, and ticks scheduled, since the
+            record's first.
+        """
+        limit = self._limits.stale_percent
+        return self._judge_share(
+            _reading("stale angle share", self._percent(stale_angles, scheduled), limit),
+            _reading("stale wrench share", self._percent(stale_wrenches, scheduled), limit),
+        )
+
+    def _percent(self, ticks: int, scheduled: int) -> float:
+        return 100.0 * ticks / max(scheduled, self._share_window)
+
+    def _judge_share(self, *readings: _Reading) -> Violation | None:
+        before, self.warning = self.warning, False
+        violation = self._judge(readings)
         # The next sample carries it.
-        self._missed_near, self.warning = self.warning, before or self.warning
+        self._share_near = self._share_near or self.warning
+        self.warning = before or self.warning
         return violation
 
     def look(
@@ -381,7 +434,7 @@ class LimitWatch:
                 near.append(reading)
         if worst is not None:
             self.warning = True
-            return _violation(worst, warns=False)
+            return self._left(worst)
         for reading in near:
             self.warning = True
             channel = reading[1] or reading[0]
@@ -389,6 +442,15 @@ class LimitWatch:
                 self._notices.append(str(_violation(reading, warns=True)))
             self._warned[channel] = self._looks
         return None
+
+    def _left(self, reading: _Reading) -> Violation:
+        """Say what is beyond its limit, and of the beam only what is not the computer's doing."""
+        violation, missed = _violation(reading, warns=False), self.after_missed
+        if not missed or not BY_NAME[reading[0]].follows_missed_ticks:
+            return violation
+        if OVERLOADED not in missed:
+            missed = f"{missed} {violation.remedy}"
+        return replace(violation, remedy=missed)
 
 
 def _part(name: str) -> float:

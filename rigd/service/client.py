@@ -1,25 +1,60 @@
-"""The daemon as its clients see it: one blocking connection."""
+"""The daemon as its clients see it: one blocking connection, and a stop that does not give up."""
 
 import json
+import os
+import signal
 import socket
+import struct
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 Document = dict[str, Any]
 
+STOP_SIGNAL = signal.SIGUSR1
+"""Asks the daemon's process for what `stop` asks for."""
+
 _ANSWER_PATIENCE_S = 60.0
 """Connecting the devices anew takes up to half of it."""
-_GONE = (
-    "The daemon is gone. A session that it ran is stopped, and its file kept; see the daemon's log "
-    "for why, and start it again with rigd serve."
+_CONNECT_PATIENCE_S = 5.0
+_CROWD_PATIENCE_S = 10.0
+"""For a daemon that turns clients away, or takes nobody."""
+_STOP_PATIENCE_S = 10.0
+_STOP_ANSWER_S = 0.5
+_SIGNAL_AFTER_S = 0.3
+_END_PATIENCE_S = 3.0
+"""In which what a dead daemon has left ends by itself."""
+_PAUSE_S = 0.02
+_TIME = struct.Struct("@ll")
+_CREDENTIALS = struct.Struct("3i")
+_UNKNOWN = (
+    "Whether a session still runs is not known: look at the rig, and press the wired stop (STO) if "
+    "anything moves."
 )
 
 
 class DaemonGoneError(Exception):
-    """The daemon cannot be reached, or is gone; the message is for the operator."""
+    """The daemon cannot be reached, or is gone; the message is for the operator.
+
+    Parameters
+    ----------
+    message
+        What is known without looking.
+    lost
+        Process and user of a daemon whose connection was lost.
+    """
+
+    def __init__(self, message: str, lost: tuple[int, int] | None = None) -> None:
+        super().__init__(message)
+        self._lost = lost
+
+    def after_looking(self) -> str:
+        """Say what there still is of a daemon that was lost, which takes up to 3 s to see."""
+        return str(self) if self._lost is None else what_is_left(*self._lost)
 
 
 class RefusedByDaemonError(Exception):
@@ -37,24 +72,55 @@ class Client:
     ----------
     path
         Of the socket.
+    connect_s
+        Time for a daemon that takes no connections, being suspended or beset by others.
+    answer_s
+        Time for a reply.
+
+    Attributes
+    ----------
+    pid, uid
+        Of the process that listens there, as the kernel knows it.
 
     Raises
     ------
     DaemonGoneError
-        If nobody listens there.
+        If nobody listens there, or takes the connection in time.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._pending = b""
+    def __init__(
+        self,
+        path: Path,
+        connect_s: float = _CONNECT_PATIENCE_S,
+        answer_s: float = _ANSWER_PATIENCE_S,
+    ) -> None:
+        self._path = path
+        self._connect_s = connect_s
+        self._answer_s = answer_s
         self._events: deque[Document] = deque()
+        self._connect()
+
+    def _connect(self) -> None:
+        self._pending = b""
+        self._link = link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            self._link.connect(str(path))
-        except OSError as error:
-            self._link.close()
+            # The kernel's own time-out: with Python's, a full queue is a failure at once.
+            patience = _TIME.pack(*divmod(round(self._connect_s * 1e6), 1_000_000))
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, patience)
+            link.connect(str(self._path))
+            credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        except BlockingIOError:
+            link.close()
             raise DaemonGoneError(
-                f"The daemon on {path} cannot be reached ({error.strerror or error})."
+                f"The daemon on {self._path} takes no connection within {self._connect_s:g} s: "
+                f"it is suspended, or beset by others. {_UNKNOWN}"
             ) from None
+        except OSError as error:
+            link.close()
+            raise DaemonGoneError(
+                f"The daemon on {self._path} cannot be reached ({error.strerror or error})."
+            ) from None
+        self.pid, self.uid, _ = _CREDENTIALS.unpack(credentials)
 
     def __enter__(self) -> Self:
         return self
@@ -74,6 +140,9 @@ class Client:
     def ask(self, command: str, **fields: object) -> Document:
         """Send a request and wait for its reply; events that come meanwhile are kept.
 
+        A daemon that has turned this client away, because there were too many, is asked again: it
+        has not obeyed then.
+
         Raises
         ------
         RefusedByDaemonError
@@ -81,8 +150,20 @@ class Client:
         DaemonGoneError
             If there is none.
         """
+        deadline_s = time.monotonic() + min(_CROWD_PATIENCE_S, self._answer_s)
+        while True:
+            try:
+                return self._ask_once(command, fields)
+            except _CrowdedError:
+                if time.monotonic() > deadline_s:
+                    raise
+                time.sleep(_PAUSE_S)
+                self.close()
+                self._connect()
+
+    def _ask_once(self, command: str, fields: dict[str, object]) -> Document:
         self.send(command, **fields)
-        deadline_s = time.monotonic() + _ANSWER_PATIENCE_S
+        deadline_s = time.monotonic() + self._answer_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             message = self._next(left_s)
             if message is None:
@@ -90,12 +171,13 @@ class Client:
             if "event" in message:
                 self._events.append(message)
             elif not message.get("ok"):
-                raise RefusedByDaemonError(
-                    str(message.get("error", message)), wrong_use=bool(message.get("wrong_use"))
-                )
+                raise _refusal(message)
             else:
                 return message
-        raise DaemonGoneError(f"The daemon does not answer within {_ANSWER_PATIENCE_S:g} s.")
+        raise DaemonGoneError(
+            f"The daemon (process {self.pid}) does not answer within {self._answer_s:g} s. "
+            f"{_UNKNOWN}"
+        )
 
     def send(self, command: str, **fields: object) -> None:
         """Send a request whose reply nobody waits for.
@@ -112,7 +194,7 @@ class Client:
         except OSError:
             # It may have said why before it left.
             self._raise_what_was_said()
-            raise DaemonGoneError(_GONE) from None
+            raise self._gone() from None
 
     def event(self, timeout_s: float) -> Document | None:
         """Return the next event (or reply), or None if none comes in time.
@@ -135,7 +217,7 @@ class Client:
             except OSError:
                 data = b""
             if not data:
-                raise DaemonGoneError(_GONE)
+                raise self._gone()
             self._pending += data
         line, self._pending = self._pending.split(b"\n", 1)
         try:
@@ -150,6 +232,162 @@ class Client:
         try:
             while (message := self._next(0.1)) is not None:
                 if "error" in message:
-                    raise RefusedByDaemonError(str(message["error"]), wrong_use=False)
+                    raise _refusal(message)
         except DaemonGoneError:
             return
+
+    def _gone(self) -> DaemonGoneError:
+        return DaemonGoneError(
+            f"The connection to the daemon (process {self.pid}) is lost.", (self.pid, self.uid)
+        )
+
+
+class _CrowdedError(RefusedByDaemonError):
+    """The daemon has not obeyed, because there were too many clients."""
+
+
+def _refusal(message: Document) -> RefusedByDaemonError:
+    kind = _CrowdedError if message.get("crowded") else RefusedByDaemonError
+    return kind(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
+
+
+def stop_session(path: Path) -> Document:
+    """Have a daemon stop what it runs; asks again and again, then sends its process a signal.
+
+    Parameters
+    ----------
+    path
+        Of its socket.
+
+    Returns
+    -------
+    dict
+        Its reply.
+
+    Raises
+    ------
+    RefusedByDaemonError
+        If it refuses.
+    DaemonGoneError
+        If it has not said for 10 s that it stops; the message tells what was done and seen.
+    """
+    began_s = time.monotonic()
+    seen: tuple[int, int] | None = None
+    signalled = False
+    while True:
+        try:
+            with Client(path, _STOP_ANSWER_S, _STOP_ANSWER_S) as client:
+                seen = client.pid, client.uid
+                return client.ask("stop")
+        except (DaemonGoneError, _CrowdedError) as error:
+            failure = str(error)
+        waited_s = time.monotonic() - began_s
+        if seen is not None and not signalled and waited_s > _SIGNAL_AFTER_S:
+            signalled = _signal_stop(seen[0])
+        if waited_s > _STOP_PATIENCE_S or not path.exists():
+            break
+        time.sleep(_PAUSE_S)
+    if seen is None:
+        raise DaemonGoneError(failure)
+    if not signalled:
+        raise DaemonGoneError(failure, seen)
+    raise DaemonGoneError(
+        f"The daemon (process {seen[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
+        f"has said nothing for {waited_s:.0f} s. {_UNKNOWN}"
+    )
+
+
+def await_end(path: Path, patience_s: float) -> Document | None:
+    """Wait until a daemon says that no session runs.
+
+    Returns
+    -------
+    dict or None
+        Its status then; None if it still runs or stops one after that time.
+
+    Raises
+    ------
+    RefusedByDaemonError, DaemonGoneError
+        If it cannot be asked any more.
+    """
+    deadline_s = time.monotonic() + patience_s
+    with Client(path) as client:
+        while True:
+            status = client.ask("status")
+            series = status["series"]
+            if status["state"] not in ("running", "stopping") and not (
+                series is not None and series["running"]
+            ):
+                return status
+            if time.monotonic() > deadline_s:
+                return None
+            time.sleep(_PAUSE_S)
+
+
+def what_is_left(pid: int, uid: int) -> str:
+    """Say what there still is of a daemon that does not answer, after looking for some seconds.
+
+    Parameters
+    ----------
+    pid, uid
+        Of its process and user.
+    """
+    deadline_s = time.monotonic() + _END_PATIENCE_S
+    while True:
+        daemon, control = _is_there(pid), list(_control_processes(pid))
+        if not (daemon or control) or time.monotonic() > deadline_s:
+            break
+        time.sleep(_PAUSE_S)
+    if daemon:
+        return (
+            f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
+            f"status. {_UNKNOWN}"
+        )
+    begin_again = "see the daemon's log for why, and start it again with rigd serve."
+    if control:
+        return (
+            f"The daemon is gone (process {pid}), and its control process {control[0]} still runs "
+            "and may move the motor: press the wired stop (STO). Then " + begin_again
+        )
+    if uid != os.getuid() and not Path("/proc/1").exists():
+        return f"The daemon is gone (process {pid}). {_UNKNOWN} Then {begin_again}"
+    return (
+        "The daemon is gone. Its control process, which alone moves the motor, has ended too; what "
+        f"was recorded of a session is in the daemon's output folder; {begin_again}"
+    )
+
+
+def _is_there(pid: int) -> bool:
+    """Whether a process of that number runs, be it another user's."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    with suppress(OSError, IndexError):  # dead, and not yet buried by its parent
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return True
+
+
+def _control_processes(pid: int) -> Iterator[int]:
+    """Return the control processes of a supervisor: its number is their only argument."""
+    from rigd.engine.processes import CONTROL  # which takes a while, and is seldom needed
+
+    wanted = [b"-m", CONTROL.module.encode(), str(pid).encode()]
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with suppress(OSError):
+                if (entry / "cmdline").read_bytes().split(b"\0")[1:4] == wanted:
+                    yield int(entry.name)
+
+
+def _signal_stop(pid: int) -> bool:
+    """Send the daemon its signal, if it is one that handles it: others would die of it."""
+    with suppress(OSError, ValueError, IndexError):
+        status = Path(f"/proc/{pid}/status").read_text()
+        caught = int(status.partition("SigCgt:")[2].split()[0], 16)
+        if caught >> (STOP_SIGNAL - 1) & 1:
+            os.kill(pid, STOP_SIGNAL)
+            return True
+    return False

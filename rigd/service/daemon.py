@@ -12,6 +12,7 @@ from pathlib import Path
 from rigd.devices.registry import Reality, reality, simulated_differently
 from rigd.profile import Profile
 from rigd.service.address import COMMON, bind, socket_path
+from rigd.service.client import STOP_SIGNAL
 from rigd.service.documents import look_up_user
 from rigd.service.log import NAME, Log
 from rigd.service.server import Server
@@ -91,6 +92,8 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     for number in _ENDING:
         if signal.getsignal(number) != signal.SIG_IGN:  # nohup
             loop.add_signal_handler(number, end, number)
+    # For those whom a crowd keeps from the socket; `server.serve` is what makes it findable.
+    loop.add_signal_handler(STOP_SIGNAL, _stop, service)
     server.serve(service)
     opening = asyncio.create_task(service.open())
     attending = asyncio.create_task(service.attend())
@@ -104,3 +107,8 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     await asyncio.gather(opening, attending, return_exceptions=True)
     await server.close()
     return asked.result()
+
+
+def _stop(service: Service) -> None:
+    _log.info("stop: asked for by %s", STOP_SIGNAL.name)
+    service.stop(f"the daemon got {STOP_SIGNAL.name}")

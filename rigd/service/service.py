@@ -601,6 +601,8 @@ def _note_end(series: Series, result: SessionResult, publish: Publish) -> None:
         "missed": result.missed,
         "late": result.late,
         "lost": result.lost,
+        "stale angles": result.stale_angles,
+        "stale wrenches": result.stale_wrenches,
         "not shown live": result.live_dropped,
     }
     _log.log(

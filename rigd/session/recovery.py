@@ -293,6 +293,8 @@ def _counts(samples: npt.NDArray[np.void], known_to_be_gone: int) -> dict[str, s
         "missed": str(missed),
         "lost": str(lost),
         "late": str(int(np.count_nonzero(status & Status.LATE))),
+        "stale_angles": str(int(np.count_nonzero(status & Status.ANGLE_STALE))),
+        "stale_wrenches": str(int(np.count_nonzero(status & Status.WRENCH_STALE))),
     }
 
 

@@ -40,10 +40,14 @@ class Crew:
     ----------
     live
         As given.
+    cores
+        For the processes that are still to be started, where this one keeps off some; empty: its
+        own.
     """
 
     def __init__(self, *, live: bool) -> None:
         self.live = live
+        self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
         self._used: set[Process] = set()
@@ -118,7 +122,7 @@ class Crew:
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:
-        self._children[process] = Child(process.name, process.module, self._fds)
+        self._children[process] = Child(process.name, process.module, self._fds, self.cores)
         self._used.discard(process)
 
     def __enter__(self) -> Self:

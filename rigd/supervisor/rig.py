@@ -14,6 +14,7 @@ from rigd.engine.board import Board, Stop, Word
 from rigd.engine.jobs import ControlJob
 from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import CONTROL, LIVE, Pulse
+from rigd.engine.realtime import Precedence
 from rigd.engine.signals import StopRequest
 from rigd.profile import Profile
 from rigd.supervisor.crew import Crew
@@ -67,6 +68,7 @@ class Rig:
         self._view: LiveView | None = None
         self._zero_set = False
         self._pulse = Pulse()
+        self._precedence: Precedence | None = None
         self._looking = threading.Lock()
         self._statuses = StatusWatch(profile.rig.rate_hz)
         self.connected = False
@@ -96,12 +98,14 @@ class Rig:
             self.disconnect()
         try:
             crew = self._crew = self._crew or Crew(live=self._live)
+            granted = self._take_precedence(crew)
             if reset_fault:
                 self._reset_fault(moving)
             _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast)
             job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
             crew.fresh(CONTROL).start(job)
             self._told = self._ask(_CONNECT_PATIENCE_S)
+            self._told["realtime"] |= granted
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
@@ -142,6 +146,8 @@ class Rig:
                 "The zero of the angle was lost with the connection, and the limits with it; move "
                 "the motor to its middle and run rigd zero."
             )
+        if self._precedence is not None:
+            self._precedence.cover()
         _wipe(crew.channels.board)
         crew.channels.clear()
         session = Session(order, crew, self._told, self._view, watcher, listens)
@@ -228,7 +234,9 @@ class Rig:
         still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
             crew.control.kill()
-            message = {"ended": f"The control process has not moved for {still_s:.1f} s."}
+            message = {
+                "ended": f"The control process has not moved for {still_s:.1f} s. Check CPU load."
+            }
         if message is not None:
             self.disconnect()
             raise RigError(message.get("ended") or "The control process was asked to end.")
@@ -250,6 +258,18 @@ class Rig:
             self.connected = False
         if crew is not None:
             crew.end()
+        if self._precedence is not None:
+            self._precedence.release()
+            self._precedence = None
+
+    def _take_precedence(self, crew: Crew) -> dict[str, str]:
+        """Put this process before the ordinary ones; say what was granted."""
+        if self._fast:
+            return {}
+        realtime = self._profile.realtime
+        self._precedence = Precedence(realtime.supervision_priority, realtime.cpu)
+        crew.cores = self._precedence.cores_before
+        return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
 
     def _reset_fault(self, moving: Reality | None) -> None:
         try:
@@ -291,7 +311,7 @@ class Rig:
         if answer is None:
             raise RigError(
                 f"The control process does not answer within {patience_s:g} s; see whether the "
-                "devices are on."
+                "devices are on, and check CPU load."
             )
         if "ended" in answer:
             raise RigError(answer["ended"] or "It was stopped.")

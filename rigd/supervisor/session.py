@@ -10,12 +10,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Final
 
 from rigd.engine.board import Phase, Stop, Word
 from rigd.engine.events import Event, read_events
 from rigd.engine.jobs import RecorderJob, SessionJob
 from rigd.engine.process import ChildError, Message
 from rigd.engine.processes import CONTROL, RECORDER, Pulse
+from rigd.engine.realtime import REFUSED
 from rigd.engine.reference import put_reference
 from rigd.engine.ring import Observer
 from rigd.engine.signals import StopRequest
@@ -33,6 +35,16 @@ _START_PATIENCE_S = 30.0
 _MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
+_COUNTED = {
+    "scheduled": Word.SCHEDULED,
+    "missed": Word.MISSED,
+    "late": Word.LATE,
+    "stale_angles": Word.STALE_ANGLES,
+    "stale_wrenches": Word.STALE_WRENCHES,
+}
+"""What the control process counts on the board, by the names of the outcome."""
+_NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
+
 
 class SessionFailedError(Exception):
     """A session could not be run or ended; the message says why, in the operator's words.
@@ -44,12 +56,13 @@ class SessionFailedError(Exception):
     kept
         Where its record was saved, if that is not the ``.part`` of the file.
     counts
-        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``.
+        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``,
+        ``stale_angles``, ``stale_wrenches``.
     """
 
     path: Path | None = None
     kept: Path | None = None
-    counts: Mapping[str, int] = MappingProxyType({"scheduled": 0, "missed": 0, "late": 0})
+    counts: Mapping[str, int] = _NO_TICKS
 
     def result(self) -> "SessionResult":
         """Return how the session ended, once its processes have."""
@@ -94,6 +107,9 @@ class SessionResult:
     lost: int | None
     fault: bool
     """Something failed, in the record or after it, whatever was asked for meanwhile."""
+    stale_angles: int = 0
+    """Recorded ticks whose angle is an old one; likewise `stale_wrenches`."""
+    stale_wrenches: int = 0
     live_dropped: int = 0
     """Samples that the live view did not get."""
     part: Path | None = None
@@ -116,6 +132,8 @@ class SessionResult:
             "missed": self.missed,
             "late": self.late,
             "lost": self.lost,
+            "stale_angles": self.stale_angles,
+            "stale_wrenches": self.stale_wrenches,
         }
 
 
@@ -224,7 +242,8 @@ class Session:
         self._open_file()
         order = self._order
         self._control_at_work = True
-        crew.control.send_object("session", SessionJob(order.profile, reference))
+        job = SessionJob(order.profile, reference, self._refused_to_supervision())
+        crew.control.send_object("session", job)
         answer = self._listen_to_control()
         if "ready" in answer:
             crew.recorder.send(begin=file_header(order, self._connected, answer["ready"]))
@@ -238,18 +257,32 @@ class Session:
     def _open_file(self) -> None:
         """Have the file made, under another name if somebody else has just taken the one chosen."""
         crew = self._crew
+        realtime = None if self._virtual else self._order.profile.realtime
         for _ in range(_MOST_NAMES):
-            job = RecorderJob(self._order.path, crew.channels.specs)
+            job = RecorderJob(self._order.path, crew.channels.specs, realtime)
             crew.fresh(RECORDER).start(job)
             try:
-                self._ask_recorder("opened", _START_PATIENCE_S)
+                opened = self._ask_recorder("opened", _START_PATIENCE_S)
             except _NameTakenError as error:
                 taken = error
                 self._order = replace(self._order, path=another_path(self._order.path))
             else:
                 self._opened = self._order.path
+                granted = {f"recorder_{name}": text for name, text in opened["realtime"].items()}
+                self._connected = {
+                    **self._connected,
+                    "realtime": self._connected["realtime"] | granted,
+                }
                 return
         raise taken
+
+    def _refused_to_supervision(self) -> dict[str, str]:
+        """Return what the scheduler did not grant supervisor and recorder, and why."""
+        return {
+            name: text
+            for name, text in self._connected["realtime"].items()
+            if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
+        }
 
     def _listen_to_control(self) -> Message:
         """Wait for the control process's next message, watching everybody meanwhile."""
@@ -273,7 +306,7 @@ class Session:
             hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
             still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
             if answer is None and still_s > hung_after_s:
-                return self._kill_control(f"has not moved for {hung_after_s:g} s")
+                return self._kill_control(f"has not moved for {hung_after_s:g} s (check CPU load)")
             if answer is not None:
                 return self._understood(answer)
             if self._recorder_lost is None:
@@ -323,9 +356,8 @@ class Session:
 
     def _counts(self) -> dict[str, int]:
         board = self._board
-        words = {"scheduled": Word.SCHEDULED, "missed": Word.MISSED, "late": Word.LATE}
         # Before this session's record they stand where the last one left them.
-        return {name: board[word] if board[Word.GO] else 0 for name, word in words.items()}
+        return {name: board[word] if board[Word.GO] else 0 for name, word in _COUNTED.items()}
 
     def _recorder_trouble(self) -> str | None:
         try:
@@ -350,7 +382,8 @@ class Session:
             self._report()
         if message is None:
             raise SessionFailedError(
-                f"The recorder process does not answer within {patience_s:g} s."
+                f"The recorder process does not answer within {patience_s:g} s. Check CPU load and "
+                "disk."
             )
         if "error" in message:
             self._note_kept(message)
@@ -390,7 +423,7 @@ class Session:
         self._crew.recorder.send(close=outcome)
         closed = self._ask_recorder("closed", 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
-        counts = {"scheduled": 0, "missed": 0, "late": 0} | counts | closed.get("counts", {})
+        counts = {**_NO_TICKS, **counts, **closed.get("counts", {})}
         ended, reason = closed.get("outcome", (finished["finished"], finished["reason"]))
         return SessionResult(
             path=None if closed["closed"] is None else Path(closed["closed"]),
@@ -401,6 +434,8 @@ class Session:
             missed=counts["missed"],
             late=counts["late"],
             lost=counts.get("lost", 0),
+            stale_angles=counts["stale_angles"],
+            stale_wrenches=counts["stale_wrenches"],
             fault=finished["fault"] or ended == "fault",
             live_dropped=self._board[Word.LIVE_DROPPED],
         )

@@ -1,14 +1,17 @@
-"""Kill or suspend the processes of a session at random moments, and look at what is left.
+"""Kill, suspend and end the processes of a session at random moments, and look at what is left.
 
-`rigd simulate` and `rigd run`, or `rigd serve` and `rigd start`, are processes of their own. The
-simulated drive says by its log when it was switched off, the file says what was kept.
+Four kinds of rig: simulated in the session itself (direct), by `rigd simulate` on the wire, in
+lock-step with it, and owned by `rigd serve`. The simulated drive says by its log when it was
+switched off, the file says what was kept. Then the rig has to come back: the next session is run,
+after `rigd reset` where that was asked for, and has to be complete.
 
-    python tests/chaos/kill_rig.py --kills 50 --stops 50
+    python tests/chaos/kill_rig.py --cases 200 --jobs 2
 """
 
 import argparse
 import contextlib
 import fcntl
+import itertools
 import json
 import os
 import random
@@ -20,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,11 +31,13 @@ from typing import Any
 import numpy as np
 
 from rigd.devices.simulator import find_simulator
+from rigd.safety.interlocks import OVERLOADED
 from rigd.session import Status, read_session
 from rigd.sim.wire.control import ask
 
 BIN = Path(sys.executable).parent
-PROFILE = Path(__file__).parents[2] / "hw_profiles" / "antenna_can.toml"
+PROFILES = Path(__file__).parents[2] / "hw_profiles"
+PROFILE = PROFILES / "antenna_can.toml"
 
 HEARTBEAT_TIMEOUT_S = 0.3
 RECORDER_LAG_S = 2.0
@@ -40,6 +46,7 @@ CHANGES = (
     ("stale_ticks_in_a_row = { value = 10", "stale_ticks_in_a_row = { value = 400"),
     ("missed_ticks_in_a_row = { value = 25", "missed_ticks_in_a_row = { value = 400"),
     ("missed_percent = { value = 2.0", "missed_percent = { value = 20.0"),
+    ("stale_percent = { value = 1.0", "stale_percent = { value = 50.0"),
     # A tick that comes late measures where the motor is by then, which looks like a jump.
     ("acceleration_rad_s2 = { value = 1000.0", "acceleration_rad_s2 = { value = 10000.0"),
     ("drive_heartbeat_timeout_s = { value = 0.1", "drive_heartbeat_timeout_s = { value = 1.0"),
@@ -56,7 +63,10 @@ MODULES = {
     "recorder": b"rigd.engine.recorder",
     "publisher": b"rigd.live.publisher",
 }
-VICTIMS = ("control", "recorder", "publisher", "supervisor", "all")
+VICTIMS = ("control", "recorder", "publisher", "supervisor", "all", "simulate")
+MODES = ("direct", "wire", "lock-step", "daemon")
+SIGNALS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM, signal.SIGINT)
+_ASKING = (signal.SIGTERM, signal.SIGINT)
 
 KEPT_S = 0.3
 """No sample older than this at the moment of the kill may be lost."""
@@ -65,6 +75,9 @@ _TRANSPORT_S = 5e-3
 _STARTED_S = 60.0
 _ENDED_S = 15.0
 _LONGEST_S = 60.0
+_NEXT_S = 90.0
+_FLUSHED_S = 0.3
+"""After which the log of the simulated rig is on the disk."""
 _COMMAND_S = 60.0
 """Within which `rigd recover` and `analyze` are done, on a busy computer, too."""
 
@@ -78,7 +91,16 @@ OFF_WITHIN_S = {
     ("supervisor", signal.SIGSTOP): 3.0,
     ("recorder", signal.SIGKILL): HEARTBEAT_TIMEOUT_S,
     ("recorder", signal.SIGSTOP): RECORDER_LAG_S + 1.0,
+    # Asked to end, it comes to a stop by itself, through a disabled drive.
+    **{(victim, how): 1.0 for victim in ("control", "supervisor", "all") for how in _ASKING},
 }
+LOST_S = 0.5
+"""Of a record that may be lost, where only its file tells."""
+
+_GRACE_S = 0.2
+"""For which a virtual machine stands still now and then; a standstill is not the rig's."""
+
+_SIMULATORS_LOCK = "antenna_can.lock"
 
 ARMED_S = 6.0
 """Before the record, for as long as the supervisor waits for the recorder, the motor is held."""
@@ -98,8 +120,10 @@ class Case:
     """After the first bytes of the record, or after the start of the command."""
     anywhere: bool = False
     """The moment counts from the start of the command."""
-    daemon: bool = False
-    """`rigd serve` and `rigd start` in place of `rigd run`."""
+    mode: str = "wire"
+    stopped_s: float | None = None
+    """After which the suspension ends, whatever came of it; None: it lasts until the drive is off,
+    or as long as nobody ends it."""
     sweep_s: float = 5.0
     analysed: bool = True
     """Whether to let `analyze` have a go at the file."""
@@ -112,8 +136,9 @@ class Case:
     def __str__(self) -> str:
         where = "start" if self.anywhere else "record"
         then = f", then {self.afterwards.name}" if self._ends_suspended else ""
-        served = " (serve)" if self.daemon else ""
-        what = f"{self.how.name} of {self.victim}{served}"
+        what = f"{self.mode}: {self.how.name} of {self.victim}"
+        if self.stopped_s is not None:
+            what += f" for {self.stopped_s:.1f} s"
         return f"{what} {self.moment_s:.2f} s into the {where}{then}"
 
     @property
@@ -121,8 +146,28 @@ class Case:
         return self.how == signal.SIGSTOP and self.victim in ("supervisor", "all")
 
     @property
+    def daemon(self) -> bool:
+        """`rigd serve` and `rigd start` in place of `rigd run`."""
+        return self.mode == "daemon"
+
+    @property
+    def timed(self) -> bool:
+        """Whether the simulated rig goes by the clock, so that its times can be compared."""
+        return self.mode != "lock-step"
+
+    @property
     def live(self) -> bool:
         return self.victim in ("publisher", "all")
+
+    @property
+    def killed(self) -> bool:
+        """Whether the victim is killed in the end."""
+        return signal.SIGKILL in (self.how, self._ends_suspended and self.afterwards)
+
+    @property
+    def asks_daemon_to_end(self) -> bool:
+        """Whether the daemon was told to end, and is not to be asked for another session."""
+        return self.victim in ("supervisor", "all") and self.how in _ASKING
 
     @property
     def released(self) -> bool:
@@ -149,15 +194,18 @@ class Verdict:
     analysis: str = "-"
     missed: tuple[int, int] = (0, 0)
     """Missed ticks in the two seconds before and after the signal."""
+    after: str = "-"
+    """How the next session came about."""
 
     def row(self) -> str:
         def number(value: float | None) -> str:
             return "-" if value is None else f"{value:.3f}"
 
         return (
-            f"{self.case!s:58} exit {self.exit_code!s:>3}  {self.outcome:9} {self.kept:9} "
+            f"{self.case!s:66} exit {self.exit_code!s:>3}  {self.outcome:9} {self.kept:9} "
             f"off {number(self.off_s):>6}  behind {number(self.behind_s):>6}  "
             f"gone {self.gone_s:5.2f}  {self.analysis:9} missed {self.missed[0]}/{self.missed[1]}  "
+            f"next {self.after:16}  "
             f"{'; '.join(self.complaints) or 'ok'}"
         )
 
@@ -190,29 +238,52 @@ class DriveLog:
 class Scene:
     """A simulated rig and a session on it, in processes of their own."""
 
-    def __init__(self, folder: Path, *, live: bool, sweep_s: float, daemon: bool) -> None:
+    def __init__(self, folder: Path, *, live: bool, sweep_s: float, mode: str) -> None:
         self.folder = folder
+        self.mode = mode
         self.sessions = folder / "sessions"
         self._runtime = Path(tempfile.mkdtemp(prefix="rigd-kill-"))
         self._mark = f"XDG_RUNTIME_DIR={self._runtime}".encode()
         self._environment = {**os.environ, "XDG_RUNTIME_DIR": str(self._runtime)}
-        self._log_path = folder / "drive.jsonl"
         self._said = (folder / "said.txt").open("w+", encoding="utf-8")
         self._json = (folder / "out.json").open("w+", encoding="utf-8")
-        profile = folder / "rig.toml"
-        profile.write_text(changed(PROFILE.read_text("utf-8"), CHANGES), encoding="utf-8")
-        self.simulator = self._start("simulate", "--profile", profile, "--log", self._log_path)
-        self._origin_s = self._await_simulator()
-        self.log = DriveLog(self._log_path)
+        self._profile = folder / "rig.toml"
+        source = PROFILES / "sim.toml" if mode == "direct" else PROFILE
+        self._profile.write_text(
+            changed(source.read_text("utf-8"), CHANGES, all_there=mode != "direct"), "utf-8"
+        )
+        self.simulator: subprocess.Popen[str] | None = None
+        self.log: DriveLog | None = None
+        self._origin_s = 0.0
+        if mode != "direct":
+            self.start_simulator()
         options = ["--rest", REST_S, "--duration", sweep_s, "--ring-down", RING_DOWN_S]
         options += ["--stop-hz", 10, "--json"]
-        where = ["--profile", profile, "--output", self.sessions, *(["--live"] if live else [])]
-        if daemon:
-            self.supervisor = self._start("serve", *where)
+        self._live = ["--live"] if live else []
+        if mode == "daemon":
+            self.supervisor = self._serve()
             wait_for(lambda: self.state == "ready", _STARTED_S, "daemon that is ready")
             self.session = self._start("start", "chirp", *options)
         else:
-            self.session = self.supervisor = self._start("run", "chirp", *where, *options)
+            self.session = self.supervisor = self._start("run", "chirp", *self._where, *options)
+
+    @property
+    def _where(self) -> list[object]:
+        fast = ["--fast"] if self.mode == "lock-step" else []
+        return ["--profile", self._profile, "--output", self.sessions, *self._live, *fast]
+
+    def _serve(self) -> subprocess.Popen[str]:
+        return self._start("serve", *self._where)
+
+    def start_simulator(self) -> None:
+        """Start `rigd simulate`, with a log of its own."""
+        path = self.folder / f"drive-{time.monotonic_ns()}.jsonl"
+        options = ["--lock-step"] if self.mode == "lock-step" else []
+        self.simulator = self._start(
+            "simulate", "--profile", self._profile, "--log", path, *options
+        )
+        self._origin_s = self._await_simulator()
+        self.log = DriveLog(path)
 
     def _start(self, *arguments: object) -> subprocess.Popen[str]:
         telling = "simulate" not in arguments
@@ -256,11 +327,15 @@ class Scene:
         """Return the simulated rig's time at a moment of the monotonic clock."""
         return self._origin_s + monotonic_ns * 1e-9
 
+    @property
+    def _simulators(self) -> list[int]:
+        return [] if self.simulator is None else [self.simulator.pid]
+
     def processes(self) -> dict[int, bytes]:
         """Return the processes of the session and their command lines."""
         found = {}
         for entry in Path("/proc").iterdir():
-            if not entry.name.isdigit() or int(entry.name) == self.simulator.pid:
+            if not entry.name.isdigit() or int(entry.name) in self._simulators:
                 continue
             with contextlib.suppress(OSError):
                 if self._mark in (entry / "environ").read_bytes().split(b"\0"):
@@ -271,6 +346,8 @@ class Scene:
         """Return the processes to be hit, the one with the torque first."""
         if victim == "supervisor":
             return [self.supervisor.pid]
+        if victim == "simulate":
+            return self._simulators
         processes = self.processes()
         names = MODULES if victim == "all" else {victim: MODULES[victim]}
         found = [
@@ -302,9 +379,11 @@ class Scene:
 
     @property
     def locks_held(self) -> list[str]:
-        """Return the locks that somebody still has."""
+        """Return the locks that somebody still has who should not."""
         held = []
         for path in (self._runtime / "rigd").glob("*.lock"):
+            if path.name == _SIMULATORS_LOCK and self.simulator and self.simulator.poll() is None:
+                continue
             with path.open("a") as file:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -312,18 +391,77 @@ class Scene:
                     held.append(path.name)
         return held
 
+    def next_session(self) -> str:
+        """Run a short session as the operator would, and say how it came about."""
+        steps = []
+        if self.simulator is not None and self.simulator.poll() is not None:
+            self.start_simulator()
+        if self.mode == "daemon":
+            if self.supervisor.poll() is not None:
+                self.supervisor = self._serve()
+            wait_for(lambda: self.state in ("ready", "fault"), _STARTED_S, "daemon that is at work")
+            if self.state == "fault":
+                steps += self._reset()
+        for _ in range(3):
+            code, said = self._short_session()
+            if code == 0:
+                return ", ".join([*steps, "complete"])
+            if OVERLOADED in said and "stalled" not in steps:
+                steps.append("stalled")  # which is said of the computer, not of the rig
+            elif "rigd reset" not in said or "reset" in steps:
+                return ", ".join([*steps, f"exit {code}: {_line(said)}"])
+            if self.mode != "daemon" or self.state == "fault":
+                steps += self._reset() if "rigd reset" in said or self.mode == "daemon" else []
+        return ", ".join([*steps, f"exit {code}: {_line(said)}"])
+
+    def _reset(self) -> list[str]:
+        done = self._command("reset", *([] if self.mode == "daemon" else self._where[:2]))
+        return ["reset"] if done.returncode == 0 else [f"reset refused ({_line(done.stderr)})"]
+
+    def _short_session(self) -> tuple[int, str]:
+        """Return its exit code and what was said."""
+        hold = ["hold", "--duration", 0.5, "--rest", 0.1, "--ring-down", 0.1, "--json"]
+        if self.mode == "daemon":
+            done = self._command("start", *hold)
+        else:
+            # Nobody looks at this one.
+            where = [word for word in self._where if word != "--live"]
+            where[3] = self.folder / "next"
+            done = self._command("run", *hold, *where)
+        (self.folder / "next.txt").write_text(done.stderr, encoding="utf-8")
+        if done.returncode == 0:
+            (session,) = json.loads(done.stdout)["sessions"]
+            if session["outcome"] != "complete" or session["reason"]:
+                return 0 if session["outcome"] == "complete" else 1, str(session["reason"])
+            if session["scheduled"] != sum(session[k] for k in ("recorded", "missed", "lost")):
+                return 1, f"counts: {session}"
+        return done.returncode, done.stderr
+
+    def _command(self, *arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [BIN / "rigd", *map(str, arguments)]
+        try:
+            return subprocess.run(
+                command, cwd=self.folder, env=self._environment, stdin=subprocess.DEVNULL,
+                capture_output=True, text=True, timeout=_NEXT_S, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return subprocess.CompletedProcess(command, 1, "", f"not done after {_NEXT_S:g} s")
+
     def end_simulator(self) -> None:
+        if self.simulator is None or self.log is None:
+            return
         self.simulator.send_signal(signal.SIGTERM)
         self.simulator.wait(_ENDED_S)
         self.log.look()
 
     def close(self) -> None:
-        for pid in (*self.processes(), self.simulator.pid):
+        for pid in (*self.processes(), *self._simulators):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self.session.wait()
         self.supervisor.wait()
-        self.simulator.wait()
+        if self.simulator is not None:
+            self.simulator.wait()
         self._said.close()
         self._json.close()
         shutil.rmtree(self._runtime, ignore_errors=True)
@@ -337,7 +475,7 @@ def play(case: Case, folder: Path) -> Verdict:
     HarnessError
         If the case could not be staged.
     """
-    scene = Scene(folder, live=case.live, sweep_s=case.sweep_s, daemon=case.daemon)
+    scene = Scene(folder, live=case.live, sweep_s=case.sweep_s, mode=case.mode)
     try:
         return _play(case, scene)
     finally:
@@ -352,47 +490,83 @@ def _play(case: Case, scene: Scene) -> Verdict:
     wait_for(lambda: scene.find(case.victim) or _ended(scene), 10.0, case.victim)
     if _ended(scene):
         raise HarnessError(f"The session had ended by itself:\n{scene.said}")
-    scene.log.look()
-    was_on = scene.log.enabled
+    log = scene.log
+    if log is not None:
+        log.look()
+    was_on = log is not None and log.enabled
     wall_ns = time.time_ns() - time.monotonic_ns()
     hit = scene.find(case.victim)
     before_ns = time.monotonic_ns()
     _send(hit, case.how)
     hit_ns = time.monotonic_ns()
     from_s = time.monotonic()
-    if case.released:
-        _await_off(scene, OFF_WITHIN_S[case.victim, case.how] + 3.0)
-        _send(hit if case.afterwards == signal.SIGCONT else [scene.supervisor.pid], case.afterwards)
+    if case.stopped_s is not None:
+        time.sleep(case.stopped_s)
+    elif case.released:
+        _await_off(log, OFF_WITHIN_S[case.victim, case.how] + 3.0)
+    if case.stopped_s is not None or case.released:
+        ends_by = case.afterwards if case.released else signal.SIGCONT
+        _send(hit if ends_by == signal.SIGCONT else [scene.supervisor.pid], ends_by)
         from_s = time.monotonic()
+    longest_s = _LONGEST_S + (0.0 if case.timed else case.sweep_s)
     try:
-        verdict.exit_code = scene.session.wait(_LONGEST_S)
+        verdict.exit_code = scene.session.wait(longest_s)
     except subprocess.TimeoutExpired:
-        verdict.complaints.append(f"the session goes on after {_LONGEST_S:g} s")
+        verdict.complaints.append(f"the session goes on after {longest_s:g} s")
+    if case.daemon and scene.supervisor.poll() is None and case.asks_daemon_to_end:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            scene.supervisor.wait(_ENDED_S)
     if case.daemon and scene.supervisor.poll() is None:
-        _end_daemon(verdict, scene)
-    ended_s = time.monotonic()
-    while (left := scene.processes()) and time.monotonic() - ended_s < _ENDED_S:
-        time.sleep(0.02)
-    verdict.gone_s = time.monotonic() - from_s
-    for command in left.values():
-        verdict.complaints.append(f"left behind: {command.replace(bytes(1), b' ').decode()}")
-    _await_off(scene, HEARTBEAT_TIMEOUT_S + 2.0)
-    scene.end_simulator()
-    if not left and scene.locks_held:
-        verdict.complaints.append(f"locked: {', '.join(scene.locks_held)}")
+        _judge_daemon(verdict, scene)
+    else:
+        _await_end(verdict, scene, from_s)
+    _await_off(log, HEARTBEAT_TIMEOUT_S + 2.0)
+    if log is not None:
+        time.sleep(_FLUSHED_S)
+        log.look()
     verdict.said = scene.said
     _judge_end(verdict, scene)
-    _judge_drive(verdict, scene.log, scene.time_of(before_ns), scene.time_of(hit_ns), was_on=was_on)
+    if log is not None and case.victim != "simulate":
+        hit_s = scene.time_of(hit_ns)
+        _judge_drive(verdict, log, scene.time_of(before_ns), hit_s, was_on=was_on)
     _judge_file(verdict, scene, hit_ns, wall_ns)
+    verdict.after = scene.next_session()
+    if not verdict.after.endswith("complete"):
+        verdict.complaints.append(f"the next session: {verdict.after}")
+        verdict.after = "failed"
+    if case.daemon and scene.supervisor.poll() is None:
+        _end_daemon(verdict, scene)
+    _await_end(verdict, scene, from_s)
+    scene.end_simulator()
+    if scene.log is not None and scene.log.torques and scene.log.enabled:
+        verdict.complaints.append("the drive is on after the next session")
     return verdict
 
 
-def _end_daemon(verdict: Verdict, scene: Scene) -> None:
-    """See how the daemon took it, and have it end."""
+def _await_end(verdict: Verdict, scene: Scene, from_s: float) -> None:
+    """Wait until the last process of the session is gone, and look for what it leaves."""
+    ended_s = time.monotonic()
+    while (left := scene.processes()) and time.monotonic() - ended_s < _ENDED_S:
+        time.sleep(0.02)
+    verdict.gone_s = verdict.gone_s or time.monotonic() - from_s
+    for command in left.values():
+        verdict.complaints.append(f"left behind: {command.replace(bytes(1), b' ').decode()}")
+    if not left and scene.locks_held:
+        verdict.complaints.append(f"locked: {', '.join(scene.locks_held)}")
+
+
+def _judge_daemon(verdict: Verdict, scene: Scene) -> None:
+    """See how the daemon took it."""
     expected = {"ready"} if verdict.exit_code == 0 else {"ready", "fault"}
+    if verdict.case.victim in ("control", "simulate"):
+        expected = {"ready", "fault"}  # which notices it after the session's end, too
     state = scene.state
     if state not in expected:
         verdict.complaints.append(f"the daemon is in the state {state!r}")
+
+
+def _end_daemon(verdict: Verdict, scene: Scene) -> None:
+    """Have it end."""
     scene.supervisor.send_signal(signal.SIGTERM)
     with contextlib.suppress(subprocess.TimeoutExpired):
         scene.supervisor.wait(_ENDED_S)
@@ -410,13 +584,16 @@ def _send(processes: list[int], number: signal.Signals) -> None:
             os.kill(pid, number)
 
 
-def _await_off(scene: Scene, patience_s: float) -> None:
+def _await_off(log: DriveLog | None, patience_s: float) -> None:
     """Wait until the drive is off; that it is not is found out by the judge."""
+    if log is None:  # it ends with the control process
+        time.sleep(HEARTBEAT_TIMEOUT_S)
+        return
     deadline = time.monotonic() + patience_s
-    scene.log.look()
-    while scene.log.enabled and time.monotonic() < deadline:
+    log.look()
+    while log.enabled and time.monotonic() < deadline:
         time.sleep(0.05)
-        scene.log.look()
+        log.look()
 
 
 def _judge_end(verdict: Verdict, scene: Scene) -> None:
@@ -424,22 +601,26 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
     if result is not None:
         verdict.outcome = result["outcome"]
     complete = result is not None and result["outcome"] == "complete" and not result["reason"]
-    if case.victim == "publisher":
-        expected = [0]
+    ends_by_itself = {0} if complete else {130} if verdict.outcome == "stopped" else {1}
+    passing = case.how in _ASKING and case.victim in ("recorder", "publisher")
+    if case.victim == "publisher" or passing:
+        expected = {0}
         if not complete:
             verdict.complaints.append(f"the session did not go on: {verdict.outcome}")
-        if not case.anywhere and "started again" not in verdict.said:
+        lost = not passing and case.stopped_s is None and case.timed and not case.anywhere
+        if lost and "started again" not in verdict.said:
             verdict.complaints.append("the publisher was not started again")
-    elif signal.SIGKILL in (case.how, case.released and case.afterwards) and (
-        case.victim in ("supervisor", "all")
-    ):
-        expected = [1] if case.daemon else [-signal.SIGKILL]
-    elif case.anywhere or (case.victim, case.how) == ("recorder", signal.SIGSTOP):
-        expected = [0] if complete else [1]
+    elif case.killed and case.victim in ("supervisor", "all"):
+        # Unless it had ended before.
+        expected = {1} if case.daemon else {-signal.SIGKILL, *({0} if complete else ())}
+    elif case.how in _ASKING and case.victim in ("supervisor", "all", "control"):
+        expected = {0} if complete else {130, 1} if case.daemon or case.anywhere else {130}
+    elif case.anywhere or case.how == signal.SIGSTOP:
+        expected = ends_by_itself
     else:
-        expected = [1]
+        expected = {1}
     if verdict.exit_code not in expected:
-        verdict.complaints.append(f"exit code {verdict.exit_code} instead of {expected}")
+        verdict.complaints.append(f"exit code {verdict.exit_code} instead of {sorted(expected)}")
     if "Traceback" in verdict.said:
         verdict.complaints.append("a traceback")
     words = ("Error: ", "fault: ", "After the record: ")
@@ -451,6 +632,9 @@ def _judge_drive(
     verdict: Verdict, log: DriveLog, before_s: float, hit_s: float, *, was_on: bool
 ) -> None:
     case, torques = verdict.case, log.torques
+    if not case.timed:
+        _judge_lock_step(verdict, torques)
+        return
     if torques and (torques[-1]["enabled"] or torques[-1]["torque_nm"]):
         verdict.complaints.append(f"the drive is on in the end: {torques[-1]}")
         return
@@ -465,6 +649,20 @@ def _judge_drive(
         within_s = max(within_s, ARMED_S)
     if verdict.off_s > within_s + _TRANSPORT_S:
         verdict.complaints.append(f"the drive was off after {verdict.off_s:.3f} s, not {within_s}")
+
+
+def _judge_lock_step(verdict: Verdict, torques: list[dict[str, Any]]) -> None:
+    """Judge by the simulated time, which goes on by the clock where no SYNC comes any more."""
+    if torques and (torques[-1]["enabled"] or torques[-1]["torque_nm"]):
+        verdict.complaints.append(f"the drive is on in the end: {torques[-1]}")
+        return
+    on_s = [entry["t_s"] for entry in torques if entry["enabled"]]
+    if on_s:
+        verdict.off_s = torques[-1]["t_s"] - on_s[-1]
+        if verdict.off_s > HEARTBEAT_TIMEOUT_S + _TRANSPORT_S:
+            verdict.complaints.append(
+                f"the drive was off {verdict.off_s:.3f} s after the last SYNC"
+            )
 
 
 def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> None:
@@ -489,7 +687,8 @@ def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> No
         verdict.complaints.append(f"{len(samples)} samples, {counts['recorded']} recorded")
     if not len(samples):
         return
-    log = scene.log
+    if not verdict.case.timed:
+        return
     # In the simulated rig's time.
     due_s = (session.start_utc_ns - wall_ns + samples["t_ns"].astype(np.int64)) * 1e-9
     due_s += scene.time_of(0)
@@ -500,11 +699,13 @@ def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> No
         kept_s = KEPT_S + verdict.case.grace_s
         gone = [
             e["t_s"]
-            for e in log.torques
+            for e in ([] if scene.log is None else scene.log.torques)
             if due_s[-1] + _TRANSPORT_S < e["t_s"] < hit_s - kept_s and e["enabled"]
         ]
         if gone:
             verdict.complaints.append(f"lost {len(gone)} ticks from {hit_s - gone[0]:.3f} s before")
+        if scene.log is None and verdict.behind_s > LOST_S + verdict.case.grace_s:
+            verdict.complaints.append(f"the file ends {verdict.behind_s:.3f} s before")
         gaps = np.diff(ticks) - 1
         before = gaps[(due_s[1:] > hit_s - 2.0) & (due_s[1:] <= hit_s)].sum()
         after = gaps[(due_s[1:] > hit_s) & (due_s[1:] <= hit_s + 2.0)].sum()
@@ -514,7 +715,7 @@ def _judge_file(verdict: Verdict, scene: Scene, hit_ns: int, wall_ns: int) -> No
         off = last["torque_command_nm"] == 0.0 and last["status"] & Status.TORQUE_OFF
         if not off and counts["scheduled"] == ticks[-1] + 1:
             verdict.complaints.append("the last sample has a torque")
-    if verdict.case.analysed:
+    if verdict.case.analysed and outcome["outcome"] != "complete":
         verdict.analysis = _analysed(verdict, path, len(samples))
 
 
@@ -580,10 +781,10 @@ def _line(text: str) -> str:
     return text.strip().rsplit("\n", 1)[-1][:200]
 
 
-def changed(text: str, changes: tuple[tuple[str, str], ...]) -> str:
+def changed(text: str, changes: tuple[tuple[str, str], ...], *, all_there: bool = True) -> str:
     """Return a profile with other numbers."""
     for old, new in changes:
-        if old not in text:
+        if old not in text and all_there:
             raise HarnessError(f"{PROFILE} has no {old!r}")
         text = text.replace(old, new, 1)
     return text
@@ -612,84 +813,115 @@ def _environ(**values: str) -> Iterator[None]:
 
 
 def random_cases(
-    chooser: random.Random, how: signal.Signals, count: int, victims: tuple[str, ...]
+    chooser: random.Random, count: int, modes: tuple[str, ...], victims: tuple[str, ...]
 ) -> Iterator[Case]:
-    """Draw the cases: five out of six in the record; one out of three with a daemon."""
+    """Draw the cases: modes in turn, victims in turn in each of them, five of six in the record."""
     for number in range(count):
-        anywhere = number % 6 == 5
-        victim = chooser.choice(victims) if anywhere else victims[number % len(victims)]
-        # Long enough for the supervisor to see that it hangs.
-        long = (victim, how) == ("publisher", signal.SIGSTOP) and not anywhere
+        mode = modes[number % len(modes)]
+        there = [v for v in victims if v != "simulate" or mode != "direct"]
+        victim = there[number // len(modes) % len(there)]
+        how = chooser.choice((signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP, *SIGNALS[1:]))
+        anywhere = chooser.random() < 1 / 6
+        if mode == "lock-step":  # sweeps as quickly as the two of them can
+            moment_s, sweep_s = chooser.uniform(0.1, 2.0), 60.0
+        else:
+            moment_s, sweep_s = chooser.uniform(0.3, 4.5), 5.0
         yield Case(
             victim=victim,
             how=how,
-            moment_s=chooser.uniform(*((0.3, 7.0) if anywhere else (0.3, 1.5 if long else 4.5))),
+            moment_s=chooser.uniform(0.3, 7.0) if anywhere and mode != "lock-step" else moment_s,
             anywhere=anywhere,
-            daemon=number % 3 == 2,
-            sweep_s=9.0 if long else 5.0,
+            mode=mode,
+            stopped_s=chooser.uniform(0.5, 9.0) if how == signal.SIGSTOP else None,
+            sweep_s=sweep_s,
+            analysed=number % 4 == 0,
+            grace_s=_GRACE_S,
             afterwards=chooser.choice((signal.SIGCONT, signal.SIGCONT, signal.SIGKILL)),
         )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--stops", type=int, default=50)
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--jobs", type=int, default=2, help="Cases that are played at a time.")
     parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--modes", default=",".join(MODES))
     parser.add_argument("--victims", default=",".join(VICTIMS))
     parser.add_argument("--keep", type=Path, help="Folder for what a case with complaints left.")
     given = parser.parse_args()
-    victims = tuple(given.victims.split(","))
-    chooser = random.Random(given.seed)
-    cases = [
-        *random_cases(chooser, signal.SIGKILL, given.kills, victims),
-        *random_cases(chooser, signal.SIGSTOP, given.stops, victims),
-    ]
+    modes, victims = tuple(given.modes.split(",")), tuple(given.victims.split(","))
+    cases = list(random_cases(random.Random(given.seed), given.cases, modes, victims))
     print(f"seed {given.seed}, {len(cases)} cases")  # noqa: T201
     started_s = time.monotonic()
     verdicts, skipped = [], 0
-    for number, case in enumerate(cases):
-        folder = Path(tempfile.mkdtemp(prefix="rigd-case-"))
-        try:
-            verdict = play(case, folder)
-        except HarnessError as error:
-            skipped += 1
-            print(f"{number:3} {case}: not staged. {error}", flush=True)  # noqa: T201
-            shutil.rmtree(folder)
-            continue
-        verdicts.append(verdict)
-        print(f"{number:3} {verdict.row()}", flush=True)  # noqa: T201
-        if verdict.complaints and given.keep:
-            print(verdict.said)  # noqa: T201
-            given.keep.mkdir(parents=True, exist_ok=True)
-            shutil.copytree(folder, given.keep / f"{number:03}", dirs_exist_ok=True)
-        shutil.rmtree(folder)
+    with ProcessPoolExecutor(given.jobs) as pool:
+        played = {
+            pool.submit(play_alone, case, given.keep and given.keep / f"{number:03}"): number
+            for number, case in enumerate(cases)
+        }
+        for future in as_completed(played):
+            number = played[future]
+            try:
+                verdicts.append(future.result())
+            except HarnessError as error:
+                skipped += 1
+                print(f"{number:3} {cases[number]}: not staged. {error}", flush=True)  # noqa: T201
+                continue
+            print(f"{number:3} {verdicts[-1].row()}", flush=True)  # noqa: T201
+            if verdicts[-1].complaints:
+                print(verdicts[-1].said)  # noqa: T201
     print(summary(verdicts))  # noqa: T201
     took_s = time.monotonic() - started_s
     bad = [verdict for verdict in verdicts if verdict.complaints]
-    counted = f"{len(verdicts)} cases, {len(bad)} with complaints, {skipped} not staged"
-    print(f"{counted}, {took_s:.0f} s")  # noqa: T201
+    back = sum(verdict.after.endswith("complete") for verdict in verdicts)
+    print(  # noqa: T201
+        f"{len(verdicts)} cases, {len(bad)} with complaints, the next session complete in {back}; "
+        f"{skipped} not staged; {took_s:.0f} s"
+    )
     return 1 if bad else 0
 
 
+def play_alone(case: Case, keep: Path | None) -> Verdict:
+    """Play a case in a folder of its own, of which only something wrong is kept.
+
+    Raises
+    ------
+    HarnessError
+        If the case could not be staged.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="rigd-case-"))
+    try:
+        verdict = play(case, folder)
+        if verdict.complaints and keep:
+            shutil.copytree(folder, keep, dirs_exist_ok=True)
+        return verdict
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def summary(verdicts: list[Verdict]) -> str:
-    """Return a table: a line a victim and signal."""
+    """Return a table: a line a mode, victim and signal."""
     lines = [
-        f"{'victim':10} {'signal':8} cases  bad  off p50/max s   behind p50/max s  gone max s  "
-        "missed before/after"
+        f"{'mode':9} {'victim':10} {'signal':8} cases  bad  off p50/max s   behind p50/max s  "
+        "gone max s  back  reset  stalled  missed before/after"
     ]
-    for victim in VICTIMS:
-        for how in (signal.SIGKILL, signal.SIGSTOP):
-            mine = [v for v in verdicts if (v.case.victim, v.case.how) == (victim, how)]
-            if not mine:
-                continue
-            off = [v.off_s for v in mine if v.off_s is not None]
-            behind = [v.behind_s for v in mine if v.behind_s is not None]
-            lines.append(
-                f"{victim:10} {how.name:8} {len(mine):5} {sum(bool(v.complaints) for v in mine):4}"
-                f"  {_spread(off):>14}  {_spread(behind):>16}  {max(v.gone_s for v in mine):10.2f}"
-                f"  {sum(v.missed[0] for v in mine)}/{sum(v.missed[1] for v in mine)}"
-            )
+    for mode, victim, how in itertools.product(MODES, VICTIMS, SIGNALS):
+        mine = [
+            v for v in verdicts if (v.case.mode, v.case.victim, v.case.how) == (mode, victim, how)
+        ]
+        if not mine:
+            continue
+        off = [v.off_s for v in mine if v.off_s is not None]
+        behind = [v.behind_s for v in mine if v.behind_s is not None]
+        lines.append(
+            f"{mode:9} {victim:10} {how.name:8} {len(mine):5} "
+            f"{sum(bool(v.complaints) for v in mine):4}"
+            f"  {_spread(off):>14}  {_spread(behind):>16}  {max(v.gone_s for v in mine):10.2f}"
+            f"  {sum(v.after.endswith('complete') for v in mine):4}"
+            f"  {sum('reset' in v.after for v in mine):5}"
+            f"  {sum('stalled' in v.after for v in mine):7}"
+            f"  {sum(v.missed[0] for v in mine)}/{sum(v.missed[1] for v in mine)}"
+        )
     return "\n".join(lines)
 
 

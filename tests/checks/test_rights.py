@@ -30,6 +30,7 @@ def test_every_setting_has_a_row_and_none_sticks(asked):
         "cpu",
         "idle states",
         "scheduling",
+        "supervisor and recorder",
     }
     assert rows["timer slack"].verdict is Verdict.OK
     assert state() == before
@@ -60,12 +61,15 @@ def test_the_lines_that_grant_what_is_lacking_are_spelt_out(asked, monkeypatch):
         "memory": "refused: not enough",
         "idle_states": "refused: not yours",
         "scheduling": "refused: not permitted",
+        "supervision": "nice -10 (SCHED_RR refused: not permitted)",
     }
     monkeypatch.setattr("rigd.checks.rights.settings_granted", lambda settings: granted)
     rows = {row.what: row for row in rights_rows(asked)}
     user = pwd.getpwuid(os.geteuid()).pw_name
     assert f"{user} - memlock unlimited" in rows["memory"].detail
     assert f"{user} - rtprio {asked.priority}" in rows["scheduling"].detail
+    assert f"{user} - rtprio {asked.priority}" in rows["supervisor and recorder"].detail
+    assert rows["supervisor and recorder"].wanted == "SCHED_RR 20"
     assert 'KERNEL=="cpu_dma_latency"' in rows["idle states"].detail
     assert all(row.verdict is Verdict.WARNING for row in rows.values())
 

@@ -32,7 +32,9 @@ def test_the_paper_s_chirp_is_recorded_whole_and_excites_all_three_modes(paper_s
     assert session["outcome"] == "complete"
     assert session["scheduled"] == session["recorded"] == 136_000
     assert session["missed"] == session["lost"] == session["late"] == 0
+    assert session["stale_angles"] == session["stale_wrenches"] == 0
     record = read_session(path)
+    assert record.outcome["stale_angles"] == record.outcome["stale_wrenches"] == "0"
     assert record.outcome["outcome"] == "complete"
     assert record.outcome["recorded"] == "136000"
     assert record.segments == {

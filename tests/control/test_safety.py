@@ -115,7 +115,8 @@ def test_missed_ticks_in_a_row(watch):
     assert violation is not None
     assert str(violation) == (
         "The run of missed ticks of 51 ticks exceeds its limit of 50 ticks "
-        "(limits.missed_ticks_in_a_row). See what else this computer does."
+        "(limits.missed_ticks_in_a_row). The computer is overloaded: close "
+        "other programs."
     )
 
 

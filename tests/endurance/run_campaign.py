@@ -1,15 +1,17 @@
-"""Twelve hours of rig time under the virtual clock: what grows, and is every tick accounted for?
+"""Hours of rig time under the virtual clock: what grows, and is every tick accounted for?
 
 `rigd run chirp --fast --repeat N` is one supervisor with one control process. Whenever a session
 file is finished it is checked and deleted, and the memory and the descriptors of every process are
-noted.
+noted. After the first minute none of them may grow by 2 % or more.
 
     python tests/endurance/run_campaign.py --hours 12
+    python tests/endurance/run_campaign.py --minutes 60
 """
 
 import argparse
 import os
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
@@ -28,6 +30,8 @@ RATE_HZ = 1000
 MODULES = {"rigd.engine.control": "control", "rigd.engine.recorder": "recorder"}
 
 _LOOK_S = 0.05
+_ENDLESS_HOURS = 500.0
+"""Of rig time: more than any hour of the clock comes to."""
 WARM_UP = 0.2
 """Part of the sessions that is left out: what is imported late, and what a heap settles to."""
 ENOUGH = 100
@@ -37,6 +41,11 @@ FLAT_KB = 2048
 sessions, some 3 kB each, to tell it at its end."""
 FLAT_DESCRIPTORS = 1
 """Likewise: between two sessions one or two are open that a look in mid-session does not see."""
+
+
+SETTLED_S = 60.0
+"""After which no process may grow any more."""
+MOST_GROWTH = 0.02
 
 
 @dataclass(frozen=True)
@@ -70,6 +79,62 @@ class Look:
         return cls(*map(min, zip(*map(astuple, looks), strict=True)))
 
 
+@dataclass(frozen=True)
+class Growth:
+    """How far a number has grown since the first minute."""
+
+    first: float
+    """Median of the first fifth of what came after it."""
+    last: float
+    """Median of the last fifth."""
+
+    @classmethod
+    def of(cls, times_s: list[float], values: list[int]) -> "Growth | None":
+        """Compare the beginning and the end of a series; None if it is too short for that."""
+        settled = [v for t_s, v in zip(times_s, values, strict=True) if t_s >= SETTLED_S]
+        fifth = len(settled) // 5
+        if not fifth:
+            return None
+        return cls(statistics.median(settled[:fifth]), statistics.median(settled[-fifth:]))
+
+    @property
+    def share(self) -> float:
+        """Of what it was."""
+        return self.last / self.first - 1.0 if self.first else float(self.last > 0.0)
+
+    @property
+    def too_much(self) -> bool:
+        """Whether it has grown."""
+        return self.share >= MOST_GROWTH
+
+
+def growth_table(series: dict[str, list[tuple[float, Look]]], complaints: list[str]) -> str:
+    """Return how memory and descriptors of processes have grown, and complain of what has.
+
+    Parameters
+    ----------
+    series
+        By process: when it was looked at, in s since the start, and what was seen.
+    complaints
+        To be added to.
+    """
+    lines = [f"{'since the first minute':24} {'at first':>10} {'at last':>10} {'growth':>8}"]
+    for name, looks in series.items():
+        for what, field in (("resident, kB", "resident_kb"), ("descriptors", "descriptors")):
+            values = [getattr(look, field) for _, look in looks]
+            growth = Growth.of([t_s for t_s, _ in looks], values)
+            if growth is None:
+                complaints.append(f"{name}: too few looks to say whether it grows")
+                break
+            label = f"{name} {what}"
+            lines.append(
+                f"{label:24} {growth.first:10.0f} {growth.last:10.0f} {100 * growth.share:+7.2f} %"
+            )
+            if growth.too_much:
+                complaints.append(f"{label} grew by {100 * growth.share:.1f} %")
+    return "\n".join(lines)
+
+
 def _shared_kb(descriptor: Path) -> int:
     """Return what lies in shared memory behind a descriptor in /proc."""
     try:
@@ -94,12 +159,15 @@ def processes(supervisor: int) -> dict[str, int]:
     return found
 
 
-def check(path: Path) -> tuple[int, str]:
-    """Return the ticks of a session file, and what is wrong with it, or nothing."""
+def check(path: Path, *, ended: bool = False) -> tuple[int, str]:
+    """Return the ticks of a session file, and what is wrong with it, or nothing.
+
+    One in which the campaign was `ended` may have been stopped.
+    """
     session = read_session(path)
     outcome, ticks = session.outcome or {}, session.samples["tick"].astype(np.int64)
     counts = {key: int(outcome[key]) for key in ("scheduled", "recorded", "missed", "lost")}
-    if outcome["outcome"] != "complete":
+    if outcome["outcome"] not in (("complete", "stopped") if ended else ("complete",)):
         return len(ticks), f"{outcome['outcome']}: {outcome.get('reason')}"
     if counts["scheduled"] != counts["recorded"] + counts["missed"] + counts["lost"]:
         return len(ticks), f"the counts do not add up: {counts}"
@@ -145,10 +213,20 @@ class Trend:
 
 
 class Campaign:
-    """One `rigd run --repeat`, and what was seen of it."""
+    """One `rigd run --repeat`, and what was seen of it.
 
-    def __init__(self, sessions: int, duration_s: float, folder: Path) -> None:
+    With `minutes` it is ended after that time, and has more sessions than it comes to.
+    """
+
+    def __init__(
+        self, sessions: int, duration_s: float, folder: Path, minutes: float | None = None
+    ) -> None:
         self.sessions = sessions
+        self.seen: dict[str, list[tuple[float, Look]]] = {"supervisor": [], "control": []}
+        """When, in s since the start, each process that lasts held how much."""
+        self._began_s = time.monotonic()
+        self._end_s = None if minutes is None else self._began_s + 60.0 * minutes
+        self._ended = False
         self.looks: dict[str, list[Look]] = {"supervisor": [], "control": [], "recorder": []}
         """The least that each process held in the course of each session."""
         self._fresh: dict[str, list[Look]] = {name: [] for name in self.looks}
@@ -173,6 +251,9 @@ class Campaign:
         """Attend to the files as they come; yields their number."""
         while True:
             ended = self._process.poll() is not None
+            if self._end_s is not None and not self._ended and time.monotonic() > self._end_s:
+                self._ended = True
+                self._process.send_signal(signal.SIGINT)
             if not ended:
                 self._look()
             for path in sorted((self._folder / "sessions").glob("*.mcap")):
@@ -182,10 +263,10 @@ class Campaign:
             if ended:
                 break
             time.sleep(_LOOK_S)
-        if self._process.returncode != 0:
+        if self._process.returncode != (130 if self._ended else 0):
             said = Path(self._said.name).read_text("utf-8").strip().rsplit("\n", 1)[-1]
             self.complaints.append(f"exit code {self._process.returncode}: {said}")
-        if self.files != self.sessions:
+        if self.files != self.sessions and not self._ended:
             self.complaints.append(f"{self.files} files of {self.sessions}")
 
     def close(self) -> None:
@@ -204,10 +285,13 @@ class Campaign:
         for name, looks in self._fresh.items():
             if looks and self.files < self.sessions - 1:  # in the last one they end
                 self.looks[name].append(Look.least(looks))
+                if name in self.seen:
+                    passed_s = time.monotonic() - self._began_s
+                    self.seen[name].append((passed_s, self.looks[name][-1]))
             looks.clear()
 
     def _take(self, path: Path) -> None:
-        ticks, wrong = check(path)
+        ticks, wrong = check(path, ended=self._ended)
         if wrong:
             self.complaints.append(f"{path.name}: {wrong}")
         self.ticks += ticks
@@ -218,20 +302,25 @@ class Campaign:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, default=12.0, help="Of rig time.")
+    parser.add_argument("--minutes", type=float, help="Of the clock, instead of --hours.")
     parser.add_argument("--duration", type=float, default=120.0, help="Of a sweep, s.")
     given = parser.parse_args()
-    sessions = round(given.hours * 3600 / (given.duration + 16.0))
+    hours = given.hours if given.minutes is None else _ENDLESS_HOURS
+    sessions = round(hours * 3600 / (given.duration + 16.0))
     folder = Path(tempfile.mkdtemp(prefix="rigd-endure-"))
     started_s = time.monotonic()
-    campaign = Campaign(sessions, given.duration, folder)
+    campaign = Campaign(sessions, given.duration, folder, given.minutes)
+    every = max(1, sessions // 12) if given.minutes is None else 10
     try:
         for number in campaign.follow():
-            if number % max(1, sessions // 12) == 0:
+            if number % every == 0:
                 print(_progress(campaign, time.monotonic() - started_s), flush=True)  # noqa: T201
     finally:
         campaign.close()
         shutil.rmtree(folder, ignore_errors=True)
     print(report(campaign))  # noqa: T201
+    if time.monotonic() - started_s > 2 * SETTLED_S:
+        print(growth_table(campaign.seen, campaign.complaints))  # noqa: T201
     for complaint in campaign.complaints:
         print(f"WRONG {complaint}")  # noqa: T201
     hours = campaign.ticks / RATE_HZ / 3600

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from rigd.bench.measure import measurement
 from rigd.live.address import LiveAddress, find
+from rigd.live.program import RerunProgram
 from rigd.live.viewer import Viewer
 from rigd.session import read_session
 
@@ -88,7 +89,35 @@ class Killed:
             self._viewer.close()
 
 
-KINDS = {"none": Nobody, "frozen": Frozen, "killed": Killed}
+class Reading:
+    """Somebody who reads all that comes, as fast as it does, and shows nothing of it."""
+
+    def __init__(self) -> None:
+        self._program: RerunProgram | None = None
+        self._server = 0
+
+    def look(self, address: LiveAddress, now_s: float) -> None:
+        """Connect, and again whenever the live view is another one or the connection has ended."""
+        gone = self._program is None or not self._program.running
+        if not gone and address.server == self._server:
+            return
+        self.close()
+        self._server = address.server
+        self._program = RerunProgram((address.proxy_url, "--save", os.devnull, "--port", "0"))
+
+    @property
+    def connected(self) -> bool:
+        """Whether it is there."""
+        return self._program is not None and self._program.running
+
+    def close(self) -> None:
+        """Let go."""
+        if self._program is not None:
+            self._program.kill()
+            self._program = None
+
+
+KINDS = {"none": Nobody, "reading": Reading, "frozen": Frozen, "killed": Killed}
 
 
 @dataclass

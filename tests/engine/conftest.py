@@ -29,6 +29,8 @@ class WatchedDrive:
     fault_at: int | None = None
     fault: object = None
     stale_at: int | None = None
+    stale_pattern: tuple = (True,)
+    """Of the reads from then on, over and over."""
     reads: int = 0
     held_rad: float = 0.0
     doubt: str = ""
@@ -38,7 +40,9 @@ class WatchedDrive:
 
     @property
     def angle_stale(self):
-        return self.stale_at is not None and self.reads >= self.stale_at
+        if self.stale_at is None or self.reads < self.stale_at:
+            return False
+        return self.stale_pattern[(self.reads - self.stale_at) % len(self.stale_pattern)]
 
     @property
     def angle_time_ns(self):

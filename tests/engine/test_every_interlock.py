@@ -31,6 +31,7 @@ class Sensor:
         self.reads = 0
         self.added = [0.0] * 6
         self.stale = self.saturated = False
+        self.stale_every = 1
 
     def __getattr__(self, name):
         return getattr(self.inner, name)
@@ -41,7 +42,7 @@ class Sensor:
 
     @property
     def wrench_stale(self):
-        return self.stale and self._wrong
+        return self.stale and self._wrong and self.reads % self.stale_every == 0
 
     @property
     def wrench_saturated(self):
@@ -168,6 +169,17 @@ CASES = {
     "stale wrench": Case(
         lambda s: sensor(s, stale=True),
         r"The run of ticks without a new wrench of 4 ticks exceeds its limit of 3 ticks",
+    ),
+    "stale angle share": Case(
+        lambda s: (
+            setattr(s.drive, "stale_at", MIDDLE),
+            setattr(s.drive, "stale_pattern", (False, True, True)),
+        ),
+        r"The part of ticks without a new angle of 1\.01 % exceeds its limit of 1 %",
+    ),
+    "stale wrench share": Case(
+        lambda s: sensor(s, stale=True, stale_every=2),
+        r"The part of ticks without a new wrench of 1\.01 % exceeds its limit of 1 %",
     ),
     "missed ticks": Case(
         lambda s: miss(s, 80_000_000),

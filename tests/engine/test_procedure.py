@@ -16,6 +16,12 @@ from rigd.excitation import hold
 from rigd.session.format import Status, decode_samples
 
 
+def books(**counts):
+    """The counts of a session, of which all but those given are zero."""
+    nothing = ("scheduled", "missed", "late", "lost", "stale_angles", "stale_wrenches")
+    return dict.fromkeys(nothing, 0) | counts
+
+
 def assert_books_balance(session, samples):
     counts = session.finished["counts"]
     assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
@@ -26,7 +32,7 @@ def test_a_complete_session_has_every_tick(make_session):
     samples = session.samples
     assert session.finished["finished"] == "complete"
     assert session.finished["reason"] == ""
-    assert session.finished["counts"] == {"scheduled": 5000, "missed": 0, "late": 0, "lost": 0}
+    assert session.finished["counts"] == books(scheduled=5000)
     assert np.array_equal(samples["tick"], np.arange(5000))
     assert np.array_equal(samples["t_ns"], 1_000_000 * np.arange(5000))
     assert not samples["lateness_ns"].any()
@@ -213,7 +219,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     session = make_session()
     # Two in a row, and fast: at 0.16 rad/s the new angle after them is no overspeed either.
     stale = set(range(2000, 5000, 10)) | set(range(2001, 5000, 10))
-    limits = replace(session.profile.limits, velocity_rad_s=1.0)
+    limits = replace(session.profile.limits, velocity_rad_s=1.0, stale_percent=10.0)
     session.profile = replace(session.profile, limits=limits)
     type(session.drive).angle_stale, kept = (
         property(lambda drive: drive.reads in stale),
@@ -225,6 +231,39 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
         type(session.drive).angle_stale = kept
     assert session.finished["finished"] == "complete"
     assert np.flatnonzero(session.samples["status"] & Status.ANGLE_STALE).size == len(stale)
+    assert session.finished["counts"] == books(scheduled=5000, stale_angles=len(stale))
+    assert session.board[Word.STALE_ANGLES] == len(stale)
+    # Six per cent of ten seconds, of which there may be ten: said once, and past the half of it.
+    [warning] = [event.message for event in session.events if event.level == "warning"]
+    assert warning.startswith("The part of ticks without a new angle of 5 %")
+    assert "its limit is 10 % (limits.stale_percent)" in warning
+
+
+def test_two_of_three_angles_may_not_be_old(make_session):
+    """No run of them is longer than two ticks, and yet the record would be worth nothing."""
+    session = make_session()
+    session.drive.stale_at, session.drive.stale_pattern = 0, (False, True, True)
+    session.run()
+    session.assert_safe()
+    finished = session.finished
+    assert finished["finished"] == "fault"
+    assert "part of ticks without a new angle of 1.01 %" in finished["reason"]
+    assert "acquisition.deadline_us" in finished["reason"]
+    counts, samples = finished["counts"], session.samples
+    assert counts["stale_angles"] in (101, 102), "one may come with the last sample"
+    assert counts["stale_wrenches"] == 0
+    assert np.flatnonzero(samples["status"] & Status.ANGLE_STALE).size == counts["stale_angles"]
+    assert_books_balance(session, samples)
+    assert samples["status"][-1] & Status.TORQUE_OFF
+
+
+def test_old_readings_before_the_record_do_not_count(make_session):
+    session = make_session()
+    session.drive.stale_at, session.drive.stale_pattern = 0, (False, True, True)
+    session.clock = StopAt(1_500_000_000, lambda: setattr(session.drive, "stale_at", None))
+    session.run()
+    assert session.finished["finished"] == "complete"
+    assert session.finished["counts"]["stale_angles"] <= 2
 
 
 def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session):
@@ -275,7 +314,7 @@ def test_missed_ticks_are_skipped_flagged_and_counted(make_session):
     samples = session.samples
     counts = session.finished["counts"]
     assert session.finished["finished"] == "complete"
-    assert counts == {"scheduled": 5000, "missed": 3, "late": 1, "lost": 0}
+    assert counts == books(scheduled=5000, missed=3, late=1)
     assert_books_balance(session, samples)
     gap = int(np.flatnonzero(np.diff(samples["tick"]) > 1)[0])
     assert samples["tick"][gap + 1] - samples["tick"][gap] == 4
@@ -329,6 +368,30 @@ def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):
     assert_books_balance(session, samples)
 
 
+def test_a_drive_that_ends_right_after_missed_ticks_ended_for_the_computers_sake(make_session):
+    session = make_session(clock=LateAt({3_000_000_000: 40_200_000}))
+
+    def fail(_):
+        raise DeviceError("The drive reports an error.")
+
+    read = session.drive.read_angle
+
+    def read_angle():
+        # Its watchdog has acted meanwhile.
+        if session.clock.now_ns() > 3_001_000_000 and session.drive.enabled:
+            fail(0.0)
+        return read()
+
+    session.drive.read_angle = read_angle
+    session.run()
+    session.assert_safe()
+    assert session.finished["counts"]["missed"] == 40
+    assert session.finished["reason"] == (
+        "The drive reports an error. It came after 40 missed ticks. "
+        "The computer is overloaded: close other programs."
+    )
+
+
 def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
     session = make_session()
     session.run()
@@ -359,7 +422,7 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
     samples = np.concatenate([decode_samples(read_late[0]), session.samples])
     assert session.finished["finished"] == "fault"
     assert "recorder" in session.finished["reason"]
-    assert session.finished["counts"] == {"scheduled": 16_002, "missed": 0, "late": 0, "lost": 1}
+    assert session.finished["counts"] == books(scheduled=16_002, lost=1)
     assert_books_balance(session, samples)
     assert samples["tick"][-2:].tolist() == [15_999, 16_001]
     assert session.drive.torques[-1] != 0.0
@@ -448,6 +511,18 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
     assert session.parent.said("connected")[0]["realtime"] == session.obtained
+
+
+def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session):
+    session = make_session()
+    order = session.order()
+    refused = {"supervisor_scheduling": "refused: not permitted"}
+    session.obey({"session": replace(order["session"], refused=refused)})
+    [warning] = [event for event in session.events if event.level == "warning"]
+    assert warning.message == (
+        "The system did not grant supervisor_scheduling (refused: not permitted): a computer that "
+        "is busy with other programs may end the session."
+    )
 
 
 def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):

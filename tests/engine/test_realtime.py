@@ -6,10 +6,19 @@ import resource
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
-from rigd.engine.realtime import WAKE_UP_US, _lock_memory, cores_of, isolated_cores, page_faults
+from rigd.engine.realtime import (
+    NICE,
+    WAKE_UP_US,
+    _lock_memory,
+    cores_of,
+    isolated_cores,
+    page_faults,
+)
+from rigd.profile import load_profile
 
 CODE = """
 import json, os, resource, sys
@@ -145,3 +154,121 @@ def test_touching_new_memory_is_counted():
     block = bytearray(64 << 20)
     block[:: 1 << 12] = bytes(len(block) >> 12)
     assert page_faults() > before
+
+
+PRECEDENCE = """
+import json, os, resource, sys, threading
+from rigd.engine.process import Child
+from rigd.engine.realtime import Precedence
+{before}
+
+def state(thread=0):
+    return [
+        os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK,
+        os.getpriority(os.PRIO_PROCESS, thread),
+        sorted(os.sched_getaffinity(thread)),
+    ]
+
+def as_child():
+    there, here = os.pipe()
+    if os.fork() == 0:
+        os.write(here, json.dumps(state()[:2]).encode())
+        os._exit(0)
+    return json.loads(os.read(there, 1000))
+
+told = dict(before=state())
+precedence = Precedence({priority}, {cpu})
+told["obtained"], told["with"] = precedence.take(), state()
+wait = threading.Event()
+thread = threading.Thread(target=wait.wait, daemon=True)
+thread.start()
+precedence.cover()
+told["thread"] = state(thread.native_id)
+told["child"] = as_child()
+if os.access(sys.executable, os.X_OK):
+    rig_child = Child("x", "rigd.engine.recorder", [], precedence.cores_before)
+    told["cores of a process of the rig"] = sorted(os.sched_getaffinity(rig_child.pid))
+    rig_child.stop(1.0)
+precedence.release()
+told["after"], told["thread after"] = state(), state(thread.native_id)
+wait.set()
+print(json.dumps(told))
+"""
+NICE_ONLY = """
+set_scheduler = os.sched_setscheduler
+
+def without_realtime(thread, policy, parameters):
+    if policy & os.SCHED_RR:
+        raise PermissionError(1, "not permitted")
+    set_scheduler(thread, policy, parameters)
+
+os.sched_setscheduler = without_realtime
+"""
+ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="needs rights that only root is sure to have")
+
+
+def precedence_of_a_process(*, priority=20, cpu=-1, before=""):
+    code = PRECEDENCE.format(priority=priority, cpu=cpu, before=before)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    return json.loads(done.stdout)
+
+
+def granted_realtime():
+    told = precedence_of_a_process()
+    if not told["obtained"]["scheduling"].startswith("SCHED_RR"):
+        pytest.skip(f"no real-time priority here: {told['obtained']}")
+    return told
+
+
+def test_supervisor_and_recorder_go_before_ordinary_programs_and_keep_off_the_loops_core():
+    told = granted_realtime()
+    _, nice, all_cores = told["before"]
+    cores = all_cores[:-1] or all_cores
+    assert told["obtained"] == {"scheduling": "SCHED_RR 20", "cores": ",".join(map(str, cores))}
+    assert told["with"] == told["thread"] == [os.SCHED_RR, nice, cores]
+
+
+def test_what_they_start_is_an_ordinary_process_on_every_core():
+    told = granted_realtime()
+    assert told["child"] == [os.SCHED_OTHER, 0]
+    assert told["cores of a process of the rig"] == told["before"][2]
+
+
+def test_released_all_is_as_before():
+    told = precedence_of_a_process()
+    assert told["after"] == told["thread after"] == told["before"]
+
+
+def test_a_loop_on_a_core_of_its_own_is_kept_off_that_one():
+    granted_realtime()
+    first = min(os.sched_getaffinity(0))
+    others = sorted(os.sched_getaffinity(0) - {first}) or [first]
+    told = precedence_of_a_process(cpu=first)
+    assert told["with"][2] == others
+
+
+def test_without_any_right_the_refusal_is_told_and_nothing_changes():
+    told = precedence_of_a_process(before=NO_RIGHTS)
+    assert told["obtained"]["scheduling"].startswith("refused: ")
+    assert told["with"] == told["after"] == told["before"]
+
+
+@ROOT
+def test_where_no_realtime_priority_is_granted_a_nice_value_is_tried():
+    told = precedence_of_a_process(before=NICE_ONLY)
+    assert told["obtained"]["scheduling"].startswith(f"nice {NICE} (SCHED_RR refused: ")
+    assert told["with"][:2] == told["thread"][:2] == [os.SCHED_OTHER, NICE]
+    assert told["child"] == [os.SCHED_OTHER, 0]
+    assert told["after"] == told["before"]
+
+
+def test_who_asks_for_no_priority_gets_none():
+    told = precedence_of_a_process(priority=0)
+    assert told["obtained"] == {}
+    assert told["with"] == told["before"]
+
+
+@pytest.mark.parametrize(("loop", "supervision"), [(80, 20), (4, 1), (3, 0), (0, 0), (99, 24)])
+def test_supervision_stays_below_the_loop(loop, supervision):
+    settings = replace(load_profile("sim").realtime, priority=loop)
+    assert settings.supervision_priority == supervision

@@ -63,6 +63,9 @@ def test_a_recovered_file_is_complete_for_any_reader_and_says_what_it_is(torn, o
     assert outcome["recovered_protected"] == "true"
     assert (outcome["recorded"], outcome["missed"], outcome["lost"]) == ("1000", "3", "0")
     assert outcome["scheduled"] == "1003"
+    status = read_session(recovery.path).samples["status"]
+    assert outcome["stale_angles"] == str(np.count_nonzero(status & 4))
+    assert outcome["stale_wrenches"] == str(np.count_nonzero(status & 8))
     assert torn.exists()
 
 

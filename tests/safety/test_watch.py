@@ -180,6 +180,33 @@ def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
     )
 
 
+def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
+    assert watch.check_stale_share(49, 49, 10_000) is None
+    assert watch.take_notices() == []
+    assert watch.check_stale_share(51, 60, 10_000) is None
+    assert watch.check(0.0, 0.0, REST) is None
+    # No angle was old in this tick or the one before: the check of what is old carries it.
+    assert watch.check_stale(angle_stale=False, wrench_stale=False) is None
+    assert watch.warning
+    assert watch.check(0.0, 0.0, REST) is None
+    assert not watch.warning
+    angle, wrench = watch.take_notices()
+    assert angle == (
+        "The part of ticks without a new angle of 0.51 % is past its warning level of 0.5 %; its "
+        "limit is 1 % (limits.stale_percent)."
+    )
+    assert "new wrench of 0.6 %" in wrench
+
+
+@pytest.mark.parametrize(("angles", "wrenches", "which"), [(101, 0, "angle"), (3, 101, "wrench")])
+def test_too_many_old_readings_end_a_session(watch, angles, wrenches, which):
+    assert watch.check_stale_share(100, 100, 10_000) is None
+    violation = watch.check_stale_share(angles, wrenches, 5)  # as if ten seconds had passed
+    assert violation.channel == f"part of ticks without a new {which}"
+    assert (violation.value, violation.limit) == (pytest.approx(1.01), 1.0)
+    assert watch.check_stale_share(400, 400, 40_000) is None
+
+
 def test_a_torque_that_is_no_number_is_never_commanded(watch):
     assert "not a number" in str(watch.check_torque(math.nan))
     assert watch.check_torque(1.0) is None  # cut at 0.9 N·m, and told
@@ -200,3 +227,56 @@ def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
         RefusedError, match=r"75\.0 MB .* limits\.disk_free_mb = 50 MB .* make room"
     ):
         make_room(tmp_path / "sessions", excitation, LIMITS)
+
+
+OVERLOADED = "The computer is overloaded: close other programs."
+
+
+def left_behind(watch):
+    """Have the shaft fall far behind its reference, and return what is said of it."""
+    return str(watch.check(2.0 * LIMITS.tracking_error_rad, 0.0, REST))
+
+
+def test_what_a_limit_finds_right_after_a_standstill_is_the_computers_doing(watch):
+    assert "lower the amplitude" in left_behind(watch)
+    watch.reset(0.0)
+    assert watch.check_missed(20, 20, 1000) is None
+    said = left_behind(watch)
+    assert said.endswith(f"It came after 20 missed ticks. {OVERLOADED}")
+    assert "amplitude" not in said
+
+
+def test_missed_ticks_of_several_gaps_are_told_together(watch):
+    watch.skip(4)
+    assert watch.after_missed == "It came after 4 missed ticks."
+    watch.skip(5)
+    assert watch.after_missed == f"It came after 9 missed ticks. {OVERLOADED}"
+
+
+def test_a_tick_or_two_do_not_acquit_the_beam(watch):
+    watch.skip(1)
+    said = left_behind(watch)
+    assert "It came after 1 missed tick." in said
+    assert "lower the amplitude" in said
+    assert OVERLOADED not in said
+
+
+def test_missed_ticks_are_forgotten_after_two_looks(watch):
+    watch.skip(20)
+    watch.look(0)
+    assert watch.after_missed
+    watch.look(LOOK_EVERY * PERIOD_NS)
+    assert watch.after_missed == ""
+    assert "amplitude" in left_behind(watch)
+
+
+def test_missed_ticks_are_not_to_blame_for_what_they_cannot_do(watch):
+    watch.skip(20)
+    violation = watch.look(0, disk_free_mb=0.5 * LIMITS.disk_free_mb)
+    assert "missed" not in str(violation)
+
+
+def test_a_new_session_starts_without_the_missed_ticks_of_the_last_one(watch):
+    watch.skip(20)
+    watch.reset(0.0)
+    assert watch.after_missed == ""

@@ -14,7 +14,8 @@ import pytest
 
 from rigd.service import address, server
 from rigd.service.address import AddressError, answers, bind, find, running, socket_path
-from rigd.service.server import MOST_CLIENTS, MOST_WATCHERS, Server
+from rigd.service.documents import Peer
+from rigd.service.server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
 from rigd.service.states import State
 
 LONG = {
@@ -197,12 +198,13 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
         before = descriptors()
         told = most = 0
         for _ in range(20):
-            links = [socket.socket(socket.AF_UNIX) for _ in range(50)]
+            links = [socket.socket(socket.AF_UNIX) for _ in range(MOST_SILENT + 10)]
             for link in links:
                 link.setblocking(False)
                 await join_queue(link, served.path)
             await asyncio.sleep(0.01)
             assert len(served.server._clients) <= MOST_CLIENTS
+            assert len(served.server._silent) <= MOST_SILENT
             # Some are on their way out, and a session has its files.
             most = max(most, descriptors() - len(links))
             for link in links:
@@ -210,11 +212,61 @@ def test_a_thousand_connections_leave_room_for_a_stop(served):
                     told += b"too many clients" in link.recv(1000)
                 link.close()
         assert told > 0
-        assert most <= before + 2 * MOST_CLIENTS
+        assert most <= before + MOST_SILENT + MOST_CLIENTS
         assert (await operator.ask({"command": "status"}))["state"] == "running"
         assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
         await served.until(State.READY)
         assert served.operated.service.controller is not None
+
+    served.run(scenario)
+
+
+def test_a_stop_is_obeyed_where_there_is_no_room_left(served, monkeypatch):
+    monkeypatch.setattr(server, "MOST_CLIENTS", 5)
+
+    async def scenario(served):
+        assert (await (await served.connect()).ask(LONG))["ok"]
+        watchers = [await served.connect() for _ in range(4)]
+        assert (await watchers[0].ask({"command": "watch"}))["ok"]
+        for watcher in watchers[1:]:
+            assert (await watcher.ask({"command": "watch"}))["ok"]
+        refused = await (await served.connect()).ask({"command": "status"})
+        assert (refused["ok"], refused["crowded"]) == (False, True)
+        told = await (await served.connect()).ask({"command": "stop", "id": 7})
+        assert (told["stopping"], told["id"]) == (True, 7)
+        await served.until(State.READY)
+
+    served.run(scenario)
+
+
+def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
+    """The connection of another process is the oldest, and stays."""
+    crowd = []
+
+    def introduced(link):
+        silent = introduce(link)
+        if crowd:
+            silent.peer = Peer(silent.peer.number, 1, silent.peer.uid)
+        return silent
+
+    introduce = served.server._introduced
+    monkeypatch.setattr(served.server, "_introduced", introduced)
+
+    async def scenario(served):
+        slow = await served.connect()
+        await slow.send(b'{"command":')
+        while not served.server._silent:
+            await asyncio.sleep(0.001)
+        for _ in range(3 * MOST_SILENT):
+            crowd.append(socket.socket(socket.AF_UNIX))
+            crowd[-1].setblocking(False)
+            await join_queue(crowd[-1], served.path)
+        await asyncio.sleep(0.05)
+        assert len(served.server._silent) == MOST_SILENT
+        assert b"too many clients" in crowd[0].recv(1000)
+        assert (await slow.ask(b'"status"}\n'))["state"] == "ready"
+        for link in crowd:
+            link.close()
 
     served.run(scenario)
 
@@ -229,7 +281,8 @@ def test_there_is_room_for_those_who_ask_beside_those_who_watch(served):
     served.run(scenario)
 
 
-def test_without_descriptors_clients_are_turned_away(served):
+@pytest.mark.parametrize("says_stop", [False, True])
+def test_without_descriptors_clients_are_turned_away_but_a_stop_is_obeyed(served, says_stop):
     async def scenario(served):
         link = socket.socket(socket.AF_UNIX)
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -240,14 +293,16 @@ def test_without_descriptors_clients_are_turned_away(served):
                 while True:
                     fill.append(os.open(os.devnull, os.O_RDONLY))
             link.connect(str(served.path))
+            link.sendall(b'{"command":"%s"}\n' % (b"stop" if says_stop else b"status"))
             await asyncio.sleep(0.05)
         finally:
             for fd in fill:
                 os.close(fd)
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
         link.settimeout(10.0)
-        assert b"too many clients" in link.recv(1000)
+        told = json.loads(link.recv(1000))
         link.close()
+        assert "stopping" in told if says_stop else "too many clients" in told["error"]
         assert (await (await served.connect()).ask({"command": "status"}))["ok"]
 
     served.run(scenario)

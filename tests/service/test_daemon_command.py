@@ -12,6 +12,7 @@ import pytest
 from processes import eventually
 
 from rigd.service.address import answers, socket_path
+from rigd.service.client import STOP_SIGNAL
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -199,12 +200,30 @@ def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, ri
     assert request("status")["state"] == "running"
     code, out, _ = ask("stop")
     assert code == 0
-    assert "being stopped" in out
-    until(lambda: request("status")["state"] == "ready")
+    assert "The session has ended; the torque is off." in out
+    assert request("status")["state"] == "ready"
     (session,) = request("status")["series"]["sessions"]
     assert session["outcome"] == "stopped"
     assert session["lost"] == 0
+    assert session["path"] in out
     assert read_session(Path(session["path"])).outcome["outcome"] == "stopped"
+
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    code, out, _ = ask("stop", "--no-wait")
+    assert code == 0
+    assert "is being stopped" in out
+    client.communicate(timeout=60.0)
+    assert client.returncode == 130
+
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    daemon.send_signal(STOP_SIGNAL)
+    client.communicate(timeout=60.0)
+    assert client.returncode == 130
+    until(lambda: request("status")["state"] == "ready", daemon)
+    code, out, _ = ask("stop")
+    assert (code, out) == (0, "No session is running; the torque is off.\n")
 
     client = rigd("start", "hold", *LONG)
     until(recording, daemon)
@@ -225,6 +244,46 @@ def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, ri
     assert json.loads(out)["sessions"][0]["outcome"] == "stopped"
     assert not Path(f"/proc/{control}").exists()
     assert not socket_path("sim").exists()
+
+
+CROWD = """
+import socket, sys
+kept = []
+while True:
+    link = socket.socket(socket.AF_UNIX)
+    try:
+        link.connect(sys.argv[1])
+        if sys.argv[2] == "half":
+            link.send(b'{"command": "sto')
+    except OSError:
+        continue
+    if sys.argv[2] != "close":
+        kept = [*kept[-200:], link]
+"""
+
+
+def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask):
+    daemon = serve()
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    crowd = [
+        subprocess.Popen([sys.executable, "-c", CROWD, socket_path("sim"), kind])
+        for kind in ("silent", "half", "close")
+    ]
+    try:
+        code, out, err = ask("status", "--json")
+        assert code == 0, err
+        assert json.loads(out)["state"] == "running"
+        code, out, err = ask("stop")
+        assert code == 0, err
+        assert "The session has ended; the torque is off." in out
+    finally:
+        for process in crowd:
+            process.kill()
+            process.wait()
+    _, err = client.communicate(timeout=60.0)
+    assert client.returncode == 130, err
+    assert request("status")["state"] == "ready"
 
 
 def test_a_killed_daemon_stops_the_rig_and_is_replaced(serve, rigd):

@@ -442,7 +442,7 @@ def test_the_log_tells_of_refusals_and_results(operated, caplog):
     path = operated.last["sessions"][0]["path"]
     assert result == (
         f"series 2: session 1 of 1: {path}, complete: 300 ticks scheduled, 300 recorded, 0 missed, "
-        "0 late, 0 lost, 0 not shown live"
+        "0 late, 0 lost, 0 stale angles, 0 stale wrenches, 0 not shown live"
     )
 
 

@@ -1,4 +1,4 @@
-"""Every row of docs/faults.md: a fault on the wire, and how the session and the drive end."""
+"""Every row of docs/faults.md: a fault on the wire, how it ends, and what brings the rig back."""
 
 import re
 from dataclasses import dataclass
@@ -7,7 +7,11 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
+from rigd.devices.contracts import DeviceError
+from rigd.devices.resetting import reset_drive
 from rigd.session import Status, read_session
+from rigd.sim.wire.simulate import inject
+from rigd.supervisor.rig import RigError
 
 # Fast from the beginning, so that every fault is met while the motor moves.
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}
@@ -26,6 +30,7 @@ MESSAGES = {
     "wired stop dropped": r"Drive .*wired stop \(STO\) was dropped.*switch-on disabled",
     "controller off the bus": r"CAN bus .*bus-off",
     "drive's heartbeat lost": r"Drive .*no heartbeat for 0\.1",
+    "drive restarts": r"Drive .*it has restarted by itself; look at its supply",
     "encoder jumps": r"encoder's jump of .* rad exceeds",
     "statusword corrupted": r"Drive .*statusword",
     "controlword corrupted": r"Drive .*command came over the bus that this computer did not give",
@@ -37,8 +42,18 @@ MESSAGES = {
     "torque commands lost": r"Drive .*exerts .* commanded, for 10 ticks",
     "serial line cut": r"Sensor ATI Digital F/T on /dev/pts",
     "stream silent": rf"wrench.*{STALE} ticks",
+    "streaming sensor restarts": rf"wrench.*{STALE} ticks",
     "stream reports an error": r"Sensor ATI Digital F/T .*error",
 }
+READY = "the next session can be started"
+UNTIL_MENDED = {
+    "drive silent": "no answer",
+    "wired stop dropped": r"does not get ready.*STO is open",
+    "controller off the bus": "no answer",
+    "bus cut": "does not answer",
+}
+"""What `rigd reset` says while the cause is there; elsewhere it would reset a fault that comes
+again."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +65,7 @@ class Row:
     profile: str
     ticks: int
     last: str
+    back: str = ""
 
 
 def rows(heading):
@@ -60,7 +76,7 @@ def rows(heading):
         for line in section.splitlines()
         if line.startswith("|") and "`" in line
     ]
-    return [Row(c[0], c[1].strip("`"), c[2], int(c[3]), c[4]) for c in cells]
+    return [Row(c[0], c[1].strip("`"), c[2], int(c[3]), *c[4:]) for c in cells]
 
 
 def named(row):
@@ -72,7 +88,7 @@ def test_every_row_has_its_message():
 
 
 @pytest.mark.parametrize("row", rows(FATAL), ids=named)
-def test_a_fault_ends_in_a_drive_without_torque(
+def test_a_fault_ends_in_a_drive_without_torque_and_the_rig_comes_back(
     row, quiet_profile, start_simulator, run_order, load, drive_log, tmp_path
 ):
     shortened = MESSAGES[row.name].endswith(f"{STALE} ticks")
@@ -91,10 +107,29 @@ def test_a_fault_ends_in_a_drive_without_torque(
     assert session.samples[-1]["status"] & Status.TORQUE_OFF
     # A drive that nobody can reach any more goes off a little later, by itself.
     assert eventually(lambda: drive_log(log).last_torque["enabled"] is False)
+    at_the_end = drive_log(log)
+
+    rig = load(profile).rig
+    if row.name in UNTIL_MENDED:
+        with pytest.raises(DeviceError, match=UNTIL_MENDED[row.name]) as refused:
+            reset_drive(rig)
+        assert READY not in str(refused.value)
+    inject(rig.name, ["end"])
+    if "`rigd reset`" in row.back:
+        with pytest.raises(RigError, match=f"rigd reset --profile {rig.name}"):
+            run_order(load(profile), "refused", fast=True, **CHIRP)
+        told = reset_drive(rig)
+        assert "The fault is reset" in told
+        assert READY in told
+    else:
+        assert "start again" in row.back
+    following = run_order(load(profile), "next", fast=True, **CHIRP | {"duration_s": 0.5})
+    assert following.went_well, following.reason
+    assert following.recorded == following.scheduled
     simulator.terminate()
     assert simulator.wait(30.0) == 0
 
-    said = drive_log(log)
+    said = at_the_end
     (begun,) = said.of("fault", "simulator")
     end = said.last_torque
     assert (end["enabled"], end["torque_nm"]) == (False, 0.0)

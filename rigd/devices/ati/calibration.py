@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
+import numpy as np
+
 from rigd.devices.contracts import Wrench
 
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
@@ -34,6 +36,13 @@ _TORQUE_UNITS = {
     6: ("kN·m", 1e3),
 }
 _AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+
+_FULL_SCALE_COUNTS = 32768
+_LARGEST, _SMALLEST = 1e6, 1e-6
+"""N or N·m of one gauge at its full scale: no sensor is built for more or for less (the largest has
+40 kN, the smallest resolves 1 mN)."""
+_LEAST_RANK = 1e-6
+"""Ratio of the singular values below which some loads cannot be told apart, in single precision."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,17 +92,49 @@ class Calibration:
                 f"{self.counts_per_torque} per torque, where positive numbers belong. Choose "
                 "another calibration."
             )
-        for axis, row in zip(_AXES, self.matrix, strict=True):
-            if not all(map(isfinite, row)):
-                raise ValueError(
-                    f"the row {axis} of its calibration matrix has entries that are no numbers. "
-                    "Choose another calibration."
-                )
+        self._check_matrix()
+
+    def _check_matrix(self) -> None:
+        for number, (axis, row) in enumerate(zip(_AXES, self.matrix, strict=True)):
+            unit = self.force_unit_n if number < 3 else self.torque_unit_nm
+            counts = self.counts_per_force if number < 3 else self.counts_per_torque
+            per_entry = unit / counts * _FULL_SCALE_COUNTS
+            name = "N" if number < 3 else "N·m"
+            for gauge, entry in enumerate(row):
+                if not isfinite(entry):
+                    raise ValueError(
+                        f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry}, "
+                        "which is no number. Choose another calibration."
+                    )
+                if abs(entry) * per_entry > _LARGEST:
+                    raise ValueError(
+                        f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry:.4g} "
+                        f"({abs(entry) * per_entry:.2g} {name} for a gauge at full scale), more "
+                        f"than any sensor has ({_LARGEST:g} {name}): its memory is damaged. Choose "
+                        "another calibration, or have the sensor repaired."
+                    )
             if not any(row):
                 raise ValueError(
                     f"the row {axis} of its calibration matrix is zero: that calibration is "
                     "empty. Choose another calibration."
                 )
+            if max(map(abs, row)) * per_entry < _SMALLEST:
+                raise ValueError(
+                    f"no entry of the row {axis} of its calibration matrix is beyond "
+                    f"{max(map(abs, row)):.2g} (less than {_SMALLEST:g} {name} for a gauge at full "
+                    "scale): its memory is damaged. Choose another calibration, or have the sensor "
+                    "repaired."
+                )
+        rows = np.array(self.matrix)
+        rows /= np.abs(rows).max(axis=1, keepdims=True)
+        rows /= np.abs(rows).max(axis=0, keepdims=True).clip(min=np.finfo(float).tiny)
+        singular_values = np.linalg.svd(rows, compute_uv=False)
+        if singular_values[-1] < _LEAST_RANK * singular_values[0]:
+            raise ValueError(
+                "its calibration matrix is singular: some of its six axes are combinations of the "
+                "others. Its memory is damaged; choose another calibration, or have the sensor "
+                "repaired."
+            )
 
     @property
     def force_unit_n(self) -> float:

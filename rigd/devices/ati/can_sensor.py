@@ -3,12 +3,19 @@
 import time
 from collections.abc import Sequence
 from functools import partial
+from math import ceil
 
 from rigd.devices.ati import netcanoem
 from rigd.devices.ati.calibration import Calibration, Rows, same_serial_number, wrench_function
 from rigd.devices.ati.netcanoem import REPLY_LENGTHS, identifier
 from rigd.devices.ati.polling import Answer, GaugePolls
-from rigd.devices.ati.status import CAN_BAD_CALIBRATION, CAN_BUS_ERROR, CAN_CRITICAL, can_status
+from rigd.devices.ati.status import (
+    CAN_BAD_CALIBRATION,
+    CAN_BUS_ERROR,
+    CAN_CRITICAL,
+    CAN_WATCHDOG_RESET,
+    can_status,
+)
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
@@ -18,8 +25,15 @@ _TRIES = 3
 # What was asked for again may be answered twice, and no reply says which row of the matrix it is.
 _LATE_REPLY_S = 0.5
 _LOST_POLL_S = 0.02
-# Firmware that can be asked for its counts per unit comes after this.
-_FIXED_COUNTS_UP_TO = (3, 7)
+# A box that was silent for this long may have restarted; no box starts faster.
+_RESTART_S = 0.005
+
+_ASSUMED = (
+    f"{netcanoem.COUNTS_BEFORE_SCALE} counts per N and per N·m: firmware before "
+    f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} tells neither counts per unit nor "
+    "units"
+)
+"""What is taken for granted of old firmware, for the session file and the operator."""
 
 
 class AtiCanSensor:
@@ -68,6 +82,10 @@ class AtiCanSensor:
         self._connected = False
         self._subscribed_to: CanExchange | None = None
         self._inbox: dict[int, bytes] = {}
+        self._restart_ticks = max(1, ceil(_RESTART_S * rig.rate_hz))
+        self._unanswered = 0
+        self._in_doubt = False
+        self._shown = b""
         self._calibration: Calibration | None = None
         self._firmware: tuple[int, int, int] = (0, 0, 0)
         self._status: list[str] = []
@@ -101,8 +119,8 @@ class AtiCanSensor:
             self._firmware = netcanoem.firmware(
                 self._ask("its firmware version", netcanoem.FIRMWARE)
             )
-            serial_number = self._read_serial_number()
             self._select_calibration()
+            serial_number = self._read_serial_number()  # of the calibration, not of the box
             matrix = self._read_matrix()
             # A wrong entry would bend every result, and the protocol has no checksum of its own.
             if self._read_matrix() != matrix:
@@ -115,6 +133,8 @@ class AtiCanSensor:
             self._evaluate(self._first_reading())
             self.polls.forget()
             self._previous = None
+            self._unanswered = 0
+            self._in_doubt = False
         except BaseException:
             self.close()
             raise
@@ -135,12 +155,19 @@ class AtiCanSensor:
             **self._calibration.as_dict(),
             "calibration": self._settings.calibration,
             "firmware": f"{major}.{minor}.{build}",
+            **({} if self._tells_scale else {"assumed": _ASSUMED}),
             "status": self._status,
             "base_id": self._settings.base_id,
         }
 
     def request(self, due_ns: int) -> None:  # noqa: ARG002
-        """Poll the sensor, unless it is in doubt which reply is whose."""
+        """Poll the sensor, unless it is in doubt which reply is whose, or what it measures with.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is gone, or the sensor has restarted.
+        """
         polls = self.polls
         if self._lock_step and not self._waits:
             # No time passes between two ticks: the reply to the last poll is still being made.
@@ -150,7 +177,10 @@ class AtiCanSensor:
             self._previous, self._previous_ns = polls.settle(), polls.sent_ns
         elif self._given_up:
             self.late_replies += polls.settle() is not None
-        polls.send_or_pause()
+        if self._in_doubt and not self._is_the_same():
+            polls.pause()
+        else:
+            polls.send_or_pause()
         self._give_up_ns = polls.sent_ns + self._deadline_ns
 
     def read_wrench(self) -> Wrench:
@@ -167,6 +197,16 @@ class AtiCanSensor:
         else:
             answer, sent_ns = self._previous, self._previous_ns
         if answer is None:
+            self.wrench_stale = True
+            self._unanswered += 1
+            return self._wrench
+        if self._unanswered >= self._restart_ticks:
+            # It answers again: before a reading counts, it has to show its calibration.
+            self._in_doubt = True
+            self._shown = b""
+            self._inbox.clear()
+        self._unanswered = 0
+        if self._in_doubt:
             self.wrench_stale = True
             return self._wrench
         self.wrench_stale = False
@@ -237,9 +277,9 @@ class AtiCanSensor:
     def _evaluate(self, answer: Answer) -> Wrench:
         status, g0, g2, g4 = netcanoem.read_gauges(answer[0])
         g1, g3, g5 = netcanoem.read_gauges_rest(answer[1])
-        self._status_word = status
+        before, self._status_word = self._status_word, status
         if status:
-            self._judge(status)
+            self._judge(status, before)
         limit = self._limit
         self.wrench_saturated = (
             max(g0, g2, g4, g1, g3, g5) >= limit or min(g0, g2, g4, g1, g3, g5) <= -limit
@@ -247,9 +287,11 @@ class AtiCanSensor:
         self._wrench = wrench = self._convert(g0, g2, g4, g1, g3, g5)
         return wrench
 
-    def _judge(self, status: int) -> None:
+    def _judge(self, status: int, before: int) -> None:
         if status & CAN_BUS_ERROR:
             self.bus_errors += 1
+        if status & ~before & CAN_WATCHDOG_RESET:
+            raise self._restarted(f"its watchdog has reset it (status word {status:#06x})")
         if status & CAN_CRITICAL:
             remedy = (
                 "choose another (ati_can.calibration)"
@@ -260,6 +302,38 @@ class AtiCanSensor:
                 f"{self._name}: its status word {status:#06x} says that "
                 f"{'; '.join(can_status(status & CAN_CRITICAL))}; {remedy}."
             )
+
+    def _restarted(self, how: str) -> DeviceError:
+        return DeviceError(
+            f"{self._name}: {how}; it is back at calibration 0, and what it measures since is not "
+            f"measured with calibration {self._settings.calibration} (ati_can.calibration). "
+            "Connecting anew (rigd reset, or another rigd run) selects it again. Look at the box's "
+            "supply and cable; if it happens again, have the box replaced."
+        )
+
+    def _is_the_same(self) -> bool:
+        """Whether a box that was silent has shown the calibration that was read from it.
+
+        One that was without power for a moment does not say so: bit 0 of its status is for the
+        watchdog only.
+        """
+        inbox, calibration = self._inbox, self._calibration
+        parts = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLIES]
+        if all(len(part) == REPLY_LENGTHS[netcanoem.MATRIX_ROW] for part in parts):
+            shown, before = b"".join(parts), self._shown
+            if calibration is None or netcanoem.matrix_row(shown) == calibration.matrix[0]:
+                self._in_doubt = False
+                return True
+            if shown == before:
+                raise self._restarted(
+                    "it was silent for a moment and answers with another calibration matrix since"
+                )
+            # Once may be a reply that was damaged, as at connecting.
+            self._shown = shown
+            inbox.clear()
+        base = self._settings.base_id
+        self.polls.exchange.send(netcanoem.request(base, netcanoem.MATRIX_ROW, 0))
+        return False
 
     def _poll(self, timeout_s: float) -> Answer | None:
         """Poll outside the cycle."""
@@ -320,6 +394,10 @@ class AtiCanSensor:
             )
         return found
 
+    @property
+    def _tells_scale(self) -> bool:
+        return self._firmware[:2] >= netcanoem.FIRST_FIRMWARE_WITH_SCALE
+
     def _select_calibration(self) -> None:
         wanted = self._settings.calibration
         what = f"calibration {wanted}"
@@ -330,9 +408,9 @@ class AtiCanSensor:
                 "one that it has (ati_can.calibration)."
             )
         # Its status tells whether the selected one is any good.
-        status = netcanoem.read_gauges(self._first_reading()[0])[0]
+        status = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
         if status & CAN_BAD_CALIBRATION:
-            self._judge(status)
+            self._judge(status, status)
 
     def _read_matrix(self) -> Rows:
         return tuple(
@@ -348,12 +426,13 @@ class AtiCanSensor:
         )
 
     def _read_scale(self, serial_number: str, matrix: Rows) -> Calibration:
-        force = torque = netcanoem.COUNTS_BEFORE_3_8
-        if self._firmware[:2] > _FIXED_COUNTS_UP_TO:
+        force = torque = netcanoem.COUNTS_BEFORE_SCALE
+        force_unit, torque_unit = netcanoem.NEWTON, netcanoem.NEWTON_METRE
+        if self._tells_scale:
             force, torque = netcanoem.counts_per_unit(
                 self._ask("its counts per unit", netcanoem.COUNTS_PER_UNIT)
             )
-        force_unit, torque_unit = self._ask("its unit codes", netcanoem.UNIT_CODES)
+            force_unit, torque_unit = self._ask("its unit codes", netcanoem.UNIT_CODES)
         try:
             return Calibration(
                 serial_number=serial_number,

@@ -31,8 +31,12 @@ REPLY_LENGTHS = {
 }
 """Bytes in the reply of each opcode that the driver uses."""
 
-COUNTS_BEFORE_3_8 = 1_000_000
-"""Counts per unit of force and of torque of firmware up to 3.7, which cannot be asked."""
+FIRST_FIRMWARE_WITH_SCALE = (3, 7)
+"""Firmware (major, minor) from which on a box can be asked for counts per unit and unit codes."""
+COUNTS_BEFORE_SCALE = 1_000_000
+"""Counts per unit of force and of torque of older firmware."""
+NEWTON, NEWTON_METRE = 2, 3
+"""Unit codes that are assumed of older firmware, which has no request for them either."""
 
 read_gauges = Struct(">Hhhh").unpack
 """Status word and gauges 0, 2, 4 from the first reply to GAUGES."""

@@ -124,12 +124,16 @@ class GaugePolls:
         """Poll as every tick does, but for one that is left out to see which reply is whose."""
         firsts, seconds = self._firsts, self._seconds
         if (firsts.owed or seconds.owed) and firsts.wants_pause() | seconds.wants_pause():
-            firsts.pause()
-            seconds.pause()
-            self.answer = None
-            self.sent_ns = time.monotonic_ns()
+            self.pause()
         else:
             self.send()
+
+    def pause(self) -> None:
+        """Leave a tick without a poll."""
+        self._firsts.pause()
+        self._seconds.pause()
+        self.answer = None
+        self.sent_ns = time.monotonic_ns()
 
     def wait(self, deadline_ns: int) -> Answer | None:
         """Return the answer to the last poll as soon as it has come, or None at the deadline."""

@@ -3,6 +3,7 @@
 Sources: devices.md 1.1 for NETCANOEM and 2.1 for Digital F/T. They differ in bits 9, 10 and 13.
 """
 
+CAN_WATCHDOG_RESET = 0x0001
 CAN_BAD_CALIBRATION = 0x0040
 CAN_BUS_ERROR = 0x4000
 

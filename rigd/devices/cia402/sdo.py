@@ -38,6 +38,10 @@ _EDS = Path(__file__).with_name("drive.eds")
 _SDO_TIMEOUT_S = 0.5
 _SDO_TRIES = 2
 _HURRIED_TIMEOUT_S = 0.05
+_LATE_REPLIES = 3
+"""How many replies to earlier requests, given up since, may come in place of the one awaited."""
+_TIMED_OUT = "No SDO response"
+"""How canopen begins to tell that nothing came at all; what else it tells came, and was not it."""
 _RECEIVER_POLL_S = 0.02
 _ABSENT = {
     0x0602_0000: "no such object",
@@ -105,29 +109,16 @@ class SdoAccess:
         Of the drive.
     name
         Of the drive, for messages.
-    eds
-        Path of the drive's EDS file, or empty.
-
-    Attributes
-    ----------
-    eds_identity : tuple of int
-        Vendor and product number in the drive's EDS file; 0 where it states none.
-
-    Raises
-    ------
-    DeviceError
-        If the EDS file cannot be read.
     """
 
-    def __init__(self, port: CanPort, node_id: int, name: str, eds: str = "") -> None:
+    def __init__(self, port: CanPort, node_id: int, name: str) -> None:
         for library in ("can", "canopen"):
             # What goes wrong is raised; without a handler they would also print it.
             logging.getLogger(library).addHandler(logging.NullHandler())
         self._name = name
         self._bus_name = port.name
-        dictionary = canopen.import_od(str(_EDS), node_id)
-        self.eds_identity = _take_types(dictionary, eds, node_id) if eds else (0, 0)
-        self._node = canopen.RemoteNode(node_id, dictionary)
+        self._node_id = node_id
+        self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_EDS), node_id))
         self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
         self._node.sdo.MAX_RETRIES = _SDO_TRIES
         port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
@@ -169,6 +160,21 @@ class SdoAccess:
             raise DeviceError(
                 f"{error} Look at its supply, its node id (cia402.node_id) and bit rate{heard}."
             ) from None
+
+    def use_eds(self, path: str) -> tuple[int, int]:
+        """Take objects' types from the drive's EDS file from now on.
+
+        Returns
+        -------
+        tuple of int
+            Vendor and product number in it; 0 where it states none.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be read.
+        """
+        return _take_types(self._node.object_dictionary, path, self._node_id)
 
     def tell_pre_operational(self) -> None:
         """Tell the drive to leave operational, which it may ignore; nobody waits for it.
@@ -276,10 +282,7 @@ class SdoAccess:
         variable = SdoVariable(self._node.sdo, self._variable(index, sub))
         what = "reading" if value is None else f"writing {show_value(value)} to"
         try:
-            if value is None:
-                return variable.raw
-            variable.raw = value
-            return value
+            return _ask(variable, value)
         except canopen.SdoAbortedError as error:
             remedy = (
                 " Name the drive's EDS file in the profile (cia402.eds), which has its types."
@@ -320,6 +323,20 @@ class SdoAccess:
         name = self._variable(index, sub).name
         place = f"{index:04X}:{sub}" if sub else f"{index:04X}"
         return f"object {place}" + (f" ({name})" if name else "")
+
+
+def _ask(variable: SdoVariable, value: int | None) -> object:
+    """Write a value or read one, past replies to requests that were given up before."""
+    for left in reversed(range(_LATE_REPLIES + 1)):
+        try:
+            if value is None:
+                return variable.raw
+            variable.raw = value
+            return value
+        except canopen.SdoCommunicationError as error:
+            if not left or str(error).startswith(_TIMED_OUT):
+                raise
+    raise AssertionError
 
 
 def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:

@@ -99,14 +99,15 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     assert settings is not None
     period_us = sync_period_us(rig.rate_hz)
     interpolation = interpolation_time(rig.rate_hz)
-    with SdoAccess(port, settings.node_id, name, settings.eds) as sdo:
+    with SdoAccess(port, settings.node_id, name) as sdo:
         # Before anything else, whoever it is: a session that was killed may have left it turning.
         command_off(sdo)
         sdo.to_pre_operational()
         command_off(sdo)
         identity = _read_identity(sdo)
         try:
-            _check_identity(identity, settings, name, sdo.eds_identity)
+            eds_identity = sdo.use_eds(settings.eds) if settings.eds else (0, 0)
+            _check_identity(identity, settings, name, eds_identity)
         except DeviceError as error:
             raise DeviceError(f"{error}{still_on(sdo)}") from None
         require_off(sdo, rig, name)

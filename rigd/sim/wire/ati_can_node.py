@@ -5,12 +5,15 @@ wire is big-endian. Where no document tells what the box does, it is stated here
 
 * a request with an unknown opcode, of another length, or with an index that cannot be (axis or
   diagnostic channel above 5, calibration above 15, base above 0x7F) gets no reply;
-* after power-up or a reset calibration 0 is active, and the base stays as it was set;
+* after power-up or a reset calibration 0 is active; after a reset, by request or by its watchdog,
+  bit 0 of the status is set as well, up to the next power-up;
 * a calibration that is not in the box is selected and echoed all the same, but from then on bit 6
   of the status is set and the matrix reads as not-a-number, as erased memory does; serial number,
   units and counts do not depend on the calibration;
-* a new base is acknowledged under the old one; a new bit rate is acknowledged and changes nothing
-  here, where there is none.
+* counts per unit and units are told from firmware 3.7 on, the diagnostic channels from 3.8 on;
+  older firmware does not answer these requests;
+* a new base is acknowledged under the old one and holds from the next power-up on; a new bit rate
+  is acknowledged and changes nothing here, where there is none.
 """
 
 from collections.abc import Callable, Collection
@@ -34,13 +37,15 @@ _COUNTS = Struct(">2I").pack
 _WORD = Struct(">H").pack
 _FIRMWARE = Struct(">BBH").pack
 
+_WATCHDOG_RESET = 1 << 0
 _BAD_CALIBRATION = 1 << 6
 _ANY_ERROR = 1 << 15
 _ERASED_ROW = (float("nan"),) * 6
 _DIAGNOSTICS = (32768, 0, 21450, 43690, 32771, 12)
 """Mid of the gauges' supply, unused, thermistor, power, excitation, ground: raw ADC values."""
-_LAST_WITHOUT_COUNTS = (3, 7)
-"""Firmware up to here does not know the request for counts per unit; both are 1 000 000."""
+_FIRST_WITH_COUNTS = (3, 7)
+"""Older firmware knows no request for counts per unit, which are 1 000 000 each, or for units."""
+_FIRST_WITH_DIAGNOSTICS = (3, 8)
 
 
 class AtiCanNode:
@@ -57,11 +62,11 @@ class AtiCanNode:
     log
         Called ``log("sensor", what, **values)`` when the box is set or reset.
     firmware
-        Major, minor, build; up to 3.7 the box does not tell its counts per unit.
+        Major, minor, build; before 3.7 the box tells neither counts per unit nor units.
     calibrations
         Indices that hold a calibration; the profile's alone if not given.
     counts_per_unit
-        Per N and per N·m; 1 000 000 each with a firmware up to 3.7.
+        Per N and per N·m; 1 000 000 each with a firmware before 3.7.
 
     Attributes
     ----------
@@ -98,7 +103,7 @@ class AtiCanNode:
                 "The profile has no section [ati_can], which the simulated sensor on CAN needs; "
                 "copy it from a profile that has one."
             )
-        tells_counts = firmware[:2] > _LAST_WITHOUT_COUNTS
+        tells_counts = firmware[:2] >= _FIRST_WITH_COUNTS
         self.gauges = AtiGauges(rig.sensor, counts_per_unit if tells_counts else COUNTS_PER_UNIT)
         self.frozen = False
         self.saturate: int | None = None
@@ -111,7 +116,8 @@ class AtiCanNode:
             {settings.calibration} if calibrations is None else frozenset(calibrations)
         )
         self._active = 0
-        self._base = settings.base_id
+        self._was_reset = False
+        self._base = self._next_base = settings.base_id
         serial_number = settings.serial_number or SERIAL_NUMBER
         self._serial_number = serial_number.encode("ascii", "replace")[:8].ljust(8, b"\0")
         self._requests: dict[int, tuple[int, Callable[[bytes], None]]] = {
@@ -119,8 +125,6 @@ class AtiCanNode:
             0x2: (1, self._read_matrix_row),
             0x5: (0, self._read_serial_number),
             0x6: (1, self._set_calibration),
-            0x8: (0, self._read_units),
-            0x9: (1, self._read_diagnostic),
             0xC: (0, self._reset),
             0xD: (1, self._set_base),
             0xE: (1, self._set_baud),
@@ -128,6 +132,9 @@ class AtiCanNode:
         }
         if tells_counts:
             self._requests[0x7] = (0, self._read_counts_per_unit)
+            self._requests[0x8] = (0, self._read_units)
+        if firmware[:2] >= _FIRST_WITH_DIAGNOSTICS:
+            self._requests[0x9] = (1, self._read_diagnostic)
 
     def receive(self, can_id: int, data: bytes) -> None:
         """Take a frame that somebody else sent."""
@@ -140,12 +147,27 @@ class AtiCanNode:
     def tick(self, now_s: float) -> None:
         """Nothing here takes time: the box only answers."""
 
+    def restart(self) -> None:
+        """Start anew, as its watchdog or a request has it."""
+        self._active = 0
+        self._was_reset = True
+        self._log("sensor", "reset")
+
+    def power_cycle(self) -> None:
+        """Take its power away and give it back."""
+        self._active = 0
+        self._was_reset = False
+        self._base = self._next_base
+        self._log("sensor", "power-up", base_id=self._base)
+
     def _reply(self, opcode: int, data: bytes) -> None:
         self._send(self._base << 4 | opcode, data)
 
     def _read_gauges(self, _: bytes) -> None:
         g0, g1, g2, g3, g4, g5 = self.gauges.read((self._measure(),), self.saturate)[0].tolist()
         status = self.status_bits & 0xFFFF
+        if self._was_reset:
+            status |= _WATCHDOG_RESET
         if self._active not in self._calibrations:
             status |= _BAD_CALIBRATION
         if status:
@@ -184,14 +206,13 @@ class AtiCanNode:
             self._reply(0x9, _WORD(_DIAGNOSTICS[data[0]]))
 
     def _reset(self, _: bytes) -> None:
-        self._active = 0
-        self._log("sensor", "reset")
+        self.restart()
 
     def _set_base(self, data: bytes) -> None:
         if data[0] > 0x7F:
             return
         self._reply(0xD, b"")
-        self._base = data[0]
+        self._next_base = data[0]
         self._log("sensor", "base identifier set", base_id=data[0])
 
     def _set_baud(self, data: bytes) -> None:

@@ -126,7 +126,8 @@ class AtiSerialDevice:
         self._write = write
         self._log = log
         self._unlocked = False
-        self._holding = _power_up(settings, self.gauges, rig.sensor.range)
+        self._at_power_up = _power_up(settings, self.gauges, rig.sensor.range)
+        self._holding = dict(self._at_power_up)
         self._unset = list(range(6))
         """Gauges whose gain or offset is not the calibration's."""
         self._partial = b""
@@ -154,6 +155,15 @@ class AtiSerialDevice:
         if self._jam >= _JAM_LENGTH:
             self.streaming = False
             self._log("sensor", "stream stopped")
+
+    def restart(self) -> None:
+        """Have its supply fail for a moment: it streams no more, and remembers no set-up."""
+        self.streaming = self._unlocked = False
+        self._holding = dict(self._at_power_up)
+        self._unset = list(range(6))
+        self._partial = b""
+        self._jam = 0
+        self._log("sensor", "restart")
 
     def tick(self, now_s: float) -> None:
         """Forget an incomplete request when the line has been silent for long."""

@@ -5,7 +5,7 @@ from functools import partial
 
 from rigd.sim.wire.canopen_objects import Abort, AbortCode, Entry, ObjectDictionary
 
-_WATCHES = 2
+WATCHES = 2
 _TOLERANCE_S = 1e-9
 
 
@@ -52,8 +52,7 @@ class HeartbeatWatch:
     @property
     def node_id(self) -> int:
         """Who is watched; 0 for nobody."""
-        value = self._entry.value
-        return value >> 16 & 0x7F if value & 0xFFFF else 0
+        return _watched(self._entry.value)
 
     def beat(self, now_s: float) -> None:
         """Take a heartbeat."""
@@ -69,29 +68,41 @@ class HeartbeatWatch:
         return self.lost
 
 
-def add_watches(objects: ObjectDictionary, restarted: Callable[[], None]) -> list[HeartbeatWatch]:
+def _watched(value: int) -> int:
+    return value >> 16 & 0x7F if value & 0xFFFF else 0
+
+
+def add_watches(
+    objects: ObjectDictionary, count: int, restarted: Callable[[], None]
+) -> list[HeartbeatWatch]:
     """Add object 1016, and return the watches that its entries set.
 
     Parameters
     ----------
     objects
         Gets the object.
+    count
+        How many nodes can be watched; with 0 there is no such object.
     restarted
         Called after a watch was set anew, and so is not lost.
     """
-    entries = {sub: Entry("I") for sub in range(1, _WATCHES + 1)}
+    entries = {sub: Entry("I") for sub in range(1, count + 1)}
     watches = [HeartbeatWatch(entry) for entry in entries.values()]
 
-    def check(value: int) -> None:
+    def check(entry: Entry, value: int) -> None:
         if value >> 24 or value >> 16 > 0x7F:
             raise Abort(AbortCode.VALUE)
+        others = {_watched(other.value) for other in entries.values() if other is not entry}
+        if _watched(value) and _watched(value) in others:
+            raise Abort(AbortCode.INCOMPATIBLE)
 
     def restart(watch: HeartbeatWatch) -> None:
         watch.restart()
         restarted()
 
     for entry, watch in zip(entries.values(), watches, strict=True):
-        entry.check = check
+        entry.check = partial(check, entry)
         entry.wrote = partial(restart, watch)
-    objects.add_record(0x1016, entries)
+    if entries:
+        objects.add_record(0x1016, entries)
     return watches

@@ -4,6 +4,7 @@ A mapping is turned into one :class:`struct.Struct` and a list of readers whenev
 that a PDO costs a few microseconds when it comes or goes.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from struct import Struct
@@ -11,7 +12,7 @@ from struct import Struct
 from rigd.sim.wire.canopen_objects import Abort, AbortCode, Entry, ObjectDictionary
 
 DISABLED = 0x8000_0000
-_MAX_ENTRIES = 8
+MAX_ENTRIES = 8
 _MAX_BITS = 64
 _LAST_SYNC_TYPE = 240
 _EVENT_TYPES = (254, 255)
@@ -44,6 +45,8 @@ class Pdo:
         At power-on, with `DISABLED` or not.
     mapped
         At power-on: index << 16 | sub-index << 8 | bits.
+    slots
+        How many entries it can carry at most.
     changed
         Called after identifier, type or mapping have changed.
 
@@ -66,6 +69,7 @@ class Pdo:
         mapping: int,
         cob_id: int,
         mapped: tuple[int, ...],
+        slots: int,
         changed: Callable[[], None],
     ) -> None:
         self._objects = objects
@@ -81,7 +85,7 @@ class Pdo:
         objects.add(mapping, self._count)
         self._slots = [
             objects.add(mapping, Entry("I", value, check=self._check_slot), sub)
-            for sub, value in enumerate(mapped + (0,) * (_MAX_ENTRIES - len(mapped)), 1)
+            for sub, value in enumerate((mapped + (0,) * slots)[:slots], 1)
         ]
         self.can_id = -1
         self.size = 0
@@ -92,7 +96,10 @@ class Pdo:
     def compile(self) -> None:
         """Get ready to carry what the dictionary says now."""
         slots = self._slots[: self._count.value]
-        self.entries = [self._mapped(slot.value) for slot in slots]
+        try:
+            self.entries = [self._mapped(slot.value) for slot in slots]
+        except Abort:  # at power-on: a device's file may map what it says cannot be mapped
+            self.entries = []
         self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
         self.size = self._struct.size
         on = self.entries and not self._cob_id.value & DISABLED
@@ -145,7 +152,7 @@ class Pdo:
     def _check_count(self, value: int) -> None:
         if not self._cob_id.value & DISABLED:
             raise Abort(AbortCode.STATE)
-        if value > _MAX_ENTRIES:
+        if value > len(self._slots):
             raise Abort(AbortCode.PDO_LENGTH)
         if sum(self._mapped(slot.value).bits for slot in self._slots[:value]) > _MAX_BITS:
             raise Abort(AbortCode.PDO_LENGTH)
@@ -202,14 +209,28 @@ class TransmitPdo(Pdo):
         """Start as on entering operational: every event is news."""
         self._syncs = 0
         self._last: bytes | None = None
-        self._sent_s = 0.0
+        self._sent_s = -math.inf
 
     def build(self) -> bytes:
         """Return the values as they are now."""
         return self._struct.pack(*[read() for read in self._readers])
 
-    def at_sync(self) -> bytes | None:
-        """Return what is to be sent at this SYNC, or None."""
+    def at_sync(self, now_s: float) -> bytes | None:
+        """Return what is to be sent at this SYNC, or None.
+
+        Some drives keep their inhibit time with the SYNC too, and so does this one. It begins when
+        the PDO has gone, a little after its SYNC: one SYNC later than that comes too early.
+        """
+        if self._inhibit.value:
+            if now_s - self._sent_s < 1e-4 * self._inhibit.value + 1e-9:
+                return None
+            data = self._of_sync()
+            if data is not None:
+                self._sent_s = now_s
+            return data
+        return self._of_sync()
+
+    def _of_sync(self) -> bytes | None:
         every = self._type.value
         if every == 1:
             return self.build()

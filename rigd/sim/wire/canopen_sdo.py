@@ -29,14 +29,15 @@ class SdoServer:
     reply
         Takes the eight bytes of an answer.
     wrote
-        Called with index, sub-index and number after each successful write.
+        Called after each successful write with index, sub-index, and what was written: a number, or
+        bytes in hexadecimal.
     """
 
     def __init__(
         self,
         objects: ObjectDictionary,
         reply: Callable[[bytes], None],
-        wrote: Callable[[int, int, int], None],
+        wrote: Callable[[int, int, int | str], None],
     ) -> None:
         self._objects = objects
         self._reply = reply
@@ -76,14 +77,14 @@ class SdoServer:
         command = data[0]
         entry = self._objects.find_writable(self._index, self._sub)
         if command & _EXPEDITED:
-            size = entry.bits // 8
+            size = min(entry.most_bytes, _EXPEDITED_SIZE)
             if command & _SIZE_GIVEN:
                 size = _EXPEDITED_SIZE - (command >> 2 & 0x03)
             self._write(data[4 : 4 + size])
         else:
-            # Every entry has one length, so that the segments need not be held against this one.
-            stated_bits = 8 * int.from_bytes(data[4:8], "little")
-            if command & _SIZE_GIVEN and stated_bits != entry.bits:
+            # A number has one length, so that the segments need not be held against this one.
+            stated = int.from_bytes(data[4:8], "little")
+            if command & _SIZE_GIVEN and not entry.fits(stated):
                 raise Abort(AbortCode.LENGTH)
             self._awaited = _DOWNLOAD_SEGMENT
         self._reply(_HEAD.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
@@ -91,7 +92,7 @@ class SdoServer:
     def _start_upload(self) -> None:
         value = self._objects.read(self._index, self._sub)
         size = len(value)
-        if size <= _EXPEDITED_SIZE:
+        if 0 < size <= _EXPEDITED_SIZE:
             head = _HEAD.pack(0x43 | (_EXPEDITED_SIZE - size) << 2, self._index, self._sub)
             self._reply(head + value.ljust(_EXPEDITED_SIZE, b"\0"))
             return
@@ -115,7 +116,7 @@ class SdoServer:
         else:
             self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command >> 1 & 0x07)]
             # No entry that can be written is longer: else a client could fill the memory.
-            if 8 * len(self._buffer) > self._objects.find_writable(self._index, self._sub).bits:
+            if len(self._buffer) > self._objects.find_writable(self._index, self._sub).most_bytes:
                 raise Abort(AbortCode.LENGTH)
             is_last = bool(command & _LAST_SEGMENT)
             if is_last:

@@ -6,25 +6,30 @@ drive off at once, and only the state follows later.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from enum import IntEnum
 from functools import partial
+from typing import TYPE_CHECKING
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.sim.devices import SimulatedRig
 from rigd.sim.wire.canopen_emergency import Emergencies
-from rigd.sim.wire.canopen_heartbeat import HeartbeatProducer, add_watches
+from rigd.sim.wire.canopen_heartbeat import WATCHES, HeartbeatProducer, add_watches
 from rigd.sim.wire.canopen_objects import ObjectDictionary
-from rigd.sim.wire.canopen_pdo import DISABLED, ReceivePdo, TransmitPdo
+from rigd.sim.wire.canopen_pdo import DISABLED, MAX_ENTRIES, ReceivePdo, TransmitPdo
 from rigd.sim.wire.canopen_sdo import SdoServer
 from rigd.sim.wire.drive_objects import (
     CYCLIC_SYNCHRONOUS_TORQUE,
     NO_MODE,
     add_drive_objects,
+    follow_file,
     peak_permille,
 )
 from rigd.sim.wire.drive_states import State, StateMachine
+
+if TYPE_CHECKING:
+    from rigd.sim.wire.canopen_eds import DeviceFile
 
 Log = Callable[..., None]
 
@@ -51,6 +56,7 @@ _OPERATE = 0x8F, 0x0F
 
 _LAST_COMMUNICATION_INDEX, _LAST_INDEX = 0x1FFF, 0xFFFF
 _PDOS = 4
+_LAST_PDO = 0x1FF
 _TOLERANCE_S = 1e-9
 
 
@@ -86,11 +92,25 @@ class DriveNode:
     sync_timeout_s
         After how long without a SYNC a drive in operation faults; by default
         `SYNC_TIMEOUT_PERIODS` of its SYNC period.
+    file
+        Of the drive that it is to be: it has the objects of that one, with their types, access
+        rights, limits and values at power-on, and no others.
 
     Attributes
     ----------
     frozen : bool
         It receives and sends nothing, as if its plug were out; its own watchdogs go on.
+    torque_lag_s : float
+        Time constant with which its actual torque (6077) follows what it exerts, as one that is
+        measured and filtered does; 0 shows it at once. The profile's ``torque_response_s``, until
+        it is set.
+    stays_operational : bool
+        It does not take the NMT command to pre-operational.
+    never_follows : bool
+        Its statusword has no bit 12, which says that the drive follows its target; by the
+        profile's ``follows_target_bit``, until it is set.
+    watchless : bool
+        It does not notice that its host is silent: no heartbeat, SYNC or RPDO is missed.
     angle_offset_counts : int
         Added to the position: an encoder that jumped.
     sto_dropped : bool
@@ -122,6 +142,7 @@ class DriveNode:
         send: Callable[[int, bytes], None],
         log: Log,
         sync_timeout_s: float | None = None,
+        file: "DeviceFile | None" = None,
     ) -> None:
         if rig.cia402 is None:
             raise DeviceError("Simulated drive: the profile has no section [cia402]; add one.")
@@ -132,6 +153,9 @@ class DriveNode:
             )
         self.frozen = False
         self.angle_offset_counts = 0
+        self.torque_lag_s = rig.cia402.torque_response_s
+        self.never_follows = not rig.cia402.follows_target_bit
+        self.stays_operational = self.watchless = False
         self._sto_dropped = False
         self._sto_error_code = rig.cia402.sto_error_code
         self._simulated = simulated
@@ -152,6 +176,8 @@ class DriveNode:
         self._last_sync_s = 0.0
         self._sync_alive = False
         self._permille = 0
+        self._measured_permille = 0.0
+        self._measured_at_s = 0.0
         self._mode = NO_MODE
         self._limited = self._following = self._too_fast = False
 
@@ -159,14 +185,15 @@ class DriveNode:
         own = self._own = add_drive_objects(objects, rig.motor, rig.cia402, rig.rate_hz)
         self._emergencies = Emergencies(objects, node_id, self._send_emergency)
         self._producer = HeartbeatProducer(objects)
-        self._watches = add_watches(objects, self._forgive_heartbeats)
+        watches = WATCHES if file is None else file.subs(0x1016)
+        self._watches = add_watches(objects, watches, self._forgive_heartbeats)
         self._receive_pdos = [
-            ReceivePdo(objects, 0x1400 + k, 0x1600 + k, *default, self._arm)
-            for k, default in enumerate(_defaults(0x200 + node_id, 0x6040))
+            ReceivePdo(objects, *pdo, self._arm)
+            for pdo in _pdos(0x1400, 0x200 + node_id, 0x6040, file)
         ]
         self._transmit_pdos = [
-            TransmitPdo(objects, 0x1800 + k, 0x1A00 + k, *default, self._arm)
-            for k, default in enumerate(_defaults(0x180 + node_id, 0x6041))
+            TransmitPdo(objects, *pdo, self._arm)
+            for pdo in _pdos(0x1800, 0x180 + node_id, 0x6041, file)
         ]
         self._sdo = SdoServer(objects, partial(self._transmit, 0x580 + node_id), self._wrote)
 
@@ -177,7 +204,7 @@ class DriveNode:
         own.mode_display.live = own.mode.get
         own.position.live = self._position
         own.velocity.live = self._velocity
-        own.actual_torque.live = lambda: self._permille
+        own.actual_torque.live = self._actual_torque
         for entry in (
             own.target_torque,
             own.torque_offset,
@@ -194,6 +221,8 @@ class DriveNode:
             may_enable=lambda: self._nmt is Nmt.OPERATIONAL and self._is_guarded(),
             may_reset=self._may_reset,
         )
+        if file is not None:
+            follow_file(objects, file)
         self._compile()
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -218,9 +247,10 @@ class DriveNode:
         self._now_s = now_s
         if self._nmt is Nmt.INITIALISING:
             self._boot()
-        self._watch_heartbeats(now_s)
-        self._watch_sync(now_s)
-        self._watch_rpdos(now_s)
+        if not self.watchless:
+            self._watch_heartbeats(now_s)
+            self._watch_sync(now_s)
+            self._watch_rpdos(now_s)
         self._machine.tick(now_s)
         if self._producer.is_due(now_s):
             self._transmit(0x700 + self._node_id, bytes([self._nmt]))
@@ -233,6 +263,10 @@ class DriveNode:
     def emergency(self, code: int, register: int, vendor: bytes) -> None:
         """Have the drive fail with an error code, bits of the error register, vendor's bytes."""
         self._fail(code, register, vendor)
+
+    def restart(self) -> None:
+        """Have its supply fail for a moment: it boots, and remembers nothing."""
+        self._boot()
 
     @property
     def sto_dropped(self) -> bool:
@@ -273,6 +307,8 @@ class DriveNode:
         if len(data) != 2 or data[1] not in (0, self._node_id):
             return
         command = data[0]
+        if command == 128 and self.stays_operational:
+            return
         if command == 1:
             self._enter_nmt(Nmt.OPERATIONAL)
         elif command in (2, 128):
@@ -327,6 +363,8 @@ class DriveNode:
             if revived:
                 self._refresh_torque()
         self._advance()
+        if self.torque_lag_s:
+            self._measure_torque()
         if operational:
             limit_rad_s = self._own.max_speed_rpm.value * self._rad_s_per_rpm
             too_fast = not -limit_rad_s <= self._plant.velocity_rad_s <= limit_rad_s
@@ -334,22 +372,24 @@ class DriveNode:
                 self._too_fast = too_fast
                 self._refresh_torque()
             for tpdo in self._sync_tpdos:
-                sample = tpdo.at_sync()
+                sample = tpdo.at_sync(self._now_s)
                 if sample is not None:
                     self._transmit(tpdo.can_id, sample)
 
     def _on_rpdo(self, pdo: ReceivePdo, data: bytes) -> None:
         if self._nmt is not Nmt.OPERATIONAL:
             return
-        if len(data) != pdo.size:
-            code = _PDO_TOO_SHORT if len(data) < pdo.size else _PDO_TOO_LONG
+        if len(data) < pdo.size:
             vendor = bytes([len(data), pdo.size])
             if self._machine.state is State.OPERATION_ENABLED:
-                self._fail(code, _COMMUNICATION, vendor)
+                self._fail(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
             else:
-                self._report(code, _COMMUNICATION, vendor)
+                self._report(_PDO_TOO_SHORT, _COMMUNICATION, vendor)
             return
-        if self._emergencies.active:
+        if len(data) > pdo.size:  # the first bytes count (CiA 301)
+            self._report(_PDO_TOO_LONG, _COMMUNICATION, bytes([len(data), pdo.size]))
+            data = data[: pdo.size]
+        elif self._emergencies.active:
             self._clear(_PDO_TOO_SHORT, _PDO_TOO_LONG)
         pdo.received_s = self._now_s
         if pdo.is_synchronous:
@@ -374,7 +414,7 @@ class DriveNode:
         if not self.frozen:
             self._send(can_id, data)
 
-    def _wrote(self, index: int, sub: int, value: int) -> None:
+    def _wrote(self, index: int, sub: int, value: int | str) -> None:
         self._log("sdo write", index=f"{index:04X}", sub=sub, value=value)
 
     def _compile(self) -> None:
@@ -531,8 +571,8 @@ class DriveNode:
         )
         wanted = own.target_torque.value + own.torque_offset.value if self._following else 0
         limit = min(own.max_torque.value, self._peak_permille)
-        high = min(limit, own.positive_limit.value)
-        low = -min(limit, own.negative_limit.value)
+        high = min(limit, abs(own.positive_limit.value))
+        low = -min(limit, abs(own.negative_limit.value))  # some drives have it with its sign
         permille = low if wanted < low else min(wanted, high)
         if self._too_fast and permille * self._direction * self._plant.velocity_rad_s > 0:
             permille = 0
@@ -548,7 +588,7 @@ class DriveNode:
         word = state.bits | (_REMOTE if self._sto_dropped else _VOLTAGE_AND_REMOTE)
         if state is State.OPERATION_ENABLED:
             if self._following:
-                word |= _FOLLOWS
+                word |= 0 if self.never_follows else _FOLLOWS
             elif self._own.controlword.value & _HALT and self._stands():
                 word |= _STANDING
             if self._limited:
@@ -568,14 +608,33 @@ class DriveNode:
         counts = steps * self._direction + self.angle_offset_counts
         return (counts + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
 
+    def _measure_torque(self) -> None:
+        elapsed_s, self._measured_at_s = self._now_s - self._measured_at_s, self._now_s
+        share = -math.expm1(-elapsed_s / self.torque_lag_s)
+        self._measured_permille += share * (self._permille - self._measured_permille)
+
+    def _actual_torque(self) -> int:
+        return round(self._measured_permille) if self.torque_lag_s else self._permille
+
     def _velocity(self) -> int:
         counts = round(self._plant.velocity_rad_s / self._resolution_rad) * self._direction
         return max(-0x8000_0000, min(counts, 0x7FFF_FFFF))
 
 
-def _defaults(cob_id: int, index: int) -> list[tuple[int, tuple[int, ...]]]:
-    """Return identifiers and mappings of the PDOs at power-on: the first carries one word."""
-    others: list[tuple[int, tuple[int, ...]]] = [
-        (DISABLED | cob_id + 0x100 * number, ()) for number in range(1, _PDOS)
-    ]
-    return [(cob_id, (index << 16 | 16,)), *others]
+def _pdos(
+    communication: int, cob_id: int, word: int, file: "DeviceFile | None"
+) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
+    """Yield the PDOs of one direction: both indices, identifier, mapping and room for entries.
+
+    The first carries one word. Of a drive with a file there are those that the file has; only the
+    first four have identifiers beforehand.
+    """
+    numbers: Iterable[int] = range(_PDOS)
+    if file is not None:
+        numbers = file.numbers(communication, communication + _LAST_PDO)
+    for number in numbers:
+        mapping = communication + 0x200 + number
+        slots = MAX_ENTRIES if file is None else file.subs(mapping)
+        given = cob_id + 0x100 * number if number < _PDOS else 0
+        mapped = () if number else (word << 16 | 16,)
+        yield communication + number, mapping, given | (DISABLED if number else 0), mapped, slots

@@ -6,11 +6,15 @@ the drive's own direction.
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Motor, ServoDrive
 from rigd.sim.wire.canopen_objects import Abort, AbortCode, Entry, ObjectDictionary
 from rigd.sim.wire.canopen_pdo import is_free_id
+
+if TYPE_CHECKING:
+    from rigd.sim.wire.canopen_eds import DeviceFile
 
 NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE = 0, 10
 
@@ -19,6 +23,13 @@ _VENDOR_ID, _PRODUCT_CODE, _REVISION, _SERIAL_NUMBER = 0x5249_4744, 0x402, 0x000
 _DEVICE_NAME = b"simulated servo drive"
 _SOFTWARE_VERSION = b"1"
 _SUPPORTED_MODES = 1 << (CYCLIC_SYNCHRONOUS_TORQUE - 1)
+
+_SUPPORTED_INDEX, _TARGET_INDEX = 0x6502, 0x6071
+_IDENTITY = 0x1018
+_IN_SERVICE = (0x6076,)
+"""Whoever puts a drive into service tells it its motor: no file knows it."""
+_NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
+"""Limits; with one of zero no drive would turn."""
 
 _TORQUE_UNIT_NM = 1e-3
 """Of object 6076 where the profile does not state one."""
@@ -119,7 +130,12 @@ def add_drive_objects(
     add(0x605B, Entry("h", 0, low=0, high=1))
     add(0x605C, Entry("h", 0, low=0, high=1))
     add(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))
-    add(0x6502, Entry("I", _SUPPORTED_MODES, "ro"))
+    supported = add(_SUPPORTED_INDEX, Entry("I", _SUPPORTED_MODES, "ro"))
+
+    def check_mode(value: int) -> None:
+        if value != NO_MODE and not (value > 0 and supported.value >> (value - 1) & 1):
+            raise Abort(AbortCode.VALUE)
+
     interpolation = {1: Entry("B", max(1, round(1e3 / rate_hz)), low=1)}
     interpolation[2] = Entry("b", -3, low=-6, high=0)
     objects.add_record(0x60C2, interpolation)
@@ -134,7 +150,7 @@ def add_drive_objects(
         statusword=add(0x6041, Entry("H", 0, "ro", "t")),
         quick_stop_option=add(0x605A, Entry("h", 2, check=_check_quick_stop)),
         fault_option=add(0x605E, Entry("h", 0, low=0, high=2)),
-        mode=add(0x6060, Entry("b", NO_MODE, mapping="rt", check=_check_mode)),
+        mode=add(0x6060, Entry("b", NO_MODE, mapping="rt", check=check_mode)),
         mode_display=add(0x6061, Entry("b", NO_MODE, "ro", "t")),
         position=add(0x6064, Entry("i", 0, "ro", "t")),
         velocity=add(0x606C, Entry("i", 0, "ro", "t")),
@@ -150,6 +166,40 @@ def add_drive_objects(
     )
 
 
+def follow_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
+    """Have the objects that a drive's file has, and their values at power-on.
+
+    What the file does not tell, or cannot, is as without one: rated torque, limits of zero, and
+    identity. A file that does not tell the modes is taken to mean cyclic synchronous torque where
+    it has a target torque.
+
+    Raises
+    ------
+    DeviceError
+        If the file's type of the rated torque cannot hold this motor's.
+    """
+    rated = objects[0x6076, 0].value
+    own = set(_IN_SERVICE)
+    own |= {
+        index
+        for index in (*_NOT_TOLD_BY_ZERO, _SUPPORTED_INDEX)
+        if (said := file.entries.get((index, 0))) is not None and not said.default
+    }
+    if not any(file.entries[key].default for key in file.entries if key[0] == _IDENTITY and key[1]):
+        own.add(_IDENTITY)
+    objects.follow(file.entries, own)
+    if (_SUPPORTED_INDEX, 0) in file.entries and _SUPPORTED_INDEX in own:
+        supported = objects[_SUPPORTED_INDEX, 0]
+        supported.value = supported.default = (
+            _SUPPORTED_MODES if (_TARGET_INDEX, 0) in file.entries else 0
+        )
+    if (0x6076, 0) in file.entries and objects[0x6076, 0].value != rated:
+        raise DeviceError(
+            f"Simulated drive: object 6076 of {file.name} cannot hold the rated torque, {rated}; "
+            "check cia402.rated_torque_unit_nm."
+        )
+
+
 def _check_sync_id(value: int) -> None:
     # Bit 30 would make the drive the producer, bit 29 the identifier a long one.
     if value > 0x7FF or not is_free_id(value):
@@ -158,9 +208,4 @@ def _check_sync_id(value: int) -> None:
 
 def _check_quick_stop(value: int) -> None:
     if value not in _QUICK_STOP_OPTIONS:
-        raise Abort(AbortCode.VALUE)
-
-
-def _check_mode(value: int) -> None:
-    if value not in (NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE):
         raise Abort(AbortCode.VALUE)

@@ -85,7 +85,15 @@ KINDS: dict[str, dict[str, _Key]] = {
     "status": {"bits": _whole(0, 0xFFFF, needed=True), "for": _FOR},
     "jump": {"counts": _whole(-(2**31), 2**31 - 1, needed=True)},
     "cut": {"device": _one_of("bus", "sensor", default="bus")},
+    "restart": {"device": _DEVICE},
+    "lag": {"ms": _positive(needed=True), "for": _FOR},
+    "no_pre_operational": {"for": _FOR},
+    "no_bit_12": {"for": _FOR},
+    "no_watch": {"for": _FOR},
 }
+LASTING = tuple(kind for kind in KINDS if kind not in ("emcy", "jump", "restart"))
+"""What goes on until it ends by itself or is ended."""
+KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +223,12 @@ class Line:
     def add(self, fault: Fault) -> None:
         """Let a fault act from now on."""
         self._active.append(_Active(fault))
+
+    def end(self, kind: str | None) -> list[str]:
+        """Let the faults of a kind, or all, act no more; return the kinds of those that did."""
+        over = [fault for fault in self._active if kind in (None, fault.kind)]
+        self._active = [fault for fault in self._active if fault not in over]
+        return [fault.kind for fault in over]
 
     def send(self, can_id: int, data: bytes, origin: object = None) -> None:
         """Let a frame, or a record of a serial line, go the way of this line."""

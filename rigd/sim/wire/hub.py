@@ -78,14 +78,18 @@ class Hub:
         self._clients: list[_Client] = []
         self._count = 0
         self.lost = 0
-        self._listener = listen(path)
         self._path = path
-        handlers[self._listener.fileno()] = self._accept
+        self.open()
 
     @property
     def clients(self) -> int:
         """How many are connected."""
         return len(self._clients)
+
+    def open(self) -> None:
+        """Let clients connect, at first and after `close`."""
+        self._listener = listen(self._path)
+        self._handlers[self._listener.fileno()] = self._accept
 
     def send(self, frame: bytes, origin: object = None) -> None:
         """Send a frame to all clients but the one that it comes from."""
@@ -167,8 +171,18 @@ class VirtualCan:
 
     clients = 1
     """Who listens on such a bus is not known."""
+    lost = 0
 
     def __init__(self, channel: str, handlers: Handlers, on_frames: OnFrames) -> None:
+        self._channel = channel
+        self._serve(self._bound(), handlers, on_frames)
+
+    def open(self) -> None:
+        """Take part in the bus again, after `close`."""
+        self._serve(self._bound(), self._handlers, self._on_frames)
+
+    def _bound(self) -> socket.socket:
+        channel = self._channel
         try:
             link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except (AttributeError, OSError):
@@ -181,14 +195,13 @@ class VirtualCan:
                 f"CAN bus {channel}: it cannot be opened ({error.strerror}); bring it up with: "
                 f"ip link set {channel} up"
             ) from None
-        self._serve(link, handlers, on_frames)
+        return link
 
     def _serve(self, link: socket.socket, handlers: Handlers, on_frames: OnFrames) -> None:
         link.setblocking(False)
         self._link = link
         self._handlers = handlers
         self._on_frames = on_frames
-        self.lost = 0
         handlers[link.fileno()] = self._receive
 
     def send(self, frame: bytes, origin: object = None) -> None:

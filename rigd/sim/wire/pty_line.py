@@ -42,13 +42,17 @@ class PtyLine:
         self._handlers = handlers
         self._on_bytes = on_bytes
         self._on_open = on_open
+        self.lost = 0
+        self.open()
+
+    def open(self) -> None:
+        """Make the line, at first and after `close`; its port may get another name."""
         self._ours, theirs = os.openpty()
         tty.setraw(theirs)
         self.port = os.ttyname(theirs)
         os.close(theirs)
         os.set_blocking(self._ours, False)
         self._open = False
-        self.lost = 0
 
     def write(self, data: bytes) -> None:
         """Send bytes; those that the host does not take are gone."""

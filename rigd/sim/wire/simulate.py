@@ -5,6 +5,7 @@ The operator's commands come over the control socket.
 """
 
 import gc
+import math
 import os
 import select
 import time
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
@@ -27,6 +28,9 @@ from rigd.sim.wire.lone_process import only_one, socket_folder, stop_requested
 from rigd.sim.wire.pty_line import PtyLine
 from rigd.sim.wire.transport import without_transport
 from rigd.sim.wire.world import World
+
+if TYPE_CHECKING:
+    from rigd.sim.wire.canopen_eds import DeviceFile
 
 __all__ = [
     "DeviceError",
@@ -53,6 +57,8 @@ class SimulatorOptions:
     faults: tuple[Fault, ...] = ()
     quiet: bool = False
     """Tell nothing on the terminal."""
+    eds: Path | None = None
+    """The manufacturer's file of the drive that is simulated; by default the profile's, if any."""
 
 
 def check_on_wire(rig: RigParameters) -> None:
@@ -144,6 +150,13 @@ class _Process:
         self._log = log
         self._stack = stack
         self._handlers: Handlers = {}
+        self._file: DeviceFile | None = None
+        assert rig.cia402 is not None
+        eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
+        if eds is not None:
+            from rigd.sim.wire.canopen_eds import read_eds
+
+            self._file = read_eds(eds, rig.cia402.node_id)
         folder = stack.enter_context(socket_folder(rig.name))
         self._bus: Hub | VirtualCan
         can_socket = ""
@@ -164,7 +177,7 @@ class _Process:
             pid=os.getpid(),
             control_socket=str(folder / f"{rig.name}.control"),
             can_socket=can_socket,
-            serial_port="" if self._line is None else self._line.port,
+            serial_port=self._port,
             lock_step=options.lock_step,
             rig=described(rig),
         )
@@ -179,6 +192,7 @@ class _Process:
             "started",
             rig=self._rig.name,
             lock_step=self._options.lock_step,
+            **({} if self._file is None else {"eds": self._file.name}),
             **started,
         )
         for line in self._invitation():
@@ -231,6 +245,7 @@ class _Process:
             send=self._bus.send,
             write=_nowhere if line is None else line.write,
             cut=self._cut,
+            mend=self._mend,
             log=self._log,
         )
         assert rig.cia402 is not None
@@ -240,8 +255,8 @@ class _Process:
             world.step,
             world.can_port("drive"),
             self._log,
-            # How long a drive bears silence is not known: as long as its heartbeat may stay away.
-            sync_timeout_s=rig.cia402.heartbeat_timeout_s,
+            sync_timeout_s=self._sync_timeout_s(),
+            file=self._file,
         )
         world.join("drive", drive)
         if rig.ati_serial is not None:
@@ -254,6 +269,17 @@ class _Process:
             world.join("sensor", AtiCanNode(rig, simulated, world.can_port("sensor"), self._log))
         return world
 
+    def _sync_timeout_s(self) -> float:
+        """How long the drive bears that no SYNC comes."""
+        drive = self._rig.cia402
+        assert drive is not None
+        if drive.own_watchdog_s:
+            return drive.own_watchdog_s
+        if self._file is not None and (0x1006, 0) not in self._file.entries:
+            return math.inf  # it is not told when to expect one
+        # How long others bear it is not known: as long as its heartbeat may stay away.
+        return drive.heartbeat_timeout_s
+
     def _invitation(self) -> Iterator[str]:
         address, rig = self._address, self._rig
         assert rig.can is not None
@@ -262,6 +288,9 @@ class _Process:
         yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
         if address.serial_port:
             yield f"  serial   {address.serial_port}"
+        if self._file is not None:
+            objects = len({index for index, _ in self._file.entries})
+            yield f"  drive    as {self._file.name} has it, {objects} objects"
         fast = " --fast" if address.lock_step else ""
         yield f"  session  rigd run chirp --profile {rig.name}{fast}"
         yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
@@ -286,17 +315,31 @@ class _Process:
         elif self._line is not None:
             self._line.close()
 
+    def _mend(self, device: str) -> None:
+        if device == "bus":
+            self._bus.open()
+        elif self._line is not None:
+            self._line.open()
+            # The line may be another one now: whoever comes has to find it.
+            self._address = replace(self._address, serial_port=self._port)
+            announce(self._rig.name, self._address)
+
+    @property
+    def _port(self) -> str:
+        return "" if self._line is None else self._line.port
+
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
         if "inject" in request:
             try:
                 fault = parse_fault(str(request["inject"]))
                 self._world.inject(fault)
-            except FaultError as error:
+            except (FaultError, DeviceError) as error:
                 return {"error": str(error)}
             return {"injected": str(fault)}
         if "status" in request:
             return {
                 "rig": self._rig.name,
+                "drive": "default" if self._file is None else self._file.name,
                 "time_s": round(self._world.now_s, 6),
                 "lock_step": self._options.lock_step,
                 "moved_periods": self._world.moved,

@@ -7,6 +7,7 @@ callables. So the same world runs behind sockets and in a test.
 import heapq
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
@@ -24,12 +25,21 @@ _RECORD_SIZE = 13
 _WORDS_ON_CAN = ("id",)
 _WORDS_ON_SERIAL = ("bytes",)
 _CAN_BYTES = 8
+_TRAITS = {
+    "no_pre_operational": "stays_operational",
+    "no_bit_12": "never_follows",
+    "no_watch": "watchless",
+}
+"""What the drive may be like, and by which of its attributes."""
 
 
 class Node(Protocol):
     """A device on the simulated CAN bus."""
 
     frozen: bool
+
+    def restart(self) -> None:
+        """Start as at power-on."""
 
     def receive(self, can_id: int, data: bytes) -> None:
         """Take a frame that somebody else sent."""
@@ -43,6 +53,9 @@ class SerialDevice(Protocol):
 
     frozen: bool
 
+    def restart(self) -> None:
+        """Start as at power-on."""
+
     def receive(self, data: bytes) -> None:
         """Take bytes that the host sent."""
 
@@ -51,6 +64,17 @@ class SerialDevice(Protocol):
 
     def tick(self, now_s: float) -> None:
         """Let simulated time pass."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Standing:
+    """A fault that holds an attribute of a device."""
+
+    fault: Fault
+    device: Any
+    attribute: str
+    value: object
+    normal: object
 
 
 class World:
@@ -68,8 +92,8 @@ class World:
         Takes a frame for the hosts on the CAN bus, and which of them sent it (None: a node).
     write
         Takes bytes for the host on the serial line.
-    cut
-        Cuts the "bus" or the line of the "sensor".
+    cut, mend
+        Cuts the "bus" or the line of the "sensor", and puts it together again.
     log
         Takes the events; its time is set here.
 
@@ -96,6 +120,7 @@ class World:
         send: Callable[[bytes, object], None],
         write: Callable[[bytes], None],
         cut: Callable[[str], None],
+        mend: Callable[[str], None],
         log: EventLog,
     ) -> None:
         self._simulated = simulated
@@ -107,6 +132,7 @@ class World:
         self._send = send
         self._write = write
         self._cut = cut
+        self._mend = mend
         self._log = log
         self._nodes: dict[str, Node] = {}
         self._serial: SerialDevice | None = None
@@ -123,6 +149,8 @@ class World:
         self._postponed: list[tuple[float, int, Callable[[], None]]] = []
         self._planned: list[tuple[float, int, Callable[[], None]]] = []
         self._awaiting_drive: list[Fault] = []
+        self._standing: list[_Standing] = []
+        self._cut_lines: dict[str, Fault] = {}
         self._enabled_s: float | None = None
         self.periods = 0
         self.moved = 0
@@ -309,8 +337,6 @@ class World:
         device = values.get("device", values.get("from", "drive"))
         if fault.kind in ("saturate", "status"):
             device = "sensor"
-        elif fault.kind in ("sto", "busoff"):
-            device = "drive"
         on_serial = self._serial is not None and device == "sensor"
         if device in ("drive", "sensor") and device not in self._nodes and not on_serial:
             raise FaultError(f"Fault '{fault}': this rig has no {device} on its lines.")
@@ -339,35 +365,68 @@ class World:
         if fault.kind in LINE_KINDS:
             self._lines[values["from"]].add(fault)
         elif fault.kind == "freeze":
-            self._set_for(fault, drive if values["device"] == "drive" else sensor, "frozen", True)
+            self._stand(fault, drive if values["device"] == "drive" else sensor, "frozen", True)
         elif fault.kind == "saturate":
-            self._set_for(fault, sensor, "saturate", values["gauge"])
+            self._stand(fault, sensor, "saturate", values["gauge"])
         elif fault.kind == "status":
-            self._set_for(fault, sensor, "status_bits", values["bits"])
+            self._stand(fault, sensor, "status_bits", values["bits"])
         elif fault.kind == "emcy":
             drive.emergency(values["code"], values["register"], bytes(5))
         elif fault.kind == "sto":
-            self._set_for(fault, drive, "sto_dropped", True)
+            self._stand(fault, drive, "sto_dropped", True)
         elif fault.kind == "busoff":
             self._send(BUS_OFF_FRAME, None)
-            self._set_for(fault, self, "bus_off", True)
+            self._stand(fault, self, "bus_off", True)
         elif fault.kind == "jump":
             drive.angle_offset_counts += values["counts"]
+        elif fault.kind == "restart":
+            (drive if values["device"] == "drive" else sensor).restart()
+        elif fault.kind == "lag":
+            self._stand(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
+        elif fault.kind in _TRAITS:
+            self._stand(fault, drive, _TRAITS[fault.kind], True)
+        elif fault.kind == "end":
+            self._end(values.get("fault"))
         else:
+            self._cut_lines[values["device"]] = fault
             self._cut(values["device"])
         self._let_hear()
 
-    def _set_for(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
-        """Set an attribute of a device, and set it back if the fault has an end."""
-        before = getattr(device, attribute)
+    def _stand(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
+        """Let a fault hold an attribute of a device, until it ends."""
+        others = [s for s in self._standing if (s.device, s.attribute) == (device, attribute)]
+        normal = others[0].normal if others else getattr(device, attribute)
+        standing = _Standing(fault, device, attribute, value, normal)
+        self._standing.append(standing)
         setattr(device, attribute, value)
         if "for" in fault.values:
+            end_s = self.now_s + float(fault.values["for"])
+            self._plan(end_s, partial(self._end_one, standing))
 
-            def end() -> None:
-                setattr(device, attribute, before)
+    def _end_one(self, standing: "_Standing") -> None:
+        """Let the attribute be what the latest of the others that hold it wants, or normal."""
+        if standing not in self._standing:  # it was ended before its time
+            return
+        self._standing.remove(standing)
+        value = standing.normal
+        for other in self._standing:
+            if (other.device, other.attribute) == (standing.device, standing.attribute):
+                value = other.value
+        setattr(standing.device, standing.attribute, value)
+        self._log("simulator", "fault over", fault=str(standing.fault))
+
+    def _end(self, kind: str | None) -> None:
+        """End all faults of a kind, or all there are."""
+        for line in self._lines.values():
+            for ended in line.end(kind):
+                self._log("simulator", "fault over", fault=ended)
+        for standing in [s for s in self._standing if kind in (None, s.fault.kind)]:
+            self._end_one(standing)
+        if kind in (None, "cut"):
+            cut, self._cut_lines = self._cut_lines, {}
+            for device, fault in cut.items():
+                self._mend(device)
                 self._log("simulator", "fault over", fault=str(fault))
-
-            self._plan(self.now_s + float(fault.values["for"]), end)
 
     def _plan(self, when_s: float, action: Callable[[], None]) -> None:
         self._order += 1

@@ -18,7 +18,10 @@ from rigd.devices.canbus import CanExchange
 BASE = 0x68
 GAUGES = (100, -2000, 300, 4000, -5, 6000)
 MATRIX = tuple(
-    tuple(0.5 * (7 * axis + gauge + 1) * (-1) ** (axis + gauge) for gauge in range(6))
+    tuple(
+        0.5 * (7 * axis + gauge + 1) * (-1) ** (axis + gauge) + 100.0 * (axis == gauge)
+        for gauge in range(6)
+    )
     for axis in range(6)
 )
 

@@ -39,8 +39,8 @@ def calibration(**changes):
     [(1, 4.4482216), (2, 1.0), (3, 4448.2216), (4, 1000.0), (5, 9.80665), (6, 9.80665e-3)],
 )
 def test_force_units(code, newton):
-    rows = calibration(force_unit=code).wrench_per_count()
-    assert rows[2][2] == pytest.approx(newton, rel=1e-8)
+    rows = calibration(force_unit=code, counts_per_force=1000).wrench_per_count()
+    assert rows[2][2] == pytest.approx(1e-3 * newton, rel=1e-8)
     assert rows[3][3] == 1.0
 
 
@@ -49,8 +49,8 @@ def test_force_units(code, newton):
     [(1, 0.112984829), (2, 1.35581795), (3, 1.0), (4, 1e-3), (5, 0.0980665), (6, 1000.0)],
 )
 def test_torque_units(code, newton_metre):
-    rows = calibration(torque_unit=code).wrench_per_count()
-    assert rows[5][5] == pytest.approx(newton_metre, rel=1e-8)
+    rows = calibration(torque_unit=code, counts_per_torque=1000).wrench_per_count()
+    assert rows[5][5] == pytest.approx(1e-3 * newton_metre, rel=1e-8)
     assert rows[0][0] == 1.0
 
 
@@ -80,7 +80,7 @@ def test_counts_that_are_not_positive_are_refused(counts):
 def test_a_matrix_with_entries_that_are_no_numbers_is_refused(entry):
     rows = [list(row) for row in ONES]
     rows[4][1] = entry
-    with pytest.raises(ValueError, match=r"row Ty .* no numbers"):
+    with pytest.raises(ValueError, match=r"entry Ty, gauge 1 .* no number"):
         calibration(matrix=tuple(map(tuple, rows)))
 
 
@@ -89,6 +89,50 @@ def test_a_matrix_with_an_empty_row_is_refused():
         calibration(matrix=((0.0,) * 6,) * 6)
     with pytest.raises(ValueError, match=r"row Tz .* zero"):
         calibration(matrix=(*ONES[:5], (0.0,) * 6))
+
+
+@pytest.mark.parametrize(
+    ("axis", "entry", "says"),
+    [
+        (0, 1e35, r"entry Fx, gauge 2 .* 1e\+35 .*more than any sensor has \(1e\+06 N\)"),
+        (5, -1e35, r"entry Tz, gauge 2 .* -1e\+35 .*more than any sensor has \(1e\+06 N·m\)"),
+        (3, 31.0, r"entry Tx, gauge 2 .* 31 "),
+    ],
+)
+def test_an_entry_that_no_sensor_has_is_named(axis, entry, says):
+    rows = [list(row) for row in ONES]
+    rows[axis][2] = entry
+    with pytest.raises(ValueError, match=says):
+        calibration(matrix=tuple(map(tuple, rows)))
+
+
+def test_an_entry_just_within_what_a_sensor_may_have_is_taken():
+    rows = [list(row) for row in ONES]
+    rows[3][2] = 30.0
+    calibration(matrix=tuple(map(tuple, rows)))
+
+
+def test_a_row_of_next_to_nothing_is_named():
+    tiny = tuple(1e-30 * entry for entry in ONES[1])
+    with pytest.raises(ValueError, match=r"row Fy .* beyond 1e-30 "):
+        calibration(matrix=(ONES[0], tiny, *ONES[2:]))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, -25.0])
+def test_a_matrix_that_cannot_tell_two_loads_apart_is_refused(scale):
+    copied = tuple(scale * entry for entry in ONES[2])
+    with pytest.raises(ValueError, match="is singular"):
+        calibration(matrix=(*ONES[:3], copied, *ONES[4:]))
+    with pytest.raises(ValueError, match="is singular"):  # a gauge that counts for nothing
+        calibration(matrix=(*ONES[:5], ONES[0]))
+
+
+@given(st.lists(st.floats(1e-4, 1e4), min_size=6, max_size=6), st.permutations(range(6)))
+def test_axes_and_gauges_of_any_size_and_order_are_taken(sizes, order):
+    rows = [
+        [size * 1e-3 * entry for entry in ONES[k]] for size, k in zip(sizes, order, strict=True)
+    ]
+    calibration(matrix=tuple(map(tuple, rows)))
 
 
 def test_the_range_is_given_in_newtons():
@@ -112,12 +156,12 @@ gauges = st.integers(-32768, 32767)
 @settings(max_examples=60)
 @given(
     matrix=st.lists(st.lists(entries, min_size=6, max_size=6), min_size=6, max_size=6),
-    counts=st.tuples(st.integers(1, 2**31 - 1), st.integers(1, 2**31 - 1)),
+    counts=st.tuples(st.integers(10**5, 2**31 - 1), st.integers(10**5, 2**31 - 1)),
     readings=st.lists(gauges, min_size=6, max_size=6),
 )
 def test_the_wrench_is_matrix_times_gauges_over_counts(matrix, counts, readings):
     for axis, row in enumerate(matrix):
-        row[axis] = row[axis] or 1.0
+        row[axis] = 3e5  # none of them is a combination of the others
     found = calibration(
         matrix=tuple(map(tuple, matrix)), counts_per_force=counts[0], counts_per_torque=counts[1]
     )
@@ -183,7 +227,7 @@ def test_any_calibration_block_is_read_or_refused_in_words(registers, sound_unit
     try:
         block = parse_block(registers)
     except ValueError as error:
-        assert str(error).endswith("calibration.")
+        assert str(error).endswith(("calibration.", "sensor repaired."))
     else:
         assert all(map(math.isfinite, sum(block.calibration.wrench_per_count(), ())))
         json.dumps(replace(block.calibration).as_dict(), allow_nan=False)

@@ -114,13 +114,40 @@ def test_the_wrench_is_the_matrix_times_the_gauges(bench, fakes):
     assert bench.sensor.wrench_time_ns == bench.sensor.polls.sent_ns > 0
 
 
-@pytest.mark.parametrize("firmware", [(3, 7, 9), (2, 9, 0)])
-def test_older_firmware_is_not_asked_for_its_counts(bench, fakes, firmware):
+@pytest.mark.parametrize("firmware", [(3, 6, 9), (2, 9, 0)])
+def test_older_firmware_is_not_asked_for_its_counts_or_units(bench, fakes, firmware):
     bench.fake.firmware = firmware
-    bench.fake.silent_to = {7}
+    bench.fake.units = (1, 1)
     bench.sensor.connect()
+    assert not {7, 8} & {opcode for opcode, _ in bench.fake.asked}
     wanted = expected_wrench(fakes, fakes.GAUGES, (1_000_000, 1_000_000))
     assert bench.tick() == pytest.approx(wanted, rel=1e-12)
+    said = bench.sensor.calibration()
+    assert (said["force_unit"], said["torque_unit"]) == ("N", "N·m")
+    assert "3.7" in said["assumed"]
+
+
+@pytest.mark.parametrize("firmware", [(3, 7, 0), (3, 7, 9), (3, 8, 0), (4, 0, 0)])
+def test_firmware_from_3_7_on_tells_its_counts_and_units(bench, fakes, firmware):
+    bench.fake.firmware = firmware
+    bench.fake.counts = (2_000_000, 2_000_000)
+    bench.sensor.connect()
+    wanted = expected_wrench(fakes, fakes.GAUGES, (2_000_000, 2_000_000))
+    assert bench.tick() == pytest.approx(wanted, rel=1e-12)
+    assert "assumed" not in bench.sensor.calibration()
+
+
+def test_the_serial_number_is_that_of_the_selected_calibration(fakes, can_rig):
+    bench = Bench(fakes, with_ati(can_rig, serial_number="FT00001"))
+    answer = bench.bus.answer
+
+    def numbered(frame):
+        bench.fake.serial_number = b"FT%05d\0" % bench.fake.active
+        return answer(frame)
+
+    bench.bus.answer = numbered
+    bench.sensor.connect()
+    assert bench.sensor.calibration()["serial_number"] == "FT00001"
 
 
 def test_units_become_newtons(bench, fakes):
@@ -204,7 +231,16 @@ def test_a_matrix_with_no_numbers(bench, entry):
     bench.fake.matrix = ((*bench.fake.matrix[0][:5], entry), *bench.fake.matrix[1:])
     message = bench.refusal()
     assert "NETCANOEM" in message
-    assert "no numbers" in message or "differently" in message
+    assert "entry Fx, gauge 5" in message or "differently" in message
+
+
+def test_a_matrix_of_a_broken_memory(bench):
+    rows = bench.fake.matrix
+    bench.fake.matrix = (*rows[:4], (1e35, *rows[4][1:]), rows[5])
+    message = bench.refusal()
+    assert "NETCANOEM" in message
+    assert "entry Ty, gauge 0" in message
+    assert "1e+35" in message
 
 
 def test_an_empty_matrix(bench):
@@ -253,9 +289,82 @@ def test_bus_errors_are_counted_and_a_watchdog_reset_is_noted(bench):
     bench.sensor.connect()
     assert bench.sensor.calibration()["status"] == ["its watchdog has reset the board"]
     before = bench.sensor.bus_errors
-    bench.fake.status = 0xC000
+    bench.fake.status = 0xC001
     bench.tick()
     assert bench.sensor.bus_errors == before + 1
+
+
+def test_a_watchdog_reset_in_mid_session_is_a_fault(bench):
+    bench.sensor.connect()
+    bench.tick()
+    bench.fake.status = 0x8001
+    with pytest.raises(DeviceError, match=r"watchdog has reset it .*back at calibration 0") as told:
+        bench.tick()
+    assert "not measured with calibration 1 (ati_can.calibration)" in str(told.value)
+    bench.sensor.connect()  # the bit stays, and the calibration is selected anew
+    assert bench.fake.asked.count((6, b"\x01")) == 2
+    bench.tick()
+    assert not bench.sensor.wrench_stale
+    bench.fake.status = 0
+    bench.tick()
+    bench.fake.status = 0x8001
+    with pytest.raises(DeviceError, match="watchdog has reset it"):
+        bench.tick()
+
+
+class Restarting(Bench):
+    """A box that can be without power for some ticks; each calibration has a matrix of its own."""
+
+    def __init__(self, fakes, rig, mode):
+        super().__init__(fakes, replace(rig, acquisition=replace(rig.acquisition, mode=mode)))
+        matrix, answer = self.fake.matrix, self.bus.answer
+
+        def by_calibration(frame):
+            self.fake.matrix = matrix if self.fake.active else matrix[::-1]
+            return [] if self.without_power else answer(frame)
+
+        self.without_power = False
+        self.bus.answer = by_calibration
+        self.sensor.connect()
+        assert not self.fresh(3).count(False)
+
+    def fresh(self, ticks):
+        return [self.tick() and not self.sensor.wrench_stale for _ in range(ticks)][1:]
+
+    def silence(self, ticks):
+        self.without_power = True
+        assert not any(self.fresh(ticks))
+        self.without_power = False
+
+
+@pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
+def test_a_box_that_was_without_power_and_is_back_at_another_calibration(fakes, can_rig, mode):
+    bench = Restarting(fakes, can_rig, mode)
+    bench.silence(8)
+    bench.fake.active = 0
+    with pytest.raises(DeviceError, match=r"silent for a moment .*another calibration matrix"):
+        assert not any(bench.fresh(20))
+    assert bench.sensor.wrench_stale, "no reading with another calibration counts"
+
+
+@pytest.mark.parametrize("mode", ["same_tick", "previous_tick"])
+def test_a_box_that_was_silent_and_is_the_same_goes_on(fakes, can_rig, mode):
+    bench = Restarting(fakes, can_rig, mode)
+    bench.silence(8)
+    bench.fake.lose_once = {2}  # the proof may be lost, too
+    assert all(bench.fresh(20)[10:])
+    assert (2, b"\0") in bench.fake.asked[-30:]
+
+
+def test_a_reply_that_is_lost_now_and_then_asks_for_no_proof(fakes, can_rig):
+    bench = Restarting(fakes, can_rig, "same_tick")
+    bench.fake.asked.clear()
+    for _ in range(5):
+        bench.without_power = True
+        bench.tick()
+        bench.without_power = False
+        bench.fresh(10)
+    assert {opcode for opcode, _ in bench.fake.asked} == {0}
 
 
 @pytest.mark.parametrize("gauge", range(6))

@@ -340,15 +340,15 @@ PDOMapping=0
         with pytest.raises(DeviceError, match=r"ProductNumber in .*drive\.eds is 0x00000007"):
             make(eds=self.eds(tmp_path, product="7")).connect()
 
-    @pytest.mark.parametrize("content", ["", "nonsense", "[60E0\n", "\0\0"])
-    def test_a_file_that_is_none(self, make, tmp_path, content):
+    @pytest.mark.parametrize("content", ["nonsense", "[60E0\n", "\0\0", "[6040]\nDataType=x\n"])
+    def test_a_file_that_is_none(self, make, scripted, tmp_path, content):
         path = tmp_path / "broken.eds"
         path.write_text(content)
-        drive = make(eds=str(path))
-        try:
-            drive.connect()
-        except DeviceError as error:
-            assert "broken.eds" in str(error)
+        scripted.state, scripted.torque = "enabled", 200
+        with pytest.raises(DeviceError, match=r"broken\.eds: this EDS file cannot be read"):
+            make(eds=str(path)).connect()
+        # Not even that leaves a drive turning.
+        assert (scripted.state, scripted.torque) == ("switch-on disabled", 0)
 
 
 def test_bit_12_is_demanded(make, scripted):

@@ -332,6 +332,25 @@ class TestResettingADriveThatTurns:
             drive.reset_fault()
 
 
+@pytest.mark.parametrize("late", [1, 2])
+def test_replies_that_come_late_are_not_taken_for_the_next_ones(drive, scripted, late):
+    """The first command is given up after 50 ms; its reply comes when another one is awaited."""
+    answer, kept = scripted._sdo, []
+
+    def answer_late(data):
+        if data[0] != 0x80:  # given up
+            kept.append(data)
+        if len(kept) > late:
+            scripted._sdo = answer
+            for request in kept:
+                answer(request)
+
+    scripted._sdo = answer_late
+    drive.connect()
+    assert len(kept) == late + 1
+    assert scripted.objects[0x6072, 0] == 1800
+
+
 def test_a_drive_with_its_sto_open_is_not_said_to_be_ready(drive, scripted):
     scripted.state = "switch-on disabled, no supply"
     with pytest.raises(DeviceError) as caught:

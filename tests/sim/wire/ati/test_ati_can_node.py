@@ -123,19 +123,30 @@ def test_a_calibration_that_is_missing_is_echoed_and_told_by_the_status(can_host
 
 def test_a_reset_forgets_the_calibration_that_was_set(can_host):
     assert can_host.ask(0xC) == []
-    assert can_host.gauges()[0] == 0x8040
+    assert can_host.gauges()[0] == 0x8041
     assert can_host.log.entries[-1] == ("sensor", "reset", {})
+    can_host.ask(0x6, b"\x03")
+    assert can_host.gauges()[0] == 0x8001
 
 
-def test_a_new_base_takes_effect_after_its_acknowledgement(can_host):
+def test_a_power_up_forgets_the_calibration_and_that_there_was_a_reset(can_host):
+    can_host.ask(0x6, b"\x03")
+    can_host.node.restart()
+    can_host.node.power_cycle()
+    assert can_host.gauges()[0] == 0x8040
+
+
+def test_a_new_base_takes_effect_at_the_next_power_up(can_host):
     assert can_host.ask(0xD, b"\x6a") == [(0x11D, b"")]
+    assert can_host.log.entries[-1] == ("sensor", "base identifier set", {"base_id": 0x6A})
+    assert can_host.ask(0xF)
+    can_host.ask(0xC)
+    assert can_host.ask(0xF), "a reset is no power-up"
+    can_host.node.power_cycle()
     assert can_host.ask(0xF) == []
     can_host.base = 0x6A
     assert can_host.ask(0xF) == [(0x6AF, bytes.fromhex("03 08 00 02"))]
     assert can_host.gauges()[1].tolist() == UNLOADED
-    assert can_host.log.entries[-1] == ("sensor", "base identifier set", {"base_id": 0x6A})
-    can_host.ask(0xC)
-    assert can_host.ask(0xF)
 
 
 def test_a_new_bit_rate_is_only_logged(can_host):
@@ -147,11 +158,11 @@ def test_a_new_bit_rate_is_only_logged(can_host):
     )
 
 
-@pytest.mark.parametrize("firmware", [(3, 7, 9), (3, 7, 0), (2, 9, 1)])
+@pytest.mark.parametrize("firmware", [(3, 6, 9), (3, 6, 0), (2, 9, 1)])
 def test_old_firmware_does_not_tell_its_counts(make_can_host, load, firmware):
     host = make_can_host(firmware=firmware, counts_per_unit=(5, 7))
     host.ask(0x6, b"\x03")
-    assert host.ask(0x7) == []
+    assert host.ask(0x7) == host.ask(0x8) == host.ask(0x9, b"\x02") == []
     ((_, version),) = host.ask(0xF)
     assert struct.unpack(">BBH", version) == firmware
     load.wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
@@ -159,7 +170,7 @@ def test_old_firmware_does_not_tell_its_counts(make_can_host, load, firmware):
     assert wrench[5] == pytest.approx(0.5, abs=1e-4)
 
 
-@pytest.mark.parametrize("firmware", [(3, 8, 0), (4, 0, 0)])
+@pytest.mark.parametrize("firmware", [(3, 7, 0), (3, 8, 0), (4, 0, 0)])
 def test_newer_firmware_tells_its_counts(make_can_host, firmware):
     assert make_can_host(firmware=firmware).counts_per_unit() == (1_000_000, 1_000_000)
 

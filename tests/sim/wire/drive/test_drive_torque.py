@@ -175,7 +175,6 @@ WAYS_OUT = {
     "emergency": lambda b: b.node.emergency(0x2310, 0x02, b""),
     "frozen": lambda b: (setattr(b.node, "frozen", True), b.wait(60, sync=True, beat=True)),
     "short pdo": lambda b: b.node.receive(0x205, b"\x0f\x00\x64"),
-    "long pdo": lambda b: b.node.receive(0x205, b"\x0f\x00\x64\x00\x00"),
     "silence": lambda b: b.wait(60),
 }
 

@@ -3,6 +3,7 @@
 import pytest
 
 COMMUNICATION = 0x11
+HOST = 100
 
 
 def guard(bench, *, abort=1, reaction=1):
@@ -224,24 +225,38 @@ def test_without_a_deadline_the_torque_is_held(running):
     assert running.witness() == (pytest.approx(0.15), True)
 
 
-@pytest.mark.parametrize(
-    ("data", "code", "vendor"),
-    [
-        (b"", 0x8210, "0004000000"),
-        (b"\x0f\x00\x64", 0x8210, "0304000000"),
-        (b"\x0f\x00\x64\x00\x00", 0x8220, "0504000000"),
-    ],
-)
-def test_a_pdo_of_a_wrong_length_is_a_fault_in_operation(running, data, code, vendor):
+@pytest.mark.parametrize(("data", "vendor"), [(b"", "0004000000"), (b"\x0f\x00\x64", "0304000000")])
+def test_a_pdo_that_is_too_short_is_a_fault_in_operation(running, data, vendor):
     running.drive(300)
     running.take()
     running.node.receive(0x205, data)
-    assert running.emergencies() == [(code, COMMUNICATION, vendor)]
+    assert running.emergencies() == [(0x8210, COMMUNICATION, vendor)]
     assert running.state() == "fault"
     running.assert_off()
 
 
-def test_a_pdo_of_a_wrong_length_is_only_reported_otherwise(bench):
+def test_of_a_pdo_that_is_too_long_the_first_bytes_count(running):
+    running.drive(300)
+    running.take()
+    running.node.receive(0x205, b"\x0f\x00\x64\x00\x00")
+    assert running.emergencies() == [(0x8220, COMMUNICATION, "0504000000")]
+    word, _, permille = running.sync()
+    assert (permille, running.state()) == (100, "operation enabled")
+    assert word & 0x0080  # warning
+    running.take()
+    running.rpdo(0x0F, 100)
+    assert running.emergencies() == [(0, 0, "0000000000")]
+
+
+def test_one_node_is_not_watched_twice(bench):
+    assert bench.write(0x1016, 1, HOST << 16 | 50, 4) == 0
+    assert bench.write(0x1016, 2, HOST << 16 | 80, 4) == 0x06040043
+    assert bench.write(0x1016, 2, HOST << 16, 4) == 0  # no time: not watched
+    assert bench.write(0x1016, 2, (HOST + 1) << 16 | 80, 4) == 0
+    assert bench.write(0x1016, 1, HOST << 16 | 60, 4) == 0  # again, the same entry
+
+
+def test_a_pdo_that_is_too_short_is_only_reported_otherwise(bench):
     bench.configure()
     bench.take()
     for _ in range(3):

@@ -97,6 +97,7 @@ class Recording:
         self.sent = []
         self.written = b""
         self.cuts = []
+        self.mended = []
         self.log = log
         simulated = SimulatedRig(rig)
         self.simulated = simulated
@@ -108,6 +109,7 @@ class Recording:
             send=lambda raw, origin: self.sent.append((raw, origin)),
             write=self._write,
             cut=self.cuts.append,
+            mend=self.mended.append,
             log=log,
         )
         self.drive = Drive(self.world.step, self.world.can_port("drive"))

@@ -25,6 +25,12 @@ OPTIONAL = {
     "status": ({"bits": whole(0, 0xFFFF)}, {"for": positive}),
     "jump": ({"counts": whole(-(2**31), 2**31 - 1)}, {}),
     "cut": ({}, {"device": st.sampled_from(["bus", "sensor"])}),
+    "restart": ({"device": device}, {}),
+    "lag": ({"ms": positive}, {"for": positive}),
+    "no_pre_operational": ({}, {"for": positive}),
+    "no_bit_12": ({}, {"for": positive}),
+    "no_watch": ({}, {"for": positive}),
+    "end": ({}, {"fault": st.sampled_from(["sto", "freeze", "cut", "drop"])}),
 }
 asked = st.one_of(
     *(
