@@ -37,7 +37,8 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     text
         Of a profile that can be used.
     settings
-        What is to stand in it; a key that it has left out comes first in its section.
+        What is to stand in it. A key that it has left out takes the place of the comment that
+        shows it, or comes first in its section.
 
     Raises
     ------
@@ -107,8 +108,12 @@ def _taken(path: Path) -> ProfileError:
 
 
 def _places(lines: Sequence[str]) -> dict[str, int]:
-    """Return the number of the line on which each section and each key of a profile stands."""
-    places = {}
+    """Return the number of the line on which each section and each key of a profile stands.
+
+    Of a key that only a comment shows, it is that of the comment.
+    """
+    places: dict[str, int] = {}
+    shown: dict[str, int] = {}
     section = ""
     for place, line in enumerate(lines):
         if title := re.match(r"\[([^\]]+)\]", line):
@@ -116,7 +121,9 @@ def _places(lines: Sequence[str]) -> dict[str, int]:
             section = title[1] + "."
         elif key := re.match(r"(\w+)\s*=", line):
             places[section + key[1]] = place
-    return places
+        elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in keys():
+            shown[section + key[1]] = place
+    return shown | places
 
 
 def _comment(text: str) -> list[str]:
