@@ -6,6 +6,7 @@ told and what it did. Run as a process: `cia402_local_node.py SETTINGS.json`, wi
 of JSON on its standard input, each answered with a line.
 """
 
+import configparser
 import dataclasses
 import json
 import os
@@ -122,9 +123,11 @@ class DriveNode(canopen.LocalNode):
                 raise SdoAbortedError(NOT_WRITABLE)
             if found.data_type in od.INTEGER_TYPES and 8 * len(data) == len(found):
                 value = found.decode_raw(bytes(data))
-                if found.max is not None and value > found.max:
+                # Of CiA 301's own objects files state limits that cannot be meant: 65535 for
+                # an entry of 1016, whose bits 16 to 23 are the node.
+                if index >= 0x2000 and found.max is not None and value > found.max:
                     raise SdoAbortedError(TOO_HIGH)
-                if found.min is not None and value < found.min:
+                if index >= 0x2000 and found.min is not None and value < found.min:
                     raise SdoAbortedError(TOO_LOW)
                 if self.drive is not None and check_writable:
                     self.drive.before_write(index, subindex, value)
@@ -203,6 +206,11 @@ class Drive:
                 if each.value is None and each.default is None:
                     blank = bytes(len(each) // 8) if each.data_type in od.NUMBER_TYPES else b"?"
                     self._store(each.index, each.subindex, blank)
+        told = node.object_dictionary.device_information
+        numbers = (told.vendor_number, told.product_number, told.revision_number)
+        for sub, number in enumerate(numbers, 1):
+            if self._has(0x1018, sub) and not self._get(0x1018, sub) and number:
+                self._put(0x1018, sub, number)
         if self._has(0x6502) and not self._get(0x6502):
             self._put(0x6502, 0, self._modes_of_the_objects())
         if self._has(0x6076):
@@ -550,7 +558,7 @@ class Drive:
             wanted = self._get_or(0x6071, 0, 0) + self._get_or(0x60B2, 0, 0)
             for index, sign in ((0x6072, 0), (0x60E0, 1), (0x60E1, -1)):
                 if self._has(index) and sign * wanted >= 0:
-                    limit = self._get(index)
+                    limit = abs(self._get(index))  # some makers state 60E1 below zero
                     wanted = max(-limit, min(limit, wanted))
         self._move(time.monotonic())
         self.torque_per_mille = wanted
@@ -631,7 +639,12 @@ def main() -> int:
     log = Log(settings.log)
     hub = SeqpacketHub(settings.socket)
     network = canopen.Network(hub)
-    drive = Drive(settings, network, log)
+    try:
+        drive = Drive(settings, network, log)
+    except (ValueError, configparser.Error) as error:
+        say({"ended": f"canopen cannot read {Path(settings.eds).name}: {error}"})
+        hub.shutdown()
+        return 1
     box = NetCanOemBox(
         settings.sensor_base,
         lambda: (0.0, 0.0, 0.0, 0.0, 0.0, drive.shaft.coupling_nm),

@@ -108,7 +108,12 @@ def play_session_with_fault(scene: Scene) -> str:
     return "ok"
 
 
-def play(name: str, eds: Path, node: dict[str, object] | None = None) -> Verdict:
+def play(
+    name: str,
+    eds: Path,
+    node: dict[str, object] | None = None,
+    left_on: tuple[str, ...] = LEFT_ON,
+) -> Verdict:
     """Put one file to the test."""
     paper = on_paper(eds)
     verdict = Verdict(name, paper)
@@ -124,8 +129,7 @@ def play(name: str, eds: Path, node: dict[str, object] | None = None) -> Verdict
             steps["named on paper"] = "ok" if _OBJECT.search(paper.why) else paper.why
             steps["refused"] = _refused(scene)
             return verdict
-        done = scene.check()
-        steps["check"] = "ok" if done.code == 0 else f"{done.code}: {failed_rows(done)}"
+        steps["check"] = "; ".join(scene.check()) or "ok"
         steps["chirp"] = complete(scene.chirp())
         if steps["chirp"] != "ok":
             return verdict
@@ -134,7 +138,7 @@ def play(name: str, eds: Path, node: dict[str, object] | None = None) -> Verdict
         off = scene.state()["state"] == "switch-on disabled"
         steps["reset"] = "ok" if done.code == 0 and off else f"{done.code}: {done.last}"
         steps["chirp again"] = complete(scene.chirp())
-    for how in LEFT_ON:
+    for how in left_on:
         steps[f"left on, pre-op {how}"] = play_left_on(eds, how, node, profile)
     return verdict
 
@@ -172,12 +176,6 @@ def play_left_on(
         if after_s > OFF_WITHIN_S:
             return f"off after {after_s:.3f} s: {done.last}"
         return f"ok: off {after_s:.3f} s, exit {done.code}"
-
-
-def failed_rows(done: Done) -> str:
-    """Return the failed lines of a check's table, in short."""
-    rows = [line for line in done.said.splitlines() if " failed" in line and "Verdict" not in line]
-    return "; ".join(re.sub(r"\s{2,}", "  ", row.strip()) for row in rows) or done.last
 
 
 def main() -> int:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,7 @@ SHIPPED = HERE.parents[1] / "hw_profiles" / "antenna_can.toml"
 NAME = "independent"
 NODE_ID = 5
 HEARTBEAT_TIMEOUT_S = 0.2
+_TIMES = ("polls", "turnaround median", "turnaround 99 %", "both replies after")
 _STARTED_S = 60.0
 _COMMAND_S = 90.0
 
@@ -35,7 +37,6 @@ VALUES: dict[str, object] = {
     "actuation.delay_s": 4.0e-3,
     "acquisition.deadline_us": 3500.0,
     "can.interface": "seqpacket",
-    "cia402.node_id": NODE_ID,
     "cia402.rated_torque_unit_nm": 1.0e-6,
     "cia402.heartbeat_timeout_s": HEARTBEAT_TIMEOUT_S,
     "cia402.drive_heartbeat_timeout_s": 2.0,
@@ -80,6 +81,14 @@ def with_values(text: str, values: dict[str, object]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def commissioned(eds: Path) -> int:
+    """Return the node id of a DCF file, which its values are of; of an EDS file, any."""
+    text = eds.read_text("utf-8", errors="replace")
+    line = r"^\s*NodeID\s*=\s*(0x[0-9a-f]+|\d+)\s*$"
+    found = re.search(line, text, re.MULTILINE | re.IGNORECASE)
+    return int(found[1], 0) if found and int(found[1], 0) in range(1, 127) else NODE_ID
+
+
 @dataclass(frozen=True)
 class Done:
     """What a command came to."""
@@ -112,7 +121,8 @@ class Scene:
         self._log = self.folder / "node.jsonl"
         self._sessions = 0
         channel = str(self.folder / "bus")
-        settings = {"eds": str(eds), "socket": channel, "log": str(self._log), "node_id": NODE_ID}
+        node_id = commissioned(eds)
+        settings = {"eds": str(eds), "socket": channel, "log": str(self._log), "node_id": node_id}
         (self.folder / "node.json").write_text(json.dumps(settings | (node or {})))
         python_path = seqpacket_bus.announce(self.folder / "interface")
         self.environment = {
@@ -128,8 +138,10 @@ class Scene:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:
-            self._answer()
-            values = VALUES | {"can.channel": channel} | (profile or {})
+            if "ended" in (told := self._answer()):
+                raise RuntimeError(told["ended"])
+            values = VALUES | {"can.channel": channel, "cia402.node_id": node_id}
+            values |= profile or {}
             self.profile = self.folder / f"{NAME}.toml"
             self.profile.write_text(with_values(text or SHIPPED.read_text("utf-8"), values))
         except BaseException:
@@ -189,8 +201,17 @@ class Scene:
             said += f"\nError: not done after {_COMMAND_S:g} s"
         return Done(process.returncode, said, time.monotonic() - began_s)
 
-    def check(self) -> Done:
-        return self.run("check", "--profile", self.profile)
+    def check(self) -> list[str]:
+        """Return what `rigd check` finds wrong, but for times, which a busy computer spoils."""
+        done = self.run("check", "--profile", self.profile, "--json")
+        found = [line for line in done.said.splitlines() if line.startswith("{")]
+        if not found:
+            return [done.last]
+        return [
+            f"{row['what']}: {row['found']} ({row['detail']})"
+            for row in json.loads(found[0])["rows"]
+            if row["verdict"] == "failed" and row["what"] not in _TIMES
+        ]
 
     def reset(self) -> Done:
         return self.run("reset", "--profile", self.profile)
