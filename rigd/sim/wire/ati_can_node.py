@@ -147,7 +147,7 @@ class AtiCanNode:
     def tick(self, now_s: float) -> None:
         """Nothing here takes time: the box only answers."""
 
-    def restart(self) -> None:
+    def reset(self) -> None:
         """Start anew, as its watchdog or a request has it."""
         self._active = 0
         self._was_reset = True
@@ -206,7 +206,7 @@ class AtiCanNode:
             self._reply(0x9, _WORD(_DIAGNOSTICS[data[0]]))
 
     def _reset(self, _: bytes) -> None:
-        self.restart()
+        self.reset()
 
     def _set_base(self, data: bytes) -> None:
         if data[0] > 0x7F:

@@ -131,7 +131,7 @@ def test_a_reset_forgets_the_calibration_that_was_set(can_host):
 
 def test_a_power_up_forgets_the_calibration_and_that_there_was_a_reset(can_host):
     can_host.ask(0x6, b"\x03")
-    can_host.node.restart()
+    can_host.node.reset()
     can_host.node.power_cycle()
     assert can_host.gauges()[0] == 0x8040
 
