@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigd.checks.rows import Row, Verdict
-from rigd.devices.cia402.eds import EdsError, read_eds
 from rigd.devices.cia402.suitability import Grade, judge
+from rigd.devices.eds import EdsError, read_eds
 
 if TYPE_CHECKING:
     from rigd.devices.parameters import RigParameters

@@ -63,7 +63,7 @@ def new(
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
-    from rigd.devices.cia402.eds import EdsError, read_eds
+    from rigd.devices.eds import EdsError, read_eds
     from rigd.profile import ProfileError
     from rigd.profile.from_eds import Draft, UnusableDriveError
     from rigd.profile.write import check_new, write_new

@@ -10,9 +10,9 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from rigd.devices.cia402 import objects
-from rigd.devices.cia402.eds import Eds
 from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
 from rigd.devices.cia402.suitability import Grade, judge
+from rigd.devices.eds import Eds
 from rigd.profile.load import ProfileError, profile_of
 from rigd.profile.settings import Profile, keys
 from rigd.profile.write import Setting, SettingValue, with_head, with_settings

@@ -52,5 +52,5 @@ def test_the_profile_s_own_file_makes_the_drive(quiet_profile, start_simulator, 
 def test_a_file_that_is_none_ends_the_command(rigd, quiet_profile, runtime_folder, tmp_path):
     done = rigd("simulate", "--profile", quiet_profile("antenna_can"), "--eds", tmp_path / "no.eds")
     assert done.returncode == 1
-    assert "There is no EDS file" in done.stderr
+    assert "cannot be read (No such file" in done.stderr
     assert "Traceback" not in done.stderr

@@ -27,9 +27,9 @@ from canopen.sdo.base import SdoVariable
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402.assignments import Assignment
-from rigd.devices.cia402.eds import EdsError, read_eds
 from rigd.devices.cia402.frames import NMT_PRE_OPERATIONAL
 from rigd.devices.contracts import DeviceError
+from rigd.devices.eds import EdsError, read_eds
 
 EVERY_BIT = 0xFFFF_FFFF
 """Mask of an object all of whose bits count."""

@@ -10,7 +10,6 @@ from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 from rigd.devices.cia402 import objects
-from rigd.devices.cia402.eds import Eds, EdsEntry
 from rigd.devices.cia402.requirements import (
     REQUIREMENTS,
     WATCHDOG,
@@ -27,6 +26,7 @@ from rigd.devices.cia402.values import (
     sync_period_us,
     torque_limit_per_mille,
 )
+from rigd.devices.eds import Eds, EdsEntry
 
 if TYPE_CHECKING:
     from rigd.devices.parameters import RigParameters, ServoDrive

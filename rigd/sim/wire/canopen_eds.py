@@ -1,62 +1,38 @@
-"""What a CANopen device has, as the manufacturer's EDS or DCF file says (CiA 306).
+"""A simulated node's objects as the maker's EDS or DCF file describes them."""
 
-Only what a simulated node needs of it: which objects there are, of which types, and what may be
-done with them.
-"""
-
-import io
-import logging
-import re
-import warnings
 from collections.abc import Iterator, Mapping
-from configparser import RawConfigParser
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from struct import calcsize, pack
-
-import canopen
-from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+from struct import calcsize
+from typing import Final
 
 from rigd.devices.contracts import DeviceError
+from rigd.devices.eds import EdsEntry, EdsError, read_eds
 from rigd.sim.wire.canopen_objects import Description
 
-_MOST_BYTES = 8_000_000
 _FIRST_INDEX = 0x1000
 """Below it stand types and dummies, which nobody can read."""
 _IDENTITY = 0x1018
 _WATCHED, _ONE_NODE = 0x1016, 0x1_0000
 
-_KINDS = {
-    datatypes.BOOLEAN: "B",
-    datatypes.INTEGER8: "b",
-    datatypes.INTEGER16: "h",
-    datatypes.INTEGER32: "i",
-    datatypes.INTEGER64: "q",
-    datatypes.UNSIGNED8: "B",
-    datatypes.UNSIGNED16: "H",
-    datatypes.UNSIGNED32: "I",
-    datatypes.UNSIGNED64: "Q",
+_BOOLEAN: Final = 0x01
+_KINDS: Final = {
+    0x00: "I",  # where no type is told
+    _BOOLEAN: "B",
+    0x02: "b",
+    0x03: "h",
+    0x04: "i",
+    0x05: "B",
+    0x06: "H",
+    0x07: "I",
+    0x15: "q",
+    0x1B: "Q",
 }
-# Kept as bytes: nobody computes with them here.
-_SIZES = {
-    datatypes.REAL32: 4,
-    datatypes.REAL64: 8,
-    datatypes.INTEGER24: 3,
-    datatypes.INTEGER40: 5,
-    datatypes.INTEGER48: 6,
-    datatypes.INTEGER56: 7,
-    datatypes.UNSIGNED24: 3,
-    datatypes.UNSIGNED40: 5,
-    datatypes.UNSIGNED48: 6,
-    datatypes.UNSIGNED56: 7,
-    datatypes.TIME_OF_DAY: 6,
-    datatypes.TIME_DIFFERENCE: 6,
-}
-_SDO_ACCESS = {"const": "ro", "rwr": "rw", "rww": "rw"}
-_PDO_DIRECTIONS = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww": "r"}
-_OBJECT = re.compile(r"[0-9A-F]{4}(sub[0-9A-F]{1,2}|Name|Value)?", re.IGNORECASE)
-_NUMBER = re.compile(r"0x[0-9a-f]{1,16}|[0-9]{1,16}")
+"""Letters of :mod:`struct` for the numbers of CiA 301; the rest is kept as bytes."""
+_TIMES: Final = {0x0C: 6, 0x0D: 6}
+"""Bytes of time of day and of time difference."""
+_SDO_ACCESS: Final = {"const": "ro", "rwr": "rw", "rww": "rw"}
+_PDO_DIRECTIONS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww": "r"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +57,7 @@ class DeviceFile:
         return sub
 
 
-def read_eds(path: Path, node_id: int) -> DeviceFile:
+def read_device(path: Path, node_id: int) -> DeviceFile:
     """Read a file for a device that is to have this node id.
 
     Raises
@@ -89,29 +65,14 @@ def read_eds(path: Path, node_id: int) -> DeviceFile:
     DeviceError
         If it cannot be read, or is no such file.
     """
-    text = _text_of(path)
     try:
-        parser = RawConfigParser(strict=False, inline_comment_prefixes=(";",))
-        parser.optionxform = str  # type: ignore[assignment,method-assign]
-        parser.read_string(text)
-        identity = list(_numbers_of_the_device(parser))
-        dictionary = _imported(parser, node_id)
-        entries = {
-            (variable.index, variable.subindex): _described(variable)
-            for variable in _variables(dictionary, parser)
-            if variable.index >= _FIRST_INDEX
-        }
-    except Exception as error:  # the library lets through whatever a file makes it stumble over
-        told = " ".join(str(error).split())[:200]
-        raise DeviceError(
-            f"The EDS file {path} cannot be used ({type(error).__name__}: {told}); take the file "
-            "from the drive's manufacturer as it is, or have it checked by an EDS editor."
-        ) from None
-    if not entries:
-        raise DeviceError(
-            f"The EDS file {path} describes no object; take the one from the drive's manufacturer."
-        )
-    for sub, number in enumerate(identity, 1):
+        eds = read_eds(path, node_id)
+    except EdsError as error:
+        raise DeviceError(f"The simulated drive cannot be made: {error}") from None
+    entries = {
+        key: _described(entry) for key, entry in eds.entries.items() if key[0] >= _FIRST_INDEX
+    }
+    for sub, number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
         said = entries.get((_IDENTITY, sub))
         if said is not None and not said.default:
             entries[_IDENTITY, sub] = replace(said, default=number)
@@ -125,88 +86,23 @@ def read_eds(path: Path, node_id: int) -> DeviceFile:
     return DeviceFile(path.name, entries)
 
 
-def _text_of(path: Path) -> str:
-    try:
-        if not path.is_file():
-            raise DeviceError(f"There is no EDS file {path}; check the name.")
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        raise DeviceError(
-            f"The EDS file {path} cannot be read ({error.strerror}); check the name."
-        ) from None
-    if len(data) > _MOST_BYTES:
-        raise DeviceError(
-            f"The EDS file {path} has more than {_MOST_BYTES // 1_000_000} MB; this is no "
-            "description of a drive."
-        )
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")  # as many tools on Windows write
-
-
-def _imported(parser: RawConfigParser, node_id: int) -> ObjectDictionary:
-    """Have the library read the objects alone: it stumbles over what is odd in all the rest."""
-    for section in parser.sections():
-        if not _OBJECT.fullmatch(section):
-            parser.remove_section(section)
-    source = io.StringIO()
-    parser.write(source)
-    source.seek(0)
-    source.name = "file.eds"  # by which the library tells the format
-    logging.getLogger("canopen").addHandler(logging.NullHandler())  # what is odd is used as it is
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return canopen.import_od(source, node_id)
-
-
-def _numbers_of_the_device(parser: RawConfigParser) -> Iterator[int]:
-    """Yield vendor, product and revision as the head of the file has them, 0 where it does not."""
-    for key in ("VendorNumber", "ProductNumber", "RevisionNumber"):
-        told = parser.get("DeviceInfo", key, fallback="").strip().lower()
-        number = int(told, 16 if told.startswith("0x") else 10) if _NUMBER.fullmatch(told) else 0
-        yield number & 0xFFFF_FFFF
-
-
-def _variables(dictionary: ObjectDictionary, parser: RawConfigParser) -> Iterator[ODVariable]:
-    compact = {
-        int(section, 16): int(parser.get(section, "CompactSubObj"), 0)
-        for section in parser.sections()
-        if len(section) == 4 and parser.has_option(section, "CompactSubObj")
-    }
-    for index, thing in dictionary.items():
-        if isinstance(thing, ODVariable):
-            yield thing
-            continue
-        yield from thing.values()
-        for sub in range(1, min(compact.get(index, 0), 254) + 1):
-            if sub not in thing.subindices:
-                like = copy(thing[1])
-                like.subindex = sub
-                yield like
-
-
-def _described(variable: ODVariable) -> Description:
-    """Return what the library read, in the terms of a simulated node."""
-    data_type = variable.data_type or datatypes.UNSIGNED32
-    access = _SDO_ACCESS.get(variable.access_type, variable.access_type)
-    if access not in ("ro", "wo"):
-        access = "rw"
-    value = variable.default if variable.value is None else variable.value
-    kind = _KINDS.get(data_type)
+def _described(entry: EdsEntry) -> Description:
+    """Return what the file says of an object, in the terms of a simulated node."""
+    access = _SDO_ACCESS.get(entry.access, entry.access)
+    kind = _KINDS.get(entry.data_type)
     if kind is None:
-        size = _SIZES.get(data_type)
-        return Description("s", access, "", text=_bytes(value, size), fixed=size is not None)
-    directions = _PDO_DIRECTIONS.get(variable.access_type, "rt")
-    if not variable.pdo_mappable or data_type == datatypes.BOOLEAN:  # of one bit in a PDO
-        directions = ""
-    low, high = variable.min, 1 if data_type == datatypes.BOOLEAN else variable.max
+        size = _TIMES.get(entry.data_type) or (entry.bits or 0) // 8
+        return Description("s", access, "", text=_bytes(entry, size), fixed=size > 0)
+    boolean = entry.data_type == _BOOLEAN
+    # A boolean takes one bit in a PDO, which nobody needs here.
+    mappable = entry.mappable and not boolean
+    directions = _PDO_DIRECTIONS.get(entry.access, "rt") if mappable else ""
+    low, high = entry.low, 1 if boolean else entry.high
     if low is not None and high is not None and low >= high:  # as tools write that know none
         low = high = None
-    if variable.index == _WATCHED and high is not None and high < _ONE_NODE:
+    if entry.index == _WATCHED and high is not None and high < _ONE_NODE:
         low = high = None  # some files limit the time in its lower half and forget the node above
-    default = _fitted(value, kind) if isinstance(value, int) else None
+    default = None if entry.default is None else _fitted(entry.default, kind)
     return Description(kind, access, directions, default, low, high)
 
 
@@ -217,12 +113,9 @@ def _fitted(value: int, kind: str) -> int:
     return value - (1 << bits) if kind.islower() and value >> (bits - 1) else value
 
 
-def _bytes(value: object, size: int | None) -> bytes:
-    """Return the default of what is kept as bytes, or as many zeros."""
-    if isinstance(value, float) and size in (4, 8):
-        return pack("<f" if size == 4 else "<d", value)
-    if isinstance(value, int) and size is not None:
-        return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
-    data = value.encode("utf-8") if isinstance(value, str) else value
-    data = data if isinstance(data, bytes) else b""
-    return data if size is None else data[:size].ljust(size, b"\0")
+def _bytes(entry: EdsEntry, size: int) -> bytes:
+    """Return the default of what is kept as bytes, of a given size or, for 0, of its own."""
+    data = entry.content
+    if entry.default is not None and size:
+        data = (entry.default & (1 << 8 * size) - 1).to_bytes(size, "little")
+    return data[:size].ljust(size, b"\0") if size else data

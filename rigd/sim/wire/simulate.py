@@ -154,9 +154,9 @@ class _Process:
         assert rig.cia402 is not None
         eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
         if eds is not None:
-            from rigd.sim.wire.canopen_eds import read_eds
+            from rigd.sim.wire.canopen_eds import read_device
 
-            self._file = read_eds(eds, rig.cia402.node_id)
+            self._file = read_device(eds, rig.cia402.node_id)
         folder = stack.enter_context(socket_folder(rig.name))
         self._bus: Hub | VirtualCan
         can_socket = ""

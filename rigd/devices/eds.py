@@ -9,6 +9,7 @@ import io
 import logging
 import re
 import stat
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +74,9 @@ class EdsEntry:
     """Value after power-up, or the one that a DCF sets; None: not told, or no whole number."""
     low: int | None
     high: int | None
+    content: bytes = b""
+    """The default where it is a text, a block or a fraction, as the drive holds it; empty: not
+    told."""
 
     @property
     def writable(self) -> bool:
@@ -98,6 +102,8 @@ class Eds:
     product_name: str
     product_code: int
     """What object 1018:2 shows; 0: not told."""
+    revision: int
+    """What object 1018:3 shows; 0: not told."""
     bit_rates_bit_s: tuple[int, ...]
     """Empty: not told."""
     commissioned_node_id: int
@@ -145,6 +151,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
         vendor_id=_identity(entries, 1, device.get("vendornumber", "")),
         product_name=_shown(device.get("productname", "")),
         product_code=_identity(entries, 2, device.get("productnumber", "")),
+        revision=_identity(entries, 3, device.get("revisionnumber", "")),
         bit_rates_bit_s=tuple(
             1000 * rate
             for rate in _BIT_RATES_KBIT_S
@@ -356,7 +363,16 @@ def _entry(variable: "ODVariable") -> EdsEntry:
         default=default,
         low=variable.min,
         high=variable.max,
+        content=_content(value, data_type),
     )
+
+
+def _content(value: object, data_type: int) -> bytes:
+    """Return a default that is no whole number as the drive holds it."""
+    if isinstance(value, float):
+        return struct.pack("<f" if _BITS.get(data_type) == 32 else "<d", value)
+    data = value.encode("utf-8") if isinstance(value, str) else value
+    return data if isinstance(data, bytes) else b""
 
 
 def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str) -> int:
