@@ -130,12 +130,14 @@ def draw_session(
     for draw in picture.events([*_notes(session)]):
         draw(stream)
     samples = session.samples
-    counts = _counts(samples)
-    done = 0
+    counts = np.zeros(3, np.int64)
+    done, last_tick = 0, -1
     block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
     for block, ages in _blocks(samples, timings, block_ticks):
         done += len(block)
-        missed, late, lost = counts[done - 1].tolist()
+        counts += _counts(block, last_tick)
+        last_tick = int(block["tick"][-1])
+        missed, late, lost = counts.tolist()
         health = Health(missed_ticks=missed, late_ticks=late, lost_ticks=lost)
         for draw in (
             *picture.timings(ages),
@@ -188,13 +190,13 @@ def _notes(session: Session) -> Iterator[Note]:
         yield outcome_note(int(session.samples["t_ns"][-1]), outcome, reason)
 
 
-def _counts(samples: Records) -> npt.NDArray[np.int64]:
-    """Return ticks that were missed, late and lost up to each sample, (n, 3)."""
-    gaps = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
+def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
+    """Return how many ticks were missed, late and lost, (3,), from the one after `last_tick` on."""
+    gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
     status = samples["status"]
     lost = np.where(status & Status.AFTER_LOST, gaps, 0)
     late = (status & Status.LATE) != 0
-    return np.cumsum(np.stack([gaps - lost, late, lost], axis=1), axis=0)
+    return np.array([(gaps - lost).sum(), late.sum(), lost.sum()], np.int64)
 
 
 def _blocks(

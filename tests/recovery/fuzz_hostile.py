@@ -458,7 +458,7 @@ def cases(count, seed, scale=None):
     for number in range(count):
         rng = random.Random(f"{seed}-{number}")
         kind = damaged if number % 2 else kinds[number // 2 % len(kinds)]
-        size = scale if scale is not None else rng.choice((0.01, 0.1, 0.3, 1.0))
+        size = scale if scale is not None else rng.choice((0.01,) * 5 + (0.1,) * 3 + (0.3, 1.0))
         name = f"{number} {kind.__name__} (scale {size})"
         yield name, lambda kind=kind, rng=rng, size=size: kind(rng, size)
 

@@ -1,0 +1,107 @@
+"""Messages of any encoding that are decoded together read as protobuf decodes them one by one."""
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rigd.session import SessionError, message_decoder, read_session
+from rigd.session.format import SAMPLE_FIELDS
+from rigd.session.schema import SAMPLE_SCHEMA, message_class, schema_data
+
+TYPES = {"INT64": 3, "UINT32": 13, "SINT32": 17, "FLOAT": 2, "SFIXED64": 16, "FIXED32": 7}
+
+
+def schema_with(changes):
+    files = FileDescriptorSet.FromString(schema_data(SAMPLE_SCHEMA))
+    for name, kind in changes.items():
+        files.file[0].message_type[0].field[SAMPLE_FIELDS.index(name)].type = TYPES[kind]
+    return files.SerializeToString()
+
+
+def read_both_ways(path, monkeypatch):
+    """Read a file as usual, and message by message; return both, and how many were single."""
+    single = []
+    whole = message_decoder.MessageDecoder._decode_single
+
+    def counting(self, channel, messages, places, out):
+        single.append(len(messages))
+        whole(self, channel, messages, places, out)
+
+    monkeypatch.setattr(message_decoder.MessageDecoder, "_decode_single", counting)
+    together = read_session(path).samples
+    count = sum(single)
+    monkeypatch.setattr(message_decoder, "_FEW", 10**9)
+    return together, read_session(path).samples, count
+
+
+@settings(
+    max_examples=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(
+    changes=st.fixed_dictionaries(
+        {},
+        optional={
+            "t_ns": st.sampled_from(["INT64", "UINT32"]),
+            "tick": st.sampled_from(["UINT32"]),
+            "status": st.sampled_from(["UINT32", "SINT32"]),
+            "fx_n": st.just("FLOAT"),
+        },
+    ),
+    order=st.permutations(range(4)),
+    tail=st.sampled_from([b"", b"\xa0\x01\x07", b"\xa2\x01\x03abc", b"\xa5\x01abcd"]),
+    seed=st.integers(0, 99),
+)
+def test_any_encoding_reads_as_protobuf_reads_it(kit, tmp_path, changes, order, tail, seed):
+    """Fields left out at zero, in another order, twice, unknown, or as numbers of any length."""
+    rng = np.random.default_rng(seed)
+    samples = kit.make_samples(400)
+    samples["fx_n"] = np.round(rng.normal(size=400)) * (rng.random(400) < 0.5)
+    samples["status"] = rng.integers(0, 400, 400) * (rng.random(400) < 0.3)
+    schema = schema_with(changes)
+    cls = message_class(SAMPLE_SCHEMA, schema)
+    quarters = [SAMPLE_FIELDS[i::4] for i in order]
+    messages = []
+    for i, row in enumerate(samples):
+        parts = [
+            cls(**{name: row[name].item() for name in names}).SerializeToString()
+            for names in quarters
+        ]
+        messages.append(b"".join(parts) + parts[i % 2] + tail)  # some fields twice
+        assert cls.FromString(messages[-1]).tick == i
+    path = kit.write_foreign(tmp_path / "f.mcap", messages, schema=schema)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        together, single, _ = read_both_ways(path, monkeypatch)
+    np.testing.assert_array_equal(together, single)
+    np.testing.assert_array_equal(together["tick"], np.arange(400))
+
+
+def test_samples_of_another_order_are_decoded_together(kit, tmp_path, monkeypatch):
+    samples = kit.make_samples(5000)
+    messages = [m[9:14] + m[:9] + m[14:] for m in kit.fixed_messages(samples)]
+    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    together, single, count = read_both_ways(path, monkeypatch)
+    np.testing.assert_array_equal(together, samples)
+    np.testing.assert_array_equal(single, samples)
+    assert count == 0
+
+
+def test_too_many_messages_that_differ_are_refused(kit, tmp_path, monkeypatch):
+    monkeypatch.setattr(message_decoder, "MAX_SINGLE_MESSAGES", 100)
+    whole = kit.fixed_messages(kit.make_samples(300))
+    messages = [m + b"\xa2\x01" + bytes([i % 100]) + bytes(i % 100) for i, m in enumerate(whole)]
+    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    with pytest.raises(SessionError, match="more than 100 messages of /rig/sample differ so much"):
+        read_session(path)
+
+
+def test_a_message_that_ends_too_early_is_found_among_others_alike(kit, tmp_path):
+    messages = [m[9:14] + m[:9] + m[14:] for m in kit.fixed_messages(kit.make_samples(100))]
+    messages[50] = messages[50][:-1] + b"\x80"  # still a number
+    messages[60] = b"\xff" * len(messages[60])
+    path = kit.write_foreign(tmp_path / "f.mcap", messages)
+    with pytest.raises(SessionError, match="not what its schema says"):
+        read_session(path)
