@@ -50,7 +50,7 @@ CHANGES = (
     # A tick that comes late measures where the motor is by then, which looks like a jump.
     ("acceleration_rad_s2 = { value = 1000.0", "acceleration_rad_s2 = { value = 10000.0"),
     # The motor goes on with the last torque while the loop stands still.
-    ("\nvelocity_rad_s = { value = 4.0", "\nvelocity_rad_s = { value = 100.0"),
+    ("\nvelocity_rad_s = { value = 4.0", "\nvelocity_rad_s = { value = 50.0"),
     ("tracking_error_rad = { value = 0.1", "tracking_error_rad = { value = 1.5"),
     ("max_speed_rad_s = { value = 5.0", "max_speed_rad_s = { value = 0.0"),
     ("drive_heartbeat_timeout_s = { value = 0.1", "drive_heartbeat_timeout_s = { value = 1.0"),
@@ -62,7 +62,7 @@ CHANGES = (
 )
 DIRECT_CHANGES = (
     *CHANGES,
-    ("\nvelocity_rad_s = { value = 15.0", "\nvelocity_rad_s = { value = 100.0"),
+    ("\nvelocity_rad_s = { value = 15.0", "\nvelocity_rad_s = { value = 50.0"),
     ("tracking_error_rad = { value = 0.5", "tracking_error_rad = { value = 1.5"),
 )
 """Of which a profile without a bus has but some."""
