@@ -150,7 +150,7 @@ def run_in_foreground(
     except RigBusyError as error:
         raise ForegroundError(str(error), wrong_use=False) from error
     except SessionFailedError as error:
-        text = f"{error} The drive is disabled. {what_is_kept(error.path)}"
+        text = f"{error} {what_is_kept(error.path)}"
         results.append(error.result())
         raise ForegroundError(text, wrong_use=False, results=results) from error
     except RigError as error:

@@ -125,8 +125,9 @@ def stop(
         status = await_end(path, _END_PATIENCE_S)
     if status is None:
         fail(
-            f"The session is being stopped, and has not ended within {_END_PATIENCE_S:g} s; look "
-            "at rigd status and at the rig, and press the wired stop (STO) if anything moves.",
+            f"The daemon was asked to stop, and its session was not seen to end within "
+            f"{_END_PATIENCE_S:g} s; look at rigd status and at the rig, and press the wired stop "
+            "(STO) if anything moves.",
             EXIT_FAILED,
         )
     series = status["series"]
@@ -135,6 +136,8 @@ def stop(
         typer.echo(f"No session is running. The rig is in fault: {status['reason']}")
     elif told["stopping"] or by_signal:
         typer.echo(f"The session has ended; the torque is off.{_file_of_last(status)}")
+    elif status["state"] == "idle":
+        typer.echo("No session is running; the devices are not connected yet.")
     else:
         typer.echo("No session is running; the torque is off.")
 

@@ -182,6 +182,8 @@ def _text(path: Path) -> str:
             raise EdsError(f"{path}: is no ordinary file; name the drive's EDS file.")
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
+    except EdsError:  # a ValueError too
+        raise
     except OSError as error:
         raise EdsError(f"{path}: cannot be read ({error.strerror}).") from error
     except ValueError as error:  # a NUL in the name

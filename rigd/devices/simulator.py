@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import socket
 import stat
 import tempfile
@@ -20,6 +21,8 @@ if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters
 
 _SOCKETS = Path("/proc/net/unix")
+_LISTENER = re.compile(r"\S+: \S+ \S+ ([0-9A-Fa-f]{1,8}) \S+ \S+ +\S+ (/.*)")
+"""Anybody may give a socket any name, with a line break in it as well."""
 _LISTENS = 0x10000
 
 
@@ -104,12 +107,12 @@ def unreachable_simulators(rig_name: str) -> list[Path]:
     found = set()
     try:
         # Num RefCount Protocol Flags Type St Inode Path
-        lines = _SOCKETS.read_text("utf-8", errors="surrogateescape").splitlines()[1:]
+        lines = _SOCKETS.read_text("utf-8", errors="surrogateescape").split("\n")
     except OSError:
         return []
-    for fields in (line.split(maxsplit=7) for line in lines):
-        if len(fields) == 8 and int(fields[3], 16) & _LISTENS:
-            path = Path(fields[7])
+    for match in filter(None, map(_LISTENER.fullmatch, lines)):
+        if int(match[1], 16) & _LISTENS:
+            path = Path(match[2])
             if path.name == f"{rig_name}.control":
                 found.add(path)
     return sorted(found)

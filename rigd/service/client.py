@@ -307,7 +307,8 @@ def await_end(path: Path, patience_s: float) -> Document | None:
     Returns
     -------
     dict or None
-        Its status then; None if it still runs or stops one after that time.
+        Its status then; None if it has not said so in that time: it still stops one, or a crowd
+        keeps this client out.
 
     Raises
     ------
@@ -315,9 +316,12 @@ def await_end(path: Path, patience_s: float) -> Document | None:
         If it cannot be asked any more.
     """
     deadline_s = time.monotonic() + patience_s
-    with Client(path) as client:
+    with Client(path, answer_s=patience_s) as client:
         while True:
-            status = client.ask("status")
+            try:
+                status = client.ask("status")
+            except _CrowdedError:
+                return None
             series = status["series"]
             if status["state"] not in ("running", "stopping") and not (
                 series is not None and series["running"]
@@ -353,11 +357,12 @@ def what_is_left(pid: int, uid: int) -> str:
             f"The daemon is gone (process {pid}), and its control process {control[0]} still runs "
             "and may move the motor: press the wired stop (STO). Then " + begin_again
         )
-    if uid != os.getuid() and not Path("/proc/1").exists():
+    if uid != os.getuid() and not _sees_other_users():
         return f"The daemon is gone (process {pid}). {_UNKNOWN} Then {begin_again}"
     return (
-        "The daemon is gone. Its control process, which alone moves the motor, has ended too; what "
-        f"was recorded of a session is in the daemon's output folder; {begin_again}"
+        "The daemon is gone. Its control process, which alone moves the motor, has ended too: see "
+        "that the rig stands still. What was recorded of a session is in the daemon's output "
+        f"folder; {begin_again}"
     )
 
 
@@ -372,6 +377,14 @@ def _is_there(pid: int) -> bool:
     with suppress(OSError, IndexError):  # dead, and not yet buried by its parent
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return True
+
+
+def _sees_other_users() -> bool:
+    """Whether the system shows the processes of other users (mount option hidepid of /proc)."""
+    try:
+        return bool(Path("/proc/1/cmdline").read_bytes())
+    except OSError:
+        return False
 
 
 def _control_processes(pid: int) -> Iterator[int]:

@@ -486,7 +486,7 @@ class Service:
             series.reason = str(error)
             if not isinstance(error, RefusedError):
                 path = error.path if isinstance(error, SessionFailedError) else None
-                fault = series.reason = f"{error} The drive is disabled. {what_is_kept(path)}"
+                fault = series.reason = f"{error} {what_is_kept(path)}"
         except Exception as error:
             # Nobody may be left to switch off: what cannot be explained ends with everything off.
             _log.exception("a session ended in a way that was not foreseen")

@@ -21,7 +21,8 @@ class State(StrEnum):
     STOPPING = "stopping"
     """A stop was asked for, and the session has not ended yet."""
     FAULT = "fault"
-    """The torque is off, and stays so until an operator resets the rig."""
+    """Nothing commands a torque until an operator resets the rig; the reason says what the drive
+    showed."""
 
 
 _LEADS_TO: Mapping[State, frozenset[State]] = {

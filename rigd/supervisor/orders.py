@@ -6,6 +6,7 @@ Shared by sessions in the foreground and by the daemon.
 import os
 import shlex
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -102,14 +103,17 @@ def load_rig(
 def _refuse_unreachable_simulators(profile: Profile) -> None:
     """Refuse to move the hardware while somebody simulates it where this command does not look."""
     for path in unreachable_simulators(profile.rig.name):
-        try:
+        remedy, whose = "run this command as its user to use it", "by another user"
+        with suppress(OSError, ValueError):
             uid = path.stat().st_uid
-            remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
-            whose = "in another environment" if uid == os.getuid() else f"by user {uid}"
-        except OSError:
-            remedy, whose = "run this command as its user to use it", "by another user"
+            whose = f"by user {uid}"
+            if uid == os.getuid():
+                whose = "in another environment"
+                remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
+        # Whoever made it has chosen its name.
+        shown = "".join(c if c.isprintable() else "?" for c in str(path))
         raise RefusedError(
-            f"A simulated rig of {profile.name} is run {whose} ({path}), which this command does "
+            f"A simulated rig of {profile.name} is run {whose} ({shown}), which this command does "
             f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "
             "--hardware if the hardware is meant."
         )

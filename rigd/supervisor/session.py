@@ -201,6 +201,8 @@ class Session:
         self._pulse = Pulse()
         self._recorder_lost: str | None = None
         self._control_at_work = False
+        # Until it is enabled it is off; then the control process has to have seen that it is.
+        self._drive_at_end = "The drive is disabled."
         self._opened: Path | None = None
         self._kept: Path | None = None
         self.device_failed = False
@@ -223,7 +225,7 @@ class Session:
             if self._control_at_work:
                 self._board[Word.STOP] = Stop.NO_RECORDER
                 self._listen_to_control()
-            failure = SessionFailedError(self._recorder_lost)
+            failure = SessionFailedError(f"{self._recorder_lost} {self._drive_at_end}")
             failure.path, failure.kept = self._opened, self._kept
             failure.counts = self._counts()
             raise failure from None
@@ -331,7 +333,9 @@ class Session:
             return finished
         if "finished" in answer:
             self._control_at_work = False
-            self.device_failed |= answer["device_failed"]
+            if answer["device_failed"]:
+                self.device_failed = True
+                self._drive_at_end = answer["reason"]
         return answer
 
     def _kill_control(self, why: str) -> Message:
@@ -345,6 +349,7 @@ class Session:
     def _control_died(self, reason: str) -> Message:
         self._control_at_work = False
         self.device_failed = True
+        self._drive_at_end = reason
         return self._as_finished(reason)
 
     def _as_finished(self, reason: str) -> Message:

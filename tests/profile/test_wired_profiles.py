@@ -144,6 +144,7 @@ def test_a_name_has_to_be_fit_for_files(refuse, name):
         ('set_objects = ["3001:2 u8 256"]', r"set_objects\[0\] .*u8 does not hold \(0 to 255\)"),
         ('set_objects = ["3001:2 u8 abc"]', r"set_objects\[0\] .*no whole number"),
         ('set_objects = ["6072 u16 100"]', r"set_objects\[0\] .*rigd sets itself"),
+        ('set_objects = ["6071 i16 100"]', r"set_objects\[0\] .*rigd sets itself"),
         ('set_objects = ["1600:1 u32 1"]', r"set_objects\[0\] .*rigd sets itself"),
         ('set_objects = ["1010:1 u32 0x65766173"]', r"set_objects\[0\] .*memory at every start"),
         ('eds = "nowhere.eds"', r'eds = "nowhere.eds": there is no file .*nowhere.eds'),

@@ -6,6 +6,8 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+from contextlib import suppress
 
 import pytest
 
@@ -210,4 +212,35 @@ def test_the_end_is_waited_for_until_it_is_seen(path):
     status = await_end(path, 30.0)
     assert status is not None
     assert status["state"] == "ready"
+    listener.close()
+
+
+def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypatch):
+    """Not seen is not seen: neither that the session has ended, nor that it goes on."""
+    monkeypatch.setattr(client_module, "_PAUSE_S", 0.01)
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen(5)
+    full = {"reply": None, "ok": False, "error": "There are too many clients.", "crowded": True}
+    crowded = threading.Event()
+    crowded.set()
+
+    def work():
+        with suppress(OSError):
+            while True:
+                link, _ = listener.accept()
+                if crowded.is_set():
+                    with link:
+                        link.sendall(json.dumps(full).encode() + b"\n")
+                else:
+                    kept.append(link)
+
+    kept = []
+    threading.Thread(target=work, daemon=True).start()
+    began_s = time.monotonic()
+    assert await_end(path, 0.3) is None
+    crowded.clear()
+    with pytest.raises(DaemonGoneError, match="not known"):
+        await_end(path, 0.3)
+    assert time.monotonic() - began_s < 30.0  # and not the minute of other answers
     listener.close()

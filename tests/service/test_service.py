@@ -254,6 +254,22 @@ def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
     assert told.items() >= session.items()
 
 
+def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(operated):
+    doubt = "Drive: it does not show that it is off; see that it is, by its STO if need be."
+
+    def fail_both(drive):
+        drive.off_doubt = doubt
+        operated.rig._crew.recorder.kill()
+
+    operated.world.countdown, operated.world.then = 3000, fail_both
+    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    assert operated.state is State.FAULT
+    reason = operated.last["reason"]
+    for words in ("killed by signal 9", doubt, "rigd recover"):
+        assert words in reason
+    assert "is disabled" not in reason
+
+
 def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
     refusal = operated.ask(
         "start", excitation="step", parameters={"amplitude_rad": 3.0, "duration_s": 1.0}

@@ -62,6 +62,21 @@ def test_neither_does_the_hardware_move_beside_one_of_another_user(profile, runt
     assert unreachable_simulators(name) == []
 
 
+def test_a_socket_of_any_name_is_no_traceback_and_does_nothing_to_the_terminal(
+    profile, runtime_folder
+):
+    """Every user may make one, and the kernel lists its name as it is, line breaks included."""
+    for name in ("a\n1: 2 3 xyz 5 6 7 /8", "b\n1 2 3 xyz 5 6 7 8", "c\x0b1 2 3 xyz 5 6 7 8"):
+        with listening(runtime_folder / name):
+            assert load_rig(profile)[1] is Reality.HARDWARE
+    with (
+        listening(runtime_folder / "\x1b]0;gone\x07" / f"{profile.stem}.control"),
+        pytest.raises(RefusedError, match="A simulated rig of") as refused,
+    ):
+        load_rig(profile)
+    assert "\x1b" not in str(refused.value)
+
+
 def test_simulated_rigs_of_other_names_and_dead_ones_are_passed_over(profile, runtime_folder):
     with listening(runtime_folder / "rigd" / f"other_{profile.stem}.control"):
         assert load_rig(profile)[1] is Reality.HARDWARE

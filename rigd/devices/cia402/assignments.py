@@ -27,7 +27,9 @@ _PDOS: Final = range(0x1400, 0x1C00)
 _STORED: Final = (0x1010, 0x1011, *range(0x1F50, 0x1F58))
 """Storing and restoring of parameters, and of firmware."""
 _SET_BY_RIGD: Final = {
-    (each.index, each.sub) for each in REQUIREMENTS if Access.WRITE in each.access
+    (each.index, each.sub)
+    for each in REQUIREMENTS
+    if each.access & (Access.WRITE | Access.RECEIVED)
 }
 
 

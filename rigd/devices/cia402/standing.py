@@ -73,8 +73,9 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
 
 
 def command_off(sdo: SdoAccess) -> None:
-    """Send controlword 0 and do not care for the answer."""
-    with suppress(DeviceError), sdo.hurried():
+    """Send controlword 0 and do not care for the answer; never raises."""
+    # An adapter's library may raise anything, and this is the way off.
+    with suppress(Exception), sdo.hurried():
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
@@ -150,9 +151,10 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
             command_off(sdo)
             if not told:
                 # A drive whose node was stopped answers again; another may ignore it.
-                sdo.tell_pre_operational()
-                told = True
-            with suppress(DeviceError):
+                with suppress(Exception):
+                    sdo.tell_pre_operational()
+                    told = True
+            with suppress(Exception):
                 statusword = sdo.read(objects.STATUSWORD)
                 if state_of(statusword) in OFF:
                     return
@@ -161,9 +163,16 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
                 break
             time.sleep(_POLL_S)
     if statusword is None:
-        sdo.to_pre_operational()  # patiently, and it names what else is on the bus
-        sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
-        statusword = sdo.read(objects.STATUSWORD)
+        try:
+            sdo.to_pre_operational()  # patiently, and it names what else is on the bus
+            sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
+            statusword = sdo.read(objects.STATUSWORD)
+        except Exception as error:
+            said = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
+            raise DeviceError(
+                f"{said} It has not shown that it is off: keep clear of the beam, and press the "
+                "wired stop (STO) if anything moves."
+            ) from None
         if state_of(statusword) in OFF:
             return
     raise DeviceError(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.devices.cia402.drive import Cia402Drive
+from rigd.devices.cia402.sdo import SdoAccess
 from rigd.devices.cia402.values import interpolation_time, sync_period_us, torque_limit_per_mille
 from rigd.devices.contracts import DeviceError
 
@@ -328,8 +329,46 @@ class TestResettingADriveThatTurns:
 
     def test_nobody_answers(self, drive, turning):
         turning.silent = True
-        with pytest.raises(DeviceError, match=r"no answer on CAN bus can0"):
+        with pytest.raises(DeviceError, match=r"no answer on CAN bus can0 .* not shown that .*STO"):
             drive.reset_fault()
+
+    def test_whatever_an_adapter_raises_at_first_it_is_told_again(
+        self, drive, turning, monkeypatch
+    ):
+        """A full queue, or a library with errors of its own."""
+        for method, trouble in (
+            ("write", RuntimeError("a library's own")),
+            ("tell_pre_operational", DeviceError("CAN bus can0 takes no commands.")),
+            ("read", OSError(5, "Input/output error")),
+        ):
+            monkeypatch.setattr(
+                SdoAccess, method, _failing_once(getattr(SdoAccess, method), trouble)
+            )
+        assert drive.reset_fault() is None
+        assert (turning.state, turning.torque) == ("switch-on disabled", 0)
+
+    def test_an_adapter_that_goes_on_failing_is_told_with_what_was_not_seen(
+        self, drive, turning, monkeypatch
+    ):
+        def fail(*_):
+            raise OSError(5, "Input/output error")
+
+        for method in ("write", "read", "tell_pre_operational"):
+            monkeypatch.setattr(SdoAccess, method, fail)
+        with pytest.raises(DeviceError, match=r"Input/output error.*not shown that .*STO"):
+            drive.reset_fault()
+
+
+def _failing_once(method, trouble):
+    """Have a method raise an error before it works."""
+    left = [trouble]
+
+    def failing(*arguments):
+        if left:
+            raise left.pop()
+        return method(*arguments)
+
+    return failing
 
 
 @pytest.mark.parametrize("late", [1, 2])
