@@ -96,7 +96,7 @@ def profile_for(paper: Paper, eds: Path) -> dict[str, object]:
     if "[6076]" not in sections:
         values["cia402.rated_torque_unit_nm"] = 0.0
     if "[6080]" not in sections:
-        values |= {"cia402.max_speed_rad_s": 0.0, "limits.stop_angle_rad": 100.0}
+        values["cia402.max_speed_rad_s"] = 0.0
     return values
 
 

@@ -46,6 +46,8 @@ VALUES: dict[str, object] = {
     "limits.missed_percent": 50.0,
     "limits.acceleration_rad_s2": 10000.0,
     "limits.tracking_error_rad": 0.5,
+    # So many ticks without an angle are a long way, and nothing is in the way of this shaft.
+    "limits.stop_angle_rad": 100.0,
     "session.tare_s": 0.5,
     "session.return_s": 0.3,
     "session.rest_timeout_s": 20.0,

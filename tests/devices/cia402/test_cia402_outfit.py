@@ -105,7 +105,7 @@ def test_a_mode_that_is_write_only_is_written_and_told_by_6061(make, scripted):
 def test_a_write_only_mode_that_is_not_taken_is_named(make, scripted):
     scripted.write_only |= {(0x6060, 0)}
     scripted.refuse_value[0x6060, 0] = 0x06090030
-    with pytest.raises(DeviceError, match="object 6060.*0x06090030"):
+    with pytest.raises(DeviceError, match=r"object 6060.*0x06090030"):
         make().connect()
 
 
