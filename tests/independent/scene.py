@@ -44,6 +44,7 @@ VALUES: dict[str, object] = {
     "limits.stale_ticks_in_a_row": 100,
     "limits.missed_ticks_in_a_row": 100,
     "limits.missed_percent": 50.0,
+    "limits.stale_percent": 50.0,
     "limits.acceleration_rad_s2": 10000.0,
     "limits.tracking_error_rad": 0.5,
     # So many ticks without an angle are a long way, and nothing is in the way of this shaft.
