@@ -58,8 +58,9 @@ def new(
     """Write a profile for a drive: what its EDS file tells, and what the terminal is asked for.
 
     Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
-    motor are asked for; Enter keeps the value shown, which stays "assumed". Without a terminal
-    nothing is asked, and what has to be filled in is listed. No file is ever overwritten.
+    motor are asked for; Enter keeps the value shown, which stays "assumed". What the drive lacks is
+    accepted only by a yes. Without a terminal nothing is asked or accepted, and what has to be
+    filled in is listed. No file is ever overwritten.
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
@@ -81,10 +82,17 @@ def new(
     for doubt in draft.doubts:
         typer.echo(f"Note: {doubt}", err=True)
     missing = draft.unanswered()
-    if missing:
+    lacks = [finding.accept for finding in draft.unaccepted()]
+    if missing or lacks:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
     for question in missing:
         typer.echo(f"  {question.key} = {draft.value(question.key)}: {question.text}", err=True)
+    if lacks:
+        typer.echo(
+            f"  cia402.accept_without: {', '.join(lacks)}: what the drive lacks; rigd refuses it "
+            "until you accept each by its name",
+            err=True,
+        )
     typer.echo(f"{output}: written. Next: rigd check --profile {output}")
 
 
@@ -103,12 +111,28 @@ def _asked(draft: "Draft") -> str:
             for question in draft.questions():
                 _ask(draft, question.key, question.text)
             try:
-                return draft.text()
+                draft.text()
             except ProfileError as error:
                 typer.echo(f"{error}\nOnce more:", err=True)
+                continue
+            _ask_for_acceptance(draft)
+            return draft.text()
     except typer.Abort:
         typer.echo("Stopped; no profile was written.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _ask_for_acceptance(draft: "Draft") -> None:
+    """Ask of each thing that the drive lacks whether it may be missing; Enter is no."""
+    declined: set[str] = set()
+    # An answer may settle another: without a watchdog nothing acts on a silent computer anyway.
+    while lacks := [each for each in draft.unaccepted() if each.accept not in declined]:
+        typer.echo(lacks[0].sentence, err=True)
+        name = lacks[0].accept
+        if typer.confirm(f"Run it without ({name})?", default=False, err=True):
+            draft.accept(name)
+        else:
+            declined.add(name)
 
 
 def _ask(draft: "Draft", key: str, text: str) -> None:

@@ -1,22 +1,18 @@
 """Electronic data sheets (EDS and DCF files, CiA 306): what a drive has, as its vendor's file says.
 
-The canopen library interprets types, limits, defaults and node ids. What real files have and it
-refuses (byte order marks, keys in lower case, sections given twice or out of order, empty values,
-octal numbers, missing names) is put right in one place before: :func:`_put_right`.
+What real files have and the canopen library refuses (byte order marks, keys in lower case, sections
+given twice or out of order, empty values, octal numbers, missing names) is put right in one place
+before: :func:`_put_right`. What it reads by itself is read alike here, without its import, which
+takes longer than a file.
 """
 
-import io
-import logging
 import re
 import stat
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ODVariable
+from typing import Final
 
 MAX_BYTES: Final = 4_000_000
 """Of a file: the greatest that vendors publish have a quarter of it."""
@@ -24,7 +20,7 @@ MAX_ENTRIES: Final = 20_000
 """Of its objects and sub-indices: five times what the greatest drives have."""
 
 _BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
-_VARIABLE, _ARRAY, _RECORD = 0x7, 0x8, 0x9
+_ARRAY, _RECORD = 0x8, 0x9
 _BITS: Final = {
     0x01: 1, 0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32,
     0x10: 24, 0x11: 64, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64,
@@ -32,22 +28,16 @@ _BITS: Final = {
 }  # fmt: skip
 """Lengths of the basic data types (CiA 301)."""
 _SIGNED: Final = frozenset((0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15))
-_DOMAIN: Final = 0x0F
+_TEXTS: Final = (0x09, 0x0B)
+_OCTETS, _DOMAIN = 0x0A, 0x0F
+_FRACTIONS: Final = {0x08: "<f", 0x11: "<d"}
 _LAST_BASIC_TYPE: Final = 0x1B
 _ACCESS: Final = ("ro", "rw", "wo", "const", "rwr", "rww")
 
 _OBJECT = re.compile(r"[0-9A-F]{4}", re.IGNORECASE)
 _MEMBER = re.compile(r"([0-9A-F]{4})sub([0-9A-F]{1,2})", re.IGNORECASE)
+_NODE_ID = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(0x[0-9a-f]{1,32}|[0-9]{1,32})", re.IGNORECASE)
-
-_KEYS: Final = {
-    key.lower(): key
-    for key in (
-        "ParameterName", "DataType", "AccessType", "PDOMapping", "LowLimit",
-        "HighLimit", "DefaultValue", "ParameterValue",
-    )
-}  # fmt: skip
-"""Of an object, in CiA 306's spelling; further ones are of no use here."""
 
 Sections = dict[str, dict[str, str]]
 """Keys and values of a file, by the names of its sections; both in lower case."""
@@ -141,7 +131,7 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     """
     sections = _sections(_text(path), path)
     device = sections.get("deviceinfo", {})
-    entries = {(e.index, e.sub): e for e in _entries(_put_right(sections, path), node_id)}
+    entries = {(e.index, e.sub): e for e in _entries(_put_right(sections, path), sections, node_id)}
     if not entries:
         raise EdsError(f"{path}: is no EDS file: no object of a drive is described in it.")
     return Eds(
@@ -239,12 +229,11 @@ def _too_many(path: Path) -> EdsError:
     )
 
 
-def _put_right(sections: Sections, path: Path) -> Sections:
-    """Return the objects of a file as the canopen library takes them.
+def _put_right(sections: Sections, path: Path) -> dict[tuple[int, int], Mapping[str, str]]:
+    """Return the keys of each object, or sub-index of one, that holds a value.
 
-    Each object comes before its sub-indices; every sub-index is written out, also those that an
-    array declares together (``CompactSubObj``); names, types and access rights are there; keys have
-    CiA 306's spelling, and numbers are decimal. What has no value is left out.
+    In the order of the indices, also those that an array declares together (``CompactSubObj``).
+    Name, type and access rights are those of the whole object where a sub-index has none.
     """
     members: dict[int, dict[int, dict[str, str]]] = {}
     for title, keys in sections.items():
@@ -252,29 +241,30 @@ def _put_right(sections: Sections, path: Path) -> Sections:
             members.setdefault(int(match[1], 16), {}).setdefault(int(match[2], 16), keys)
         elif _OBJECT.fullmatch(title):
             members.setdefault(int(title, 16), {})
-    right: Sections = {}
-    for index, subs in members.items():
+    right: dict[tuple[int, int], Mapping[str, str]] = {}
+    for index, subs in sorted(members.items()):
         title = f"{index:04x}"
-        keys = sections.get(title, {})
+        keys = _with_values(sections.get(title, {}))
         for sub, compact in _compact_members(title, sections):
             subs.setdefault(sub, compact)
         # Neither a kind that is missing nor a wrong one makes members disappear.
         kind = _integer(keys.get("objecttype", ""))
-        if subs:
-            kind = _RECORD
-        elif kind in (_ARRAY, _RECORD) and "datatype" not in keys:
+        if not subs and kind in (_ARRAY, _RECORD) and "datatype" not in keys:
             continue  # nothing of it is described
-        else:
-            kind = _VARIABLE
-        shared = {key: keys[key] for key in ("datatype", "accesstype") if key in keys}
         name = keys.get("parametername") or title.upper()
-        right[title] = _object_keys(keys, name, kind, sections)
+        shared = {"parametername": name}
+        if not subs:
+            right[index, 0] = shared | keys
+        shared |= {key: keys[key] for key in ("datatype", "accesstype") if key in keys}
         for sub in sorted(subs):
-            own = _object_keys(shared | subs[sub], name, _VARIABLE, sections)
-            right[f"{title}sub{sub:X}"] = own
+            right[index, sub] = shared | _with_values(subs[sub])
         if len(right) > MAX_ENTRIES:
             raise _too_many(path)
     return right
+
+
+def _with_values(keys: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in keys.items() if value}
 
 
 def _compact_members(title: str, sections: Sections) -> Iterator[tuple[int, dict[str, str]]]:
@@ -298,15 +288,34 @@ def _compact_members(title: str, sections: Sections) -> Iterator[tuple[int, dict
         yield sub, shared | {key: value for key, value in own.items() if value}
 
 
-def _object_keys(
-    keys: Mapping[str, str], name: str, kind: int, sections: Sections
-) -> dict[str, str]:
-    """Return the keys of an object that are of use, without those that have no value."""
-    found = {_KEYS[key]: value for key, value in keys.items() if key in _KEYS and value}
-    for key in ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit"):
-        if key in found:
-            found[key] = _NUMBER.sub(lambda match: str(_integer(match[0])), found[key])
-    data_type = _integer(found.get("DataType", ""))
+def _entries(
+    right: Mapping[tuple[int, int], Mapping[str, str]], sections: Sections, node_id: int
+) -> Iterator[EdsEntry]:
+    """Interpret the objects of a file that has been put right."""
+    for (index, sub), keys in right.items():
+        data_type = _data_type(keys, sections)
+        value: int | bytes | None = None
+        # The value that a DCF sets comes before the default, unless it is none.
+        for key in ("parametervalue", "defaultvalue"):
+            if value is None and key in keys:
+                value = _value(keys[key], data_type, node_id)
+        access = keys.get("accesstype", "").lower()
+        yield EdsEntry(
+            index=index,
+            sub=sub,
+            name=_shown(keys["parametername"]),
+            data_type=data_type,
+            access=access if access in _ACCESS else "rw",
+            mappable=_integer(keys.get("pdomapping", "")) != 0,
+            default=value if isinstance(value, int) else None,
+            low=_signed(_whole(keys.get("lowlimit", "")), data_type),
+            high=_signed(_whole(keys.get("highlimit", "")), data_type),
+            content=value if isinstance(value, bytes) else b"",
+        )
+
+
+def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
+    data_type = _integer(keys.get("datatype", ""))
     if data_type > _LAST_BASIC_TYPE:
         # Tools define a type of their own for a number with limits, as an object whose sub-index 1
         # names the basic type.
@@ -314,67 +323,33 @@ def _object_keys(
         data_type = _integer(basic)
         if not 0 < data_type <= _LAST_BASIC_TYPE:
             data_type = _DOMAIN
-    access = found.get("AccessType", "").lower()
-    return found | {
-        "ParameterName": found.get("ParameterName", name),
-        "ObjectType": str(kind),
-        "DataType": str(max(data_type, 0)),
-        "AccessType": access if access in _ACCESS else "rw",
-        "PDOMapping": str(_integer(found.get("PDOMapping", ""))),
-    }
+    return max(data_type, 0)
 
 
-class _CleanFile(io.StringIO):
-    """A text that canopen takes for a file; it goes by the end of the name."""
-
-    name = "drive.eds"
-
-
-def _entries(right: Sections, node_id: int) -> Iterator[EdsEntry]:
-    """Have the canopen library interpret the objects of a file that has been put right."""
-    from canopen import import_od
-    from canopen.objectdictionary import ODVariable
-
-    # It warns of what is missing in a file; without a handler that would be printed.
-    logging.getLogger("canopen").addHandler(logging.NullHandler())
-    lines = ["[DeviceInfo]"]  # whose absence it warns of in a way that Python deprecates
-    for title, keys in right.items():
-        lines.append(f"[{title}]")
-        lines += [f"{key}={value}" for key, value in keys.items()]
-    for found in import_od(_CleanFile("\n".join(lines)), node_id).values():
-        if isinstance(found, ODVariable):
-            yield _entry(found)
-        else:
-            yield from map(_entry, found.subindices.values())
+def _value(text: str, data_type: int, node_id: int) -> int | bytes | None:
+    """Return a number, or what else the drive holds as its bytes; None of what is neither."""
+    try:
+        if data_type in _TEXTS:
+            return text.encode("utf-8", errors="replace")
+        if data_type in (_OCTETS, _DOMAIN):
+            return bytes.fromhex(text)
+        if data_type in _FRACTIONS:
+            return struct.pack(_FRACTIONS[data_type], float(text))
+    except (ValueError, OverflowError):
+        return None
+    # An identifier may stand as $NODEID+0x180.
+    rest, relative = _NODE_ID.subn("", text.replace(" ", ""))
+    number = 0 if relative and not rest else _whole(rest)
+    if number is None:
+        return None
+    return _signed(number + node_id if relative else number, data_type)
 
 
-def _entry(variable: "ODVariable") -> EdsEntry:
-    value = variable.default if variable.value is None else variable.value
-    data_type = variable.data_type or 0
-    default = value if type(value) is int else None
-    bits = _BITS.get(data_type)
-    if default is not None and bits and data_type in _SIGNED and default >> bits - 1 == 1:
-        default -= 1 << bits  # written as a positive hexadecimal number
-    return EdsEntry(
-        index=variable.index,
-        sub=variable.subindex,
-        name=_shown(variable.name),
-        data_type=data_type,
-        access=variable.access_type,
-        mappable=variable.pdo_mappable,
-        default=default,
-        low=variable.min,
-        high=variable.max,
-        content=_content(value, data_type),
-    )
-
-
-def _content(value: object, data_type: int) -> bytes:
-    """Return a default that is no whole number as the drive holds it."""
-    if isinstance(value, float):
-        return struct.pack("<f" if _BITS.get(data_type) == 32 else "<d", value)
-    data = value.encode("utf-8") if isinstance(value, str) else value
-    return data if isinstance(data, bytes) else b""
+def _signed(number: int | None, data_type: int) -> int | None:
+    """Return a number below zero that is written as a positive hexadecimal one."""
+    if number is not None and data_type in _SIGNED and number >> _BITS[data_type] - 1 == 1:
+        return number - (1 << _BITS[data_type])
+    return number
 
 
 def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str) -> int:
@@ -385,10 +360,15 @@ def _identity(entries: Mapping[tuple[int, int], EdsEntry], sub: int, stated: str
 
 
 def _integer(text: str) -> int:
-    """Return a number in CiA 306's notation: 0x1F, 31, or octal 037; 0 of anything else."""
+    """Return a number as :func:`_whole` does; 0 of anything else."""
+    return _whole(text) or 0
+
+
+def _whole(text: str) -> int | None:
+    """Return a number in CiA 306's notation: 0x1F, 31, or octal 037; None of anything else."""
     match = _NUMBER.fullmatch(text.strip())
     if match is None:
-        return 0
+        return None
     digits = match[0].lower()
     octal = re.fullmatch(r"([+-]?)0([0-7]+)", digits)
     if octal:

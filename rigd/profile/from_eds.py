@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
-from rigd.devices.cia402.suitability import Grade, judge
+from rigd.devices.cia402.suitability import Finding, Grade, judge
 from rigd.devices.eds import Eds
 from rigd.profile.load import ProfileError, profile_of
 from rigd.profile.settings import Profile, keys
@@ -47,8 +47,9 @@ QUESTIONS = (
 _OWN_WATCHDOG = Question(
     "cia402.own_watchdog_s",
     "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
-    "(0: none, and rigd refuses the drive)",
+    "(0: none)",
 )
+_ACCEPT = "cia402.accept_without"
 _LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
 _MAKERS_OWN = range(0x2000, 0x6000)
 _MOST_NAMED = 4
@@ -90,6 +91,7 @@ class Draft:
         self._eds = eds
         self._path = path
         self._findings = judgement.findings
+        self._accepted: list[str] = []
         self._settings = {setting.key: setting for setting in self._told()}
 
     def value(self, key: str) -> SettingValue:
@@ -116,6 +118,29 @@ class Draft:
             raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
         if value != self.value(key):
             self._settings[key] = Setting(key, value, "datasheet")
+
+    def unaccepted(self) -> list[Finding]:
+        """Return what the drive lacks and the profile does not accept, so that rigd refuses it.
+
+        Raises
+        ------
+        ProfileError
+            If the values given so far contradict one another.
+        """
+        accepted = Setting(_ACCEPT, tuple(self._accepted))
+        text = with_settings(self._base.text, [*self._settings.values(), accepted])
+        found = judge(self._eds, profile_of(text, self._path).rig).findings
+        return [each for each in found if each.accept and each.grade is Grade.REFUSED]
+
+    def accept(self, name: str) -> None:
+        """Have the profile accept that something is missing: the operator's decision, never ours.
+
+        Parameters
+        ----------
+        name
+            One of `unaccepted`.
+        """
+        self._accepted.append(name)
 
     @property
     def doubts(self) -> list[str]:
@@ -156,7 +181,29 @@ class Draft:
             Setting(question.key, self.value(question.key), reason="TO FILL IN: " + question.text)
             for question in self.unanswered()
         ]
-        return with_settings(self._base.text, [*self._settings.values(), *marked])
+        settings = [*self._settings.values(), *marked, *self._acceptance()]
+        return with_settings(self._base.text, settings)
+
+    def _acceptance(self) -> Iterator[Setting]:
+        """Yield what the operator accepts; what nobody has decided on stands as a comment."""
+        left = [finding.accept for finding in self.unaccepted()]
+        own = self._own_limits() if TORQUE_LIMIT in (*left, *self._accepted) else ""
+        hint = (
+            f" For a torque limit of its own see {own}, set by cia402.set_objects." if own else ""
+        )
+        if self._accepted:
+            why = "The drive lacks, by its file, what these names stand for (docs/devices.md)."
+            why += f" Not accepted, so that rigd refuses it: {', '.join(left)}." if left else ""
+            yield Setting(_ACCEPT, tuple(self._accepted), reason=why + hint)
+        elif left:
+            why = (
+                "TO FILL IN: the drive lacks, by its file, what these names stand for "
+                "(docs/devices.md), and rigd refuses it. Take the # away, and from the list what "
+                "must not be missing."
+            )
+            yield Setting(_ACCEPT, tuple(left), reason=why + hint, commented=True)
+        elif self._base.rig.cia402 is not None and self._base.rig.cia402.accept_without:
+            yield Setting(_ACCEPT, (), reason="The drive has, by its file, all that is needed.")
 
     def _lacks(self) -> list[str]:
         """Return the names of what a profile has to accept that this drive has not."""
@@ -184,13 +231,6 @@ class Draft:
 
     def _absent(self) -> Iterator[Setting]:
         lacks = self._lacks()
-        # A watchdog is never accepted as missing by anybody but the operator.
-        accepted = tuple(name for name in lacks if name != WATCHDOG)
-        if accepted:
-            why = "The drive lacks, by its file, what these names stand for (docs/devices.md)."
-            if TORQUE_LIMIT in accepted and (own := self._own_limits()):
-                why += f" For a torque limit of its own see {own}, set by cia402.set_objects."
-            yield Setting("cia402.accept_without", accepted, reason=why)
         for missing, key, why in (
             (not self._eds.get(objects.MAX_SPEED_RPM), "max_speed_rad_s", "6080 (max motor speed)"),
             (

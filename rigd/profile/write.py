@@ -27,6 +27,8 @@ class Setting:
     reason: str = ""
     """Becomes a comment above the value."""
     hexadecimal: bool = False
+    commented: bool = False
+    """Stands as a comment only, for somebody to decide on; the key keeps its default."""
 
 
 def with_settings(text: str, settings: Iterable[Setting]) -> str:
@@ -48,7 +50,8 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     lines = text.splitlines()
     for setting in settings:
         places = _places(lines)
-        new = [*_comment(setting.reason), _line(setting)]
+        line = _line(setting)
+        new = [*_comment(setting.reason), f"# {line}" if setting.commented else line]
         if setting.key in places:
             place = places[setting.key]
             lines[place : place + 1] = new

@@ -46,8 +46,7 @@ def test_it_loads_and_has_what_the_file_tells(new, tmp_path, name, start_from):
     vendor = {"elmo_gold": 0x9A, "e35": 0xFF}.get(name, 0xFB)
     assert settings.vendor_id == vendor
     assert profile.sources["cia402.vendor_id"] == "datasheet"
-    expected = ("torque_limit",) if name.startswith("epos4") else ()
-    assert settings.accept_without == expected
+    assert settings.accept_without == ()
 
 
 @pytest.mark.parametrize("name", WITH_TORQUE)
@@ -56,8 +55,10 @@ def test_it_gets_past_loading_in_a_check(new, rigd_here, monkeypatch, name):
     monkeypatch.setattr("rigd.checks.rig.inspect_devices", lambda _: [])
     new(eds_path(name))
     done = rigd_here("check", "--profile", "my_rig.toml", "--json")
-    # A drive without any watchdog is not accepted by itself.
-    assert done.returncode == (1 if name == "e35" else 0), done.stdout
+    # What a drive lacks is not accepted by itself.
+    lacks = {"e35": "watchdog", "epos4_0110": "torque_limit", "epos4_0170": "torque_limit"}
+    assert done.returncode == (1 if name in lacks else 0), done.stdout
+    assert lacks.get(name, "") in done.stdout
     assert done.stderr == ""
 
 
@@ -70,9 +71,13 @@ def test_what_no_file_tells_is_marked_and_listed(new, tmp_path):
         assert profile.sources.get(question.key, "assumed") == "assumed"
         name = question.key.rpartition(".")[2]
         assert re.search(rf"^# TO FILL IN: [^\n]*\n(# [^\n]*\n)*{name} = ", text, re.MULTILINE)
-    assert 'accept_without = ["torque_limit"]' in text
-    assert "6072 Max torque: absent, accepted by the profile" in done.stderr
-    assert "3001:2 (Output current limit, 15000)" in text
+    shown = (
+        r'^# TO FILL IN: the drive lacks[^\n]*\n(# [^\n]*\n)+# accept_without = \["torque_limit"\]$'
+    )
+    assert re.search(shown, text, re.MULTILINE)
+    assert "cia402.accept_without: torque_limit: what the drive lacks" in done.stderr
+    assert "It has no object 6072 (Max torque)" in done.stderr
+    assert "3001:2 (Output current limit, 15000)" in text.replace("\n# ", " ")
     assert "rigd check asks the drive" in done.stderr
     # The reasons of the profile started from are still there.
     assert "The measured coupling torque cancels the beam's reaction" in text
@@ -82,9 +87,10 @@ def test_what_no_file_tells_is_marked_and_listed(new, tmp_path):
 def test_a_watchdog_is_never_accepted_as_missing_by_itself(new, tmp_path):
     done = new(eds_path("e35"))
     settings = load_profile(tmp_path / "my_rig.toml").rig.cia402
-    assert "watchdog" not in settings.accept_without
+    assert settings.accept_without == ()
     assert settings.own_watchdog_s == 0.0
     assert "cia402.own_watchdog_s" in done.stderr
+    assert "cia402.accept_without: watchdog" in done.stderr
 
 
 def test_objects_that_are_missing_switch_off_what_needs_them(new, tmp_path):
@@ -97,7 +103,8 @@ def test_objects_that_are_missing_switch_off_what_needs_them(new, tmp_path):
     assert settings.max_speed_rad_s == 0.0
     assert settings.rated_torque_unit_nm == 0.0
     assert settings.torque_tolerance_percent == 0.0
-    assert settings.accept_without == ("torque_feedback",)
+    assert settings.accept_without == ()
+    assert '# accept_without = ["torque_feedback"]' in profile.text
     assert profile.rig.can.bitrate_bit_s == 800_000
     assert "rated_torque_unit_nm" not in done.stderr
     assert 'eds = "drive.eds"' in profile.text
@@ -164,7 +171,7 @@ def test_wrong_use(new, tmp_path, eds, more, output, code, words):
 
 
 def test_a_terminal_is_asked(asked, tmp_path):
-    answers = ("can1", "300", "five", "5", "", "1e-6", "0.6", "1.2", "nan", "0.5", "", "")
+    answers = ("can1", "300", "five", "5", "", "1e-6", "0.6", "1.2", "nan", "0.5", "", "", "")
     done = asked(eds_path("epos4_0170"), *answers)
     assert done.exit_code == 0, done.stderr
     profile = load_profile(tmp_path / "my_rig.toml")
@@ -181,6 +188,45 @@ def test_a_terminal_is_asked(asked, tmp_path):
     assert "To fill in" in done.stderr
     assert "  cia402.gear_ratio = 100.0" in done.stderr
     assert "  cia402.node_id" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("lacking", "answers", "accepted", "left"),
+    [
+        (("6072", "6077"), ("y", "yes"), ("torque_limit", "torque_feedback"), ""),
+        (("6072", "6077"), ("", "y"), ("torque_feedback",), "torque_limit"),
+        (("6072", "6077"), ("n", "n"), (), "torque_limit, torque_feedback"),
+        # Without a watchdog nothing acts on a silent computer, whatever 6007 is.
+        (("1016:1", "6007"), ("y",), ("watchdog",), ""),
+        (("1016:1", "6007"), ("n",), (), "watchdog"),
+    ],
+)
+def test_what_is_missing_is_accepted_by_a_yes_only(
+    asked, tmp_path, lacking, answers, accepted, left
+):
+    path = tmp_path / "drive.eds"
+    path.write_text(eds_text(without(*lacking)))
+    questions = len(QUESTIONS) + ("1016:1" in lacking)
+    done = asked(path, *[""] * questions, *answers)
+    assert done.exit_code == 0, done.stderr
+    profile = load_profile(tmp_path / "my_rig.toml")
+    assert profile.rig.cia402.accept_without == accepted
+    assert ("cia402.accept_without: " in done.stderr) == bool(left)
+    assert f"cia402.accept_without: {left}" in done.stderr or not left
+    if accepted and left:
+        assert f"so that rigd refuses it: {left}" in profile.text.replace("\n# ", " ")
+
+
+def test_what_another_drive_may_lack_is_not_taken_over(new, tmp_path):
+    new(eds_path("epos4_0170"), output="first.toml")
+    text = (tmp_path / "first.toml").read_text()
+    line = 'accept_without = ["torque_limit"]'
+    (tmp_path / "first.toml").write_text(text.replace(f"# {line}", line))
+    assert load_profile(tmp_path / "first.toml").rig.cia402.accept_without == ("torque_limit",)
+    for name in ("epos4_0110", "elmo_gold"):
+        done = new(eds_path(name), "--from", "first.toml", output=f"{name}.toml")
+        assert done.returncode == 0, done.stderr
+        assert load_profile(tmp_path / f"{name}.toml").rig.cia402.accept_without == ()
 
 
 def test_answers_that_contradict_each_other_are_asked_for_again(asked, tmp_path):

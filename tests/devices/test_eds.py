@@ -169,6 +169,19 @@ def test_limits(read):
     assert (found.get(0x6060).low, found.get(0x6060).high) == (-1, 10)
 
 
+def test_numbers_in_a_text_stay_as_they_are(read):
+    found = read("[1009]\nDataType=9\nDefaultValue=V0.00.010 0x0F\n")
+    assert found.get(0x1009).content == b"V0.00.010 0x0F"
+
+
+@pytest.mark.parametrize(
+    ("told", "number"),
+    [("$NODEID", 5), ("0x180 + $nodeid", 0x185), ("$NODEID+0600", 0x185), ("$NODEID+x", None)],
+)
+def test_an_identifier_that_goes_with_the_node_id(read, told, number):
+    assert read(f"[1014]\nDataType=7\nDefaultValue={told}\n", 5).get(0x1014).default == number
+
+
 @pytest.mark.parametrize("name", WITH_TORQUE + WITHOUT_TORQUE)
 def test_it_says_what_the_library_says(name):
     """Where the library reads a file by itself, nothing that it found is lost or changed."""
@@ -291,14 +304,14 @@ def test_a_damaged_file_is_read_or_refused(tmp_path_factory, noise, start, lengt
         assert str(path) in str(error)
 
 
-def test_nothing_is_printed_and_the_library_comes_late(tmp_path):
-    """Neither warnings on the terminal nor an import that --help would wait for."""
+def test_nothing_is_printed_and_no_library_is_waited_for(tmp_path):
+    """Neither warnings on the terminal nor an import that takes longer than the file."""
     path = tmp_path / "bare.eds"
     path.write_text("[6040]\nDataType=0x99\nDefaultValue=x\n")
     code = (
         "import sys; from pathlib import Path; from rigd.devices.eds import read_eds; "
-        "assert 'canopen' not in sys.modules and 'can' not in sys.modules; "
-        f"assert read_eds(Path({str(path)!r})).get(0x6040)"
+        f"assert read_eds(Path({str(path)!r})).get(0x6040); "
+        "assert not {'canopen', 'can', 'numpy', 'pydantic'} & set(sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False

@@ -1,15 +1,19 @@
 """Every EDS file of a folder on paper and, as an independent node, in sessions; prints a table.
 
-    python tests/independent/run_public_eds.py FOLDER [--only NAME]
+    python tests/independent/run_public_eds.py FOLDER [--only NAME ...] [--ignore-timing]
 
 A drive with cyclic synchronous torque mode has to pass `rigd check`, a chirp, a fault in
 mid-session, `rigd reset` and the next chirp; left on by a killed host it has to be off within 0.2 s
 of the first frame of `rigd reset`, or that has to fail and say so. Any other drive has to be
-refused by the name of the object, on paper and on the bus.
+refused by the name of the object, on paper within a second and on the bus.
+
+Every row of `rigd check` counts; `--ignore-timing` leaves out those on times, which a computer that
+is busy with other things spoils, and the summary says so.
 """
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -19,7 +23,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from scene import RIGD, Done, Scene
+from scene import RIGD, TIMES, Done, Scene
 
 OFF_WITHIN_S = 0.2
 TIMELY_S = 1.0
@@ -36,6 +40,8 @@ class Paper:
 
     usable: bool
     seconds: float
+    cpu_s: float
+    """What it took of the processor, whatever else the computer did meanwhile."""
     why: str
     accept: list[str]
     absent: set[str]
@@ -54,17 +60,28 @@ class Verdict:
     def complaints(self) -> list[str]:
         return [f"{k}: {v}" for k, v in self.steps.items() if not v.startswith(("ok", "("))]
 
+    @property
+    def outcome(self) -> str:
+        """What it counts as in the summary."""
+        if self.complaints:
+            return "with complaints"
+        if any(result.startswith("(") for result in self.steps.values()):
+            return "not put to the test"
+        return "passed in sessions" if self.paper.usable else "refused as it has to be"
+
 
 def on_paper(eds: Path) -> Paper:
     """Ask `rigd check --eds`, which connects to nothing."""
-    began_s = time.monotonic()
+    began_s, before = time.monotonic(), os.times()
     done = subprocess.run(
         [RIGD, "check", "--eds", eds, "--json"],
         capture_output=True, text=True, timeout=60.0, check=False,
     )  # fmt: skip
-    seconds = time.monotonic() - began_s
+    seconds, after = time.monotonic() - began_s, os.times()
+    cpu_s = after.children_user + after.children_system
+    cpu_s -= before.children_user + before.children_system
     if not done.stdout.startswith("{"):
-        return Paper(False, seconds, done.stderr.strip() or "no answer", [], set())
+        return Paper(False, seconds, cpu_s, done.stderr.strip() or "no answer", [], set())
     document = json.loads(done.stdout)
     rows = document["rows"]
     text = json.dumps(rows)
@@ -72,7 +89,7 @@ def on_paper(eds: Path) -> Paper:
     why = "; ".join(dict.fromkeys(m for row in failed for m in _OBJECT.findall(row)))
     accept = sorted(set(_ACCEPT.findall(text.replace('\\"', '"'))))
     absent = set(re.findall(r"no object ([0-9A-F]{4})", text))
-    return Paper(document["verdict"] != "failed", seconds, why, accept, absent)
+    return Paper(document["verdict"] != "failed", seconds, cpu_s, why, accept, absent)
 
 
 def profile_for(paper: Paper, eds: Path) -> dict[str, object]:
@@ -84,7 +101,7 @@ def profile_for(paper: Paper, eds: Path) -> dict[str, object]:
     if "[6076]" not in sections:
         values["cia402.rated_torque_unit_nm"] = 0.0
     if "[6080]" not in sections:
-        values |= {"cia402.max_speed_rad_s": 0.0, "limits.stop_angle_rad": 100.0}
+        values["cia402.max_speed_rad_s"] = 0.0
     return values
 
 
@@ -113,6 +130,8 @@ def play(
     eds: Path,
     node: dict[str, object] | None = None,
     left_on: tuple[str, ...] = LEFT_ON,
+    *,
+    ignore_timing: bool = False,
 ) -> Verdict:
     """Put one file to the test."""
     paper = on_paper(eds)
@@ -126,10 +145,10 @@ def play(
         return verdict
     with scene:
         if not paper.usable:
-            steps["named on paper"] = "ok" if _OBJECT.search(paper.why) else paper.why
+            steps["named on paper"] = _named(paper, ignore_timing=ignore_timing)
             steps["refused"] = _refused(scene)
             return verdict
-        steps["check"] = "; ".join(scene.check()) or "ok"
+        steps["check"] = "; ".join(scene.check(ignore_timing=ignore_timing)) or "ok"
         steps["chirp"] = complete(scene.chirp())
         if steps["chirp"] != "ok":
             return verdict
@@ -141,6 +160,15 @@ def play(
     for how in left_on:
         steps[f"left on, pre-op {how}"] = play_left_on(eds, how, node, profile)
     return verdict
+
+
+def _named(paper: Paper, *, ignore_timing: bool) -> str:
+    if not _OBJECT.search(paper.why):
+        return paper.why
+    took_s = paper.cpu_s if ignore_timing else paper.seconds
+    if took_s > TIMELY_S:
+        return f"only after {took_s:.2f} s"
+    return f"ok: {paper.why}"
 
 
 def _refused(scene: Scene) -> str:
@@ -181,25 +209,39 @@ def play_left_on(
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", default="", help="Files whose name contains this.")
+    parser.add_argument("--only", nargs="+", default=[""], help="Files whose name contains one.")
+    parser.add_argument(
+        "--ignore-timing",
+        action="store_true",
+        help="Leave out the times that a busy computer spoils.",
+    )
     given = parser.parse_args()
     files = sorted(
         path
         for path in given.folder.iterdir()
-        if path.suffix.lower() in (".eds", ".dcf") and given.only in path.name
+        if path.suffix.lower() in (".eds", ".dcf") and any(part in path.name for part in given.only)
     )
-    bad = 0
+    outcomes: dict[str, list[str]] = {}
     for path in files:
-        verdict = play(path.stem, path)
+        verdict = play(path.stem, path, ignore_timing=given.ignore_timing)
         usable = "usable" if verdict.paper.usable else f"refused ({verdict.paper.why})"
-        say(f"{verdict.name:22} paper {verdict.paper.seconds:.1f} s: {usable}")
-        if verdict.paper.accept:
-            say(f"    profile accepts it without: {', '.join(verdict.paper.accept)}")
+        paper = verdict.paper
+        took = f"{paper.seconds:.2f} s, {paper.cpu_s:.2f} s of the processor"
+        say(f"{verdict.name:22} paper {took}: {usable}")
+        if paper.usable and paper.accept:
+            say(f"    profile accepts it without: {', '.join(paper.accept)}")
         for step, result in verdict.steps.items():
             say(f"    {step:24} {result}")
-        bad += bool(verdict.complaints)
-    say(f"{len(files)} files, {bad} with complaints")
-    return 1 if bad else 0
+        outcomes.setdefault(verdict.outcome, []).append(verdict.name)
+    say(f"{len(files)} files")
+    for outcome, names in outcomes.items():
+        say(f"    {len(names)} {outcome}: {', '.join(names)}")
+    if given.ignore_timing:
+        say(
+            f"Not judged (--ignore-timing): {', '.join(TIMES)}. A refusal on paper within "
+            f"{TIMELY_S:g} s: by the time of the processor."
+        )
+    return 0 if files and "with complaints" not in outcomes else 1
 
 
 def say(line: str) -> None:

@@ -23,7 +23,8 @@ SHIPPED = HERE.parents[1] / "hw_profiles" / "antenna_can.toml"
 NAME = "independent"
 NODE_ID = 5
 HEARTBEAT_TIMEOUT_S = 0.2
-_TIMES = ("polls", "turnaround median", "turnaround 99 %", "both replies after")
+TIMES = ("polls", "turnaround median", "turnaround 99 %", "both replies after")
+"""Rows of `rigd check` that a computer busy with other things spoils."""
 _STARTED_S = 60.0
 _COMMAND_S = 90.0
 
@@ -43,8 +44,11 @@ VALUES: dict[str, object] = {
     "limits.stale_ticks_in_a_row": 100,
     "limits.missed_ticks_in_a_row": 100,
     "limits.missed_percent": 50.0,
+    "limits.stale_percent": 50.0,
     "limits.acceleration_rad_s2": 10000.0,
     "limits.tracking_error_rad": 0.5,
+    # So many ticks without an angle are a long way, and nothing is in the way of this shaft.
+    "limits.stop_angle_rad": 100.0,
     "session.tare_s": 0.5,
     "session.return_s": 0.3,
     "session.rest_timeout_s": 20.0,
@@ -201,8 +205,8 @@ class Scene:
             said += f"\nError: not done after {_COMMAND_S:g} s"
         return Done(process.returncode, said, time.monotonic() - began_s)
 
-    def check(self) -> list[str]:
-        """Return what `rigd check` finds wrong, but for times, which a busy computer spoils."""
+    def check(self, *, ignore_timing: bool = False) -> list[str]:
+        """Return what `rigd check` finds wrong; without TIMES where those are to be ignored."""
         done = self.run("check", "--profile", self.profile, "--json")
         found = [line for line in done.said.splitlines() if line.startswith("{")]
         if not found:
@@ -210,7 +214,7 @@ class Scene:
         return [
             f"{row['what']}: {row['found']} ({row['detail']})"
             for row in json.loads(found[0])["rows"]
-            if row["verdict"] == "failed" and row["what"] not in _TIMES
+            if row["verdict"] == "failed" and not (ignore_timing and row["what"] in TIMES)
         ]
 
     def reset(self) -> Done:

@@ -453,6 +453,18 @@ OPTIONAL: Final = (
 
 REQUIREMENTS: Final = CORE + OPTIONAL
 
+MAY_BE_WRITE_ONLY: Final = (
+    objects.MODE,
+    objects.INTERPOLATION_TIME,
+    objects.ABORT_OPTION,
+    objects.COMMUNICATION_ERROR,
+    objects.HEARTBEAT_PRODUCER_MS,
+    objects.MAX_TORQUE,
+    objects.MAX_SPEED_RPM,
+)
+"""Objects that are set whatever they held before, so that one that cannot be read is written and
+taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
+
 _BY_PLACE: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
 
 

@@ -55,6 +55,7 @@ _ABSENT = {
 }
 """SDO abort codes by which an object that is read, or written after that, counts as absent. A state
 in which it cannot be accessed (0x08000022) and an access in the wrong direction do not."""
+_WRITE_ONLY = 0x0601_0001
 _WRONG_LENGTHS = (0x0607_0010, 0x0607_0012, 0x0607_0013)
 _KINDS = {
     "u8": datatypes.UNSIGNED8,
@@ -77,6 +78,11 @@ class SdoRefusal(DeviceError):
     def is_absent(self) -> bool:
         """Whether the drive has no such object, as far as its code tells."""
         return self.code in _ABSENT
+
+    @property
+    def is_write_only(self) -> bool:
+        """Whether the drive has the object and never shows what it holds."""
+        return self.code == _WRITE_ONLY
 
 
 class NotKept(DeviceError):

@@ -11,6 +11,7 @@ from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402.assignments import parse_assignment
 from rigd.devices.cia402.requirements import (
+    MAY_BE_WRITE_ONLY,
     TORQUE_LIMIT,
     WATCHDOG,
     Access,
@@ -182,12 +183,20 @@ class _SetUp:
     def settle(self, row: Requirement, wanted: int) -> bool:
         """Have an object hold a value, and return whether the drive has it.
 
+        A write-only one is written and not read back, where that may be.
+
         Raises
         ------
         DeviceError
             If the drive cannot do without, or keeps another value that does not do.
         """
-        found = self._sdo.read_if_there(row.index, row.sub)
+        try:
+            found = self._sdo.read_if_there(row.index, row.sub)
+        except SdoRefusal as refusal:
+            if not (refusal.is_write_only and row.index in MAY_BE_WRITE_ONLY):
+                raise
+            self._sdo.write(row.index, row.sub, wanted)
+            return True
         if found == wanted:
             return True
         try:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402.requirements import (
+    MAY_BE_WRITE_ONLY,
     REQUIREMENTS,
     WATCHDOG,
     Access,
@@ -254,7 +255,10 @@ class _Judge:
         if Access.WRITE in needed.access and not entry.writable:
             return self._read_only(needed, entry, found, wanted)
         if Access.READ in needed.access and entry.access == "wo":
-            return objection("is write-only: what it holds cannot be checked.", doubt=True)
+            return objection(
+                f"is write-only: what it holds cannot be checked. {needed.sentence}".rstrip(),
+                doubt=needed.index in MAY_BE_WRITE_ONLY,
+            )
         if wanted is not None and not _takes(entry, wanted):
             limits = f"{_limit(needed, entry.low)} to {_limit(needed, entry.high)}"
             return objection(

@@ -100,6 +100,7 @@ class ScriptedDrive(threading.Thread):
         self.reply_delay_s = 0.0
         self.refuse, self.keep = {}, set()
         self.read_only, self.refuse_value = set(), {}
+        self.write_only = set()
         self.formats = {}
         self.short_tpdo = False
         self.nmt_heartbeats = True
@@ -289,6 +290,8 @@ class ScriptedDrive(threading.Thread):
         elif abort or not readable:
             code = struct.pack("<I", abort or 0x06020000)
             self.send(0x580 + NODE, b"\x80" + reply + code)
+        elif command == 0x40 and (index, sub) in self.write_only:
+            self.send(0x580 + NODE, b"\x80" + reply + struct.pack("<I", 0x06010001))
         elif command == 0x40 and index in (0x1008, 0x100A):
             self._rest = self._told_name if index == 0x1008 else b"V2.10 beta"
             size = struct.pack("<I", len(self._rest))

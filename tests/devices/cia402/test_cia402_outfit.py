@@ -93,6 +93,29 @@ def test_a_limit_that_is_too_high_may_be_accepted_by_name(make, scripted):
     assert drive.outfit().accepted == ("torque_limit",)
 
 
+def test_a_mode_that_is_write_only_is_written_and_told_by_6061(make, scripted):
+    scripted.write_only |= {(0x6060, 0)}
+    drive = make()
+    drive.connect()
+    assert written(scripted)[0x6060, 0] == 10
+    drive.enable()
+    assert scripted.state == "enabled"
+
+
+def test_a_write_only_mode_that_is_not_taken_is_named(make, scripted):
+    scripted.write_only |= {(0x6060, 0)}
+    scripted.refuse_value[0x6060, 0] = 0x06090030
+    with pytest.raises(DeviceError, match=r"object 6060.*0x06090030"):
+        make().connect()
+
+
+def test_a_write_only_object_that_may_hold_something_from_before_is_refused(make, scripted):
+    scripted.objects[0x60B2, 0] = 5
+    scripted.write_only |= {(0x60B2, 0)}
+    with pytest.raises(DeviceError, match="reading object 60B2"):
+        make().connect()
+
+
 @pytest.mark.parametrize("code", [ABSENT, GENERAL, 0x06090011, 0x060A0023, 0x05040001])
 def test_the_ways_of_makers_to_say_that_an_object_is_absent(make, scripted, code):
     scripted.refuse |= dict.fromkeys([(0x1006, 0), (0x60C2, 1), (0x60C2, 2)], code)

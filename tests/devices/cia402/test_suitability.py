@@ -183,6 +183,15 @@ def test_what_a_mapping_has_already_can_be_mapped(judged):
     assert judged(table).refusals == ()
 
 
+def test_what_is_write_only_is_doubtful_where_it_is_set_anyway_and_refused_elsewhere(judged, rig):
+    mode = by_place(judged(changed("6060", "i8 wo -"), rig()))["6060"]
+    assert mode.grade is Grade.DOUBT
+    assert "write-only" in mode.sentence
+    (refusal,) = judged(changed("60B2", "i16 wo -"), rig()).refusals
+    assert "60B2" in refusal
+    assert "write-only" in refusal
+
+
 def test_no_watchdog_goes_missing_silently(judged, rig):
     bare = without("1016:1")
     warned = by_place(judged(bare))["watchdog"]
