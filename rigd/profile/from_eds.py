@@ -44,6 +44,7 @@ QUESTIONS = (
     Question("encoder.resolution_rad", "Encoder step at the output shaft, rad"),
 )
 """Friction and delay are not asked for: rigd identify motor measures them."""
+_OTHER = "What stood here was of another drive."
 _OWN_WATCHDOG = Question(
     "cia402.own_watchdog_s",
     "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
@@ -162,7 +163,8 @@ class Draft:
 
     def unanswered(self) -> list[Question]:
         """Return the questions whose values are still those of the profile started from."""
-        return [each for each in self.questions() if each.key not in self._settings]
+        answered = {key for key, setting in self._settings.items() if setting.reason != _OTHER}
+        return [each for each in self.questions() if each.key not in answered]
 
     def text(self) -> str:
         """Return the text of the profile.
@@ -227,7 +229,17 @@ class Draft:
         if can is not None and eds.bit_rates_bit_s and can.bitrate_bit_s not in eds.bit_rates_bit_s:
             why = f"The drive has no {can.bitrate_bit_s / 1000:g} kbit/s; this is its highest."
             yield Setting("can.bitrate_bit_s", max(eds.bit_rates_bit_s), "datasheet", why)
+        yield from self._of_the_other_drive()
         yield from self._absent()
+
+    def _of_the_other_drive(self) -> Iterator[Setting]:
+        """Yield what the profile started from says of its own drive alone, taken away."""
+        drive = self._base.rig.cia402
+        assert drive is not None
+        if drive.set_objects:
+            yield Setting("cia402.set_objects", (), reason=_OTHER)
+        if drive.own_watchdog_s:
+            yield Setting("cia402.own_watchdog_s", 0.0, "assumed", _OTHER)
 
     def _absent(self) -> Iterator[Setting]:
         lacks = self._lacks()

@@ -254,3 +254,17 @@ def test_the_profiles_there_are(rigd_here, tmp_path):
     lines = done.stdout.splitlines()
     for name in ("antenna_can: ", "antenna_serial: ", "sim: ", "broken: cannot be used: "):
         assert any(line.startswith(name) for line in lines), name
+
+
+def test_what_the_maker_of_another_drive_gave_it_is_not_taken_over(new, tmp_path):
+    shipped = load_profile("antenna_can").text
+    own = '[cia402]\nset_objects = ["3001:2 u32 2500"]\n'
+    own += 'own_watchdog_s = { value = 0.05, source = "datasheet" }\n'
+    (tmp_path / "other.toml").write_text(shipped.replace("[cia402]\n", own, 1))
+    done = new(eds_path("e35"), "--from", "other.toml")
+    assert done.returncode == 0, done.stderr
+    settings = load_profile(tmp_path / "my_rig.toml").rig.cia402
+    assert (settings.set_objects, settings.own_watchdog_s) == ((), 0.0)
+    # The drive has no watchdog, so that its own is asked for.
+    assert "cia402.own_watchdog_s" in done.stderr
+    assert "cia402.accept_without: watchdog" in done.stderr
