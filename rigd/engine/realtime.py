@@ -151,8 +151,13 @@ class Precedence:
         # What is forked, a thread as well, starts with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(thread, policy, os.sched_param(self._priority))
-        if self._others:
+        if not self._others:
+            return
+        try:
             os.sched_setaffinity(thread, self._others)
+        except OSError:  # the cores that it may use have become others meanwhile
+            _be_ordinary(thread)
+            raise
 
     def _put_nicely(self, thread: int) -> None:
         os.setpriority(os.PRIO_PROCESS, thread, NICE)

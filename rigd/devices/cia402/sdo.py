@@ -192,7 +192,7 @@ class SdoAccess:
         """
         try:
             self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
-        except can.CanError as error:
+        except (can.CanError, OSError) as error:
             raise DeviceError(
                 f"{self._name}: CAN bus {self._bus_name} takes no commands ({error})."
             ) from None
@@ -299,7 +299,7 @@ class SdoAccess:
                 f"{self._name}: it refuses {what} {self._title(index, sub)}: {error}.{remedy}",
                 error.code,
             ) from None
-        except (canopen.SdoCommunicationError, can.CanError):
+        except (canopen.SdoCommunicationError, can.CanError, OSError):
             raise DeviceError(
                 f"{self._name}: no answer on CAN bus {self._bus_name} to {what} "
                 f"{self._title(index, sub)}."

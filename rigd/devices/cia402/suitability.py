@@ -285,7 +285,11 @@ class _Judge:
             does = (entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
             mapping = needed.index + 0x200
             if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
-                does = False  # a PDO that cannot be switched off cannot be mapped anew
+                sentence = (
+                    f"its object {needed.place} ({needed.name}) is read-only, so that the PDO "
+                    f"cannot be switched off to be mapped anew. {needed.sentence}"
+                )
+                return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
         else:
             does = needed.fit.allows(entry.default, wanted)
         if does:
