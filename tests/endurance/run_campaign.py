@@ -358,7 +358,7 @@ def report(campaign: Campaign) -> str:
             f"{trend.uncertainty:5.3f}  {trend.slope * len(values):+10.1f}"
         )
         flat = FLAT_DESCRIPTORS if name.endswith("descriptors") else FLAT_KB
-        if trend.grows(campaign.sessions, flat):
+        if trend.grows(campaign.files, flat):
             campaign.complaints.append(f"{name} grows by {trend.slope:.3f} a session")
     return "\n".join(lines)
 
