@@ -127,7 +127,7 @@ def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
                     page = Page(named.stdout.strip())
                     ending.callback(page.close)
             for name, pid in lasting(daemon.pid).items():
-                look = Look.at(pid)
+                look = Look.in_passing(pid)
                 if look is not None:
                     looks.setdefault(name, []).append((time.monotonic() - began_s, look))
         connected = reading.connected

@@ -191,12 +191,14 @@ def session(*options: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
+    """Return the processes that a process has started, by whichever of its threads."""
+    found: list[int] = []
     try:
-        text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            found += map(int, (task / "children").read_text().split())
     except OSError:
-        return []
-    return [int(child) for child in text.split()]
+        pass
+    return found
 
 
 def resident_mb(pid: int) -> float:
