@@ -5,6 +5,7 @@ import grp
 import os
 import socket
 import stat
+import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,7 @@ COMMON = Path("/run/rigd")
 """For a daemon that a group may use: a user's own runtime folder is closed to others."""
 _SUFFIX = ".daemon"
 _PROBE_S = 1.0
+_CREDENTIALS = struct.Struct("3i")
 
 
 class AddressError(Exception):
@@ -29,6 +31,19 @@ def socket_path(rig: str, folder: Path | None = None) -> Path:
     """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise."""
     plain = "".join(c if c.isalnum() else "-" for c in rig).strip("-")
     return (folder or runtime_folder()) / f"{plain}{_SUFFIX}"
+
+
+def peer_of(link: socket.socket) -> tuple[int, int]:
+    """Return process and user at the other end of a connection, as the kernel knows them.
+
+    Raises
+    ------
+    OSError
+        If the kernel does not tell.
+    """
+    told = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(told)
+    return pid, uid
 
 
 def bind(path: Path, group: str | None) -> socket.socket:

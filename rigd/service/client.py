@@ -13,6 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from rigd.service.address import peer_of
+
 Document = dict[str, Any]
 
 STOP_SIGNAL = signal.SIGUSR1
@@ -30,7 +32,6 @@ _END_PATIENCE_S = 3.0
 """In which what a dead daemon has left ends by itself."""
 _PAUSE_S = 0.02
 _TIME = struct.Struct("@ll")
-_CREDENTIALS = struct.Struct("3i")
 _UNKNOWN = (
     "Whether a session still runs is not known: look at the rig, and press the wired stop (STO) if "
     "anything moves."
@@ -108,7 +109,7 @@ class Client:
             patience = _TIME.pack(*divmod(round(self._connect_s * 1e6), 1_000_000))
             link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, patience)
             link.connect(str(self._path))
-            credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+            self.pid, self.uid = peer_of(link)
         except BlockingIOError:
             link.close()
             raise DaemonGoneError(
@@ -120,7 +121,6 @@ class Client:
             raise DaemonGoneError(
                 f"The daemon on {self._path} cannot be reached ({error.strerror or error})."
             ) from None
-        self.pid, self.uid, _ = _CREDENTIALS.unpack(credentials)
 
     def __enter__(self) -> Self:
         return self

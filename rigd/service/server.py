@@ -12,7 +12,6 @@ import json
 import logging
 import os
 import socket
-import struct
 import threading
 import time
 from collections import Counter, deque
@@ -20,6 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import cast
 
+from rigd.service.address import peer_of
 from rigd.service.documents import Document, Peer, look_up_user
 from rigd.service.log import NAME
 from rigd.service.messages import (
@@ -46,7 +46,6 @@ _PACE_S = 0.005
 _MOST_UNREAD = 262_144
 _MOST_WAITING_LINES = 64
 _FAREWELL_S = 1.0
-_CREDENTIALS = struct.Struct("3i")
 
 _log = logging.getLogger(NAME)
 
@@ -148,8 +147,7 @@ class Server:
 
     def _introduced(self, link: socket.socket) -> "_Silent":
         link.setblocking(False)
-        credentials = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-        pid, uid, _ = _CREDENTIALS.unpack(credentials)
+        pid, uid = peer_of(link)
         self._count += 1
         return _Silent(link, Peer(self._count, pid, uid))
 

@@ -129,7 +129,7 @@ class Cia402Drive:
         self._inbox.guard(FAULT_BIT, 0)
         outfit = self._outfit = set_up(exchange.port, self._rig, self._name)
         has_torque = outfit.has(ACTUAL_TORQUE)
-        self._inbox.expect(with_torque=has_torque)
+        self._inbox.with_torque = has_torque
         self._following.compares = has_torque
         # Without a heartbeat of its own the drive is heard by its TPDOs alone.
         self._listens = outfit.has(HEARTBEAT_PRODUCER_MS)

@@ -53,7 +53,7 @@ class Inbox:
     malformed : int
         Frames of the wrong length.
     with_torque : bool
-        TPDOs end in the actual torque.
+        TPDOs end in the actual torque, which not every drive tells.
     """
 
     __slots__ = (
@@ -83,10 +83,6 @@ class Inbox:
         self.malformed = 0
         self.with_torque = True
         self.clear()
-
-    def expect(self, *, with_torque: bool) -> None:
-        """Take TPDOs with the actual torque, or those of a drive that does not tell it."""
-        self.with_torque = with_torque
 
     def clear(self) -> None:
         """Forget everything but the number of malformed frames."""
