@@ -85,12 +85,12 @@ def pooled_order(
     if status in ("not identifiable", "absent"):
         estimate = interval = None
     some = len(alone) > 1 if shared is None else shared.sessions < len(verdicts)
-    mixture = status in ("integer", "fractional", "not supported") and (
+    mixture = status in ("compatible", "fractional", "open") and (
         alike.is_mixed(order) or (alike.mixed and some)
     )
     if mixture:
-        status = "not supported"
-    value = {"integer": 1.0, "fractional": estimate}.get(status)
+        status = "open"
+    value = {"compatible": 1.0, "fractional": estimate}.get(status)
     return PooledOrder(order, status, value, interval, estimate, alone, mixture)
 
 
@@ -112,16 +112,16 @@ def _status(
     if free is None:
         # Nothing pooled to go by: with a stiffness for each mode no structure has alpha free.
         fixed = structure.fixed.get(order) == 1.0
-        return "integer" if fixed and next(iter(alone)) == "integer" else "not identifiable"
+        return "compatible" if fixed and next(iter(alone)) == "compatible" else "not identifiable"
     low, high = free.interval
     if low <= 1 <= high:
-        return "integer"
+        return "compatible"
     if order not in structure.free:
         undecided = any(order in STRUCTURES[r.structure].free for r in rivals(ranked, EVEN))
-        return "not supported" if undecided else "integer"
+        return "open" if undecided else "compatible"
     adequate = sum(v.adequate for v in verdicts) >= _ADEQUATE * len(verdicts)
     integer = any(STRUCTURES[r.structure].fixed.get(order) == 1.0 for r in rivals(ranked, STRONG))
-    return "fractional" if adequate and not integer else "not supported"
+    return "fractional" if adequate and not integer else "open"
 
 
 def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:

@@ -125,7 +125,7 @@ def order(found: PooledOrder) -> str:
         return f"The order {name} of the {of} is not identifiable.{alone}"
     low, high = found.interval or (1.0, 1.0)
     ends = f"95 %: {low:.4f} to {high:.4f}, scatter between sessions included"
-    if found.status == "integer":
+    if found.status == "compatible":
         free = f" ({ends}, if it is left free)" if found.interval else ""
         chance = "" if low <= 1 <= high else ", and differs from 1 by no more than chance may"
         said = f"is 1 as far as all sessions together tell{free}{chance}"

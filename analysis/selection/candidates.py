@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -33,11 +32,18 @@ FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures always tried on a beam that is not uniform: those of a material of integer order."""
 
 _FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
-"""Tried there as well if such a beam is the best. Then the modes' frequencies say nothing of the
+"""Fitted there as well if such a beam is the best. Then the modes' frequencies say nothing of the
 orders, only their damping does."""
 
 _DISMISSED: Final = 10.0
-"""Difference of BIC by which these must be better."""
+"""Difference of BIC by which these must be better for the noise to be taken anew."""
+
+_SHOWS: Final = 4.0
+"""Deviance that a damping must save to stay in the freest structure: one that saves less moves no
+other parameter by more than two standard deviations, and only makes them uncertain."""
+
+_FREEST: Final = STRUCTURES["VI"]
+_ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 
 _CROSS_CHECKS: Final = 3
 _FEW: Final = 8
@@ -109,8 +115,30 @@ class Field:
 
     @property
     def best(self) -> Candidate:
-        """The lowest BIC."""
+        """The first: the lowest BIC, unless the field is led by another (`led_by`)."""
         return self.candidates[0]
+
+    @property
+    def freest(self) -> Candidate:
+        """The freest structure that the record supports, on the beam of the best.
+
+        All orders are free, so its intervals hold whichever simpler structure is the true one;
+        those of the lowest BIC hold only if that is. A damping that does not show at all is left
+        out, with its order.
+        """
+        best = self.best
+        alike = {c.structure.name: c for c in self.candidates if c.uniform == best.uniform}
+        freest = alike.get(_FREEST.name)
+        if freest is None:
+            return best
+        lesser = [alike[s.name] for s in _ONE_DAMPING if s.name in alike]
+        least = min(lesser, key=lambda c: c.deviance, default=freest)
+        return least if least.deviance - freest.deviance < _SHOWS else freest
+
+    def led_by(self, candidate: Candidate) -> Field:
+        """Put one candidate first: the one whose numbers are told."""
+        others = (c for c in self.candidates if c is not candidate)
+        return replace(self, candidates=(candidate, *others))
 
     @property
     def likeliest(self) -> RecordFit:
@@ -237,25 +265,20 @@ class Field:
         return Candidate(structure, candidate.uniform, found.fit(), len(self.columns))
 
     def with_orders_free(self) -> Field:
-        """Free the orders too on a beam that is not uniform, if that explains far more."""
+        """Free the orders too on a beam that is not uniform."""
         best = self.best
-        needed = best.fit.cost * math.exp(-_DISMISSED / best.values)
         refits = []
         for structure in _FREE_ORDERS:
             unknowns = self.unknowns(structure, uniform=False)
             start = adapted(unknowns, best.fit.plant, best.structure)
-            first = self.descent(unknowns, start, _FEW)
-            if first.promised_cost < needed:
-                refits.append(self.descent(unknowns, first.x, _MANY))
-        if not refits:
-            return self
+            refits.append(self.descent(unknowns, start, _MANY))
         found = (
             Candidate(refit.objective.unknowns.structure, False, refit.fit(), len(self.columns))
             for refit in refits
         )
         freed = replace(self, candidates=_ranked((*self.candidates, *found)))
         if freed.best.bic > best.bic - _DISMISSED:
-            return self
+            return freed.cross_checked()
         return freed._under(min(refits, key=lambda refit: refit.cost).noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
