@@ -32,6 +32,11 @@ _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 _NOT_DETERMINED: Final = "the record does not determine it"
 _AT_EDGE: Final = "at the edge of what is searched"
 
+_MODES_TO_TELL_DAMPINGS: Final = 2
+ONE_MODE: Final = (
+    "one mode alone does not tell damping of the material from that of the surroundings"
+)
+
 StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
 _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
@@ -189,12 +194,12 @@ def headline(
         each.order: each.reason for each in orders if each.reason is not None
     }
     intervals: dict[str, tuple[float, float]] = {
-        each.order: each.interval
-        for each in orders
-        if each.interval is not None and each.order in freest.structure.free
+        each.order: each.profile.interval for each in orders if each.order in freest.structure.free
     }
     told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
     simpler = _simpler(field) if adequate else None
+    if len(visible) < _MODES_TO_TELL_DAMPINGS:
+        told = replace(told, sizes=tuple(map(_of_one_mode, told.sizes)))
     return replace(told, structures=structures(field), simpler=simpler)
 
 
@@ -247,8 +252,8 @@ def of_fit(
 def structures(field: Field) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures a record excludes, and which would do.
 
-    On the beam selected a structure is excluded by the likelihood ratio against the freest one;
-    on another kind of beam, which is no special case of it, by a BIC that is higher by 10.
+    A special case of the freest structure on the same beam is excluded by the likelihood ratio;
+    whatever is no special case of it, by a BIC that is higher than the lowest by 10.
 
     Parameters
     ----------
@@ -262,11 +267,10 @@ def structures(field: Field) -> tuple[tuple[str, StructureStatus], ...]:
 def _status(field: Field, candidate: Candidate, freest: Candidate) -> StructureStatus:
     if candidate is freest:
         return "selected"
-    if not alike(candidate, freest):
+    simpler = set(candidate.structure.free) < set(freest.structure.free)
+    if not (simpler and alike(candidate, freest)):
         return "compatible" if candidate.bic < field.best.bic + STRONG else "excluded"
     lacks = freest.parameters - candidate.parameters
-    if lacks <= 0:  # it has more than the freest that the record supports
-        return "compatible"
     limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
@@ -327,6 +331,11 @@ def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     spread = _NORMAL_95 * size.std / size.value
     ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
     return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
+
+
+def _of_one_mode(each: Size) -> Size:
+    flag = each.size.flag or ONE_MODE
+    return replace(each, size=replace(each.size, flag=flag))
 
 
 def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from analysis.selection.headline import ONE_MODE
 from analysis.selection.orders import deviance_of_one
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ _DAMPING: Final = {
     "VI": "Damping by material and surroundings",
     "VII": "Damping by material and surroundings",
 }
+_SEVERAL: Final = 2
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 
 
@@ -36,20 +38,23 @@ def of_headline(
     adequate : bool
         Whether nothing but noise remains.
     """
-    free = told.fit.structure.name
+    free = told.fit.structure
     beam = (
         "" if "," not in told.name else ", on a beam whose modes each have a stiffness of their own"
     )
-    said = [f"{_DAMPING[free]}{beam}: the numbers are those of type {told.name}, every order free."]
-    excluded = told.with_status("excluded")
-    compatible = told.with_status("compatible")
-    if adequate and excluded:
-        said.append(f"Excluded: {_types(excluded)}.")
-    if adequate and compatible:
-        said.append(f"{_types(compatible).capitalize()} would do as well.")
+    if len(told.visible_modes) < _SEVERAL:
+        said = [f"{ONE_MODE.capitalize()}, and nothing of orders."]
+    else:
+        said = [
+            f"{_DAMPING[free.name]}{beam}: the numbers are those of type {told.name}, every order "
+            "free."
+        ]
+        excluded = told.with_status("excluded")
+        if adequate and excluded:
+            said.append(f"Excluded: {_types(excluded)}.")
+        if told.simpler is not None and told.simpler.fixed:
+            said.append(_condition(told.simpler))
     said += [order(each) for each in orders]
-    if told.simpler is not None and told.simpler.fixed:
-        said.append(_condition(told.simpler))
     if adequate:
         said.append("What it leaves is noise: nothing in the record asks for more.")
     return said
@@ -71,9 +76,10 @@ def _condition(simpler: Simpler) -> str:
         for name in ("zeta", "alpha", "gamma", "lambda")
         if name in simpler.parameters
     ]
+    one = len(simpler.fixed) == 1
     return (
-        f"If {taken} is taken for granted (type {simpler.name}, which would do): "
-        f"{', '.join(numbers)}. These intervals hold on that condition only."
+        f"Simpler, {taken} would do (type {simpler.name}). Only if {'it is' if one else 'they are'} "
+        f"true, {', '.join(numbers)}."
     )
 
 
