@@ -76,10 +76,10 @@ def _condition(simpler: Simpler) -> str:
         for name in ("zeta", "alpha", "gamma", "lambda")
         if name in simpler.parameters
     ]
-    one = len(simpler.fixed) == 1
+    they = "it is" if len(simpler.fixed) == 1 else "they are"
     return (
-        f"Simpler, {taken} would do (type {simpler.name}). Only if {'it is' if one else 'they are'} "
-        f"true, {', '.join(numbers)}."
+        f"Simpler, {taken} would do (type {simpler.name}). Only if {they} true, "
+        f"{', '.join(numbers)}."
     )
 
 
