@@ -118,7 +118,7 @@ def select(
             structure=best.structure.name,
             uniform=best.uniform,
             rivals=tuple(c.name for c in close),
-            parameters={k: v for k, v in fit.parameters.items() if k not in numbers.flags},
+            parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
             adequate=adequate,
             alpha=orders[0],
             lambda_=orders[1],
