@@ -39,6 +39,7 @@ ONE_MODE: Final = (
 
 StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
+_ORDER_OF: Final[Mapping[Damping, str]] = {"internal": "alpha", "external": "lambda"}
 _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
 
 
@@ -194,12 +195,14 @@ def headline(
         each.order: each.reason for each in orders if each.reason is not None
     }
     intervals: dict[str, tuple[float, float]] = {
-        each.order: each.profile.interval for each in orders if each.order in freest.structure.free
+        each.order: each.profile.interval
+        for each in orders
+        if each.profile.walked and each.order in freest.structure.free
     }
     told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
     simpler = _simpler(field) if adequate else None
     if len(visible) < _MODES_TO_TELL_DAMPINGS:
-        told = replace(told, sizes=tuple(map(_of_one_mode, told.sizes)))
+        told = replace(told, sizes=tuple(_flagged(each, ONE_MODE) for each in told.sizes))
     return replace(told, structures=structures(field), simpler=simpler)
 
 
@@ -238,7 +241,9 @@ def of_fit(
             if _has(fit.structure, each)
         },
         sizes=tuple(
-            _size(each, size, unexplained)
+            # What a record shows is a loss; the size that goes with it depends on the order, if
+            # only to the second degree where the two are uncorrelated.
+            _size(each, size, unexplained or reasons.get(_ORDER_OF[each]))
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None
         ),
@@ -333,9 +338,8 @@ def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
 
 
-def _of_one_mode(each: Size) -> Size:
-    flag = each.size.flag or ONE_MODE
-    return replace(each, size=replace(each.size, flag=flag))
+def _flagged(each: Size, flag: str) -> Size:
+    return replace(each, size=replace(each.size, flag=each.size.flag or flag))
 
 
 def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:

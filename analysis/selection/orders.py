@@ -88,21 +88,13 @@ def _judged(
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
     coefficient = "zeta" if order == "alpha" else "gamma"
-    if coefficient not in freest.structure.free:
-        if len(visible) < _MODES_FOR_AN_ORDER:
-            return "not identifiable", _FEW_MODES
+    untold = untold_reason(field, visible)
+    if coefficient not in freest.structure.free and len(visible) >= _MODES_FOR_AN_ORDER:
         return "absent", "no such damping shows"
-    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
-    # exactly the beam is uniform.
-    if len(visible) < _MODES_FOR_AN_ORDER:
-        return "not identifiable", _FEW_MODES
+    if untold is not None:
+        return "not identifiable", untold
     if not profile.identifiable:
         return "not identifiable", "the record does not tell the order"
-    if not freest.uniform and len(freest.structure.free) > len(visible):
-        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
-        return "not identifiable", (
-            f"on a beam that is not uniform it rests on {len(visible)} loss factors alone"
-        )
     if not adequate:
         return "open", "part of the record is unexplained"
     if any(_integer(rival, order) for rival in rivals(field, STRONG) if not alike(rival, freest)):
@@ -112,7 +104,24 @@ def _judged(
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
 
 
-_FEW_MODES: Final = "one mode alone shows how much damping there is, not of which order"
+def untold_reason(field: Field, visible: tuple[int, ...]) -> str | None:
+    """Say why no order can be told from a record, whatever its likelihood says; None if it may.
+
+    Parameters
+    ----------
+    field : Field
+    visible : tuple of int
+        Modes that the record shows.
+    """
+    freest = field.freest
+    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
+    # exactly the beam is uniform.
+    if len(visible) < _MODES_FOR_AN_ORDER:
+        return "one mode alone shows how much damping there is, not of which order"
+    if not freest.uniform and len(freest.structure.free) > len(visible):
+        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
+        return f"on a beam that is not uniform it rests on {len(visible)} loss factors alone"
+    return None
 
 
 def deviance_of_one(profile: Profile) -> float:

@@ -12,7 +12,8 @@ from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
 from analysis.selection.headline import Headline, headline
 from analysis.selection.nonlinear_search import nonlinear_forces
-from analysis.selection.orders import EVEN, order_verdict, rivals
+from analysis.selection.orders import EVEN, order_verdict, rivals, untold_reason
+from analysis.selection.profile import Profile
 from analysis.selection.profiles import profiled
 from analysis.selection.verdict import Row, Verdict
 from analysis.selection.visible import visible_modes
@@ -87,7 +88,13 @@ def select(
     field, forces = nonlinear_forces(linear, visible)
     if not field.best.uniform:
         field = field.with_orders_free()
-    field, of_alpha, of_lambda = profiled(field)
+    if untold_reason(field, visible) is None:
+        field, of_alpha, of_lambda = profiled(field)
+    else:
+        of_alpha, of_lambda = (
+            Profile.unwalked(field.freest, "alpha"),
+            Profile.unwalked(field.freest, "lambda"),
+        )
     told = field.led_by(field.freest)
     white, related = _tests(told)
     comparison, fit = field.comparison, told.best.fit

@@ -131,7 +131,7 @@ def order(verdict: OrderVerdict) -> str:
 def _why_not(verdict: OrderVerdict) -> str:
     profile = verdict.profile
     low, high = profile.interval
-    if profile.identifiable and verdict.reason is not None:
+    if verdict.reason is not None and (profile.identifiable or not profile.walked):
         return verdict.reason
     if len(profile.valleys) > 1:
         equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
