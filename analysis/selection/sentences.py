@@ -61,11 +61,19 @@ def of_headline(
 
 
 def _types(names: tuple[str, ...]) -> str:
-    if len(names) == 1:
-        return f"type {names[0]}"
-    # A name may hold a comma itself: "VII, modes free".
-    mark = ";" if any("," in name for name in names) else ","
-    return f"types {f'{mark} '.join(names[:-1])}{mark if len(names) > 2 else ''} and {names[-1]}"
+    """List structures, those of a uniform beam first."""
+    plain = sorted(name for name in names if "," not in name)
+    others: dict[str, list[str]] = {}
+    for name in sorted(set(names) - set(plain)):
+        structure, beam = name.split(", ", 1)
+        others.setdefault(beam, []).append(structure)
+    groups = [_listed(plain)] if plain else []
+    groups += [f"with {beam} {_listed(each)}" for beam, each in others.items()]
+    return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _condition(simpler: Simpler) -> str:
@@ -78,8 +86,8 @@ def _condition(simpler: Simpler) -> str:
     ]
     they = "it is" if len(simpler.fixed) == 1 else "they are"
     return (
-        f"Simpler, {taken} would do (type {simpler.name}). Only if {they} true, "
-        f"{', '.join(numbers)}."
+        f"{taken[0].upper()}{taken[1:]} {'is' if they == 'it is' else 'are'} not excluded (type "
+        f"{simpler.name}); only if {they} true, {', '.join(numbers)}."
     )
 
 
