@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.selection.candidate import Candidate
+from analysis.selection.extras import with_extras
 from analysis.selection.hum import without_leakage
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted, resonances_kept, vector
@@ -104,7 +105,7 @@ class Field:
                 if _all_but_white(field, likeliest)
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
-        return field.cross_checked()
+        return with_extras(field.cross_checked())
 
     @property
     def best(self) -> Candidate:
