@@ -11,7 +11,7 @@ import numpy as np
 from analysis.campaigns.estimates import structure_name
 from analysis.campaigns.pooled_modes import PooledMode, pooled_modes
 from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile_95
-from analysis.structures import PARAMETERS, STRUCTURES
+from analysis.structures import STRUCTURES
 from analysis.whole_record import SETTINGS, Plant
 from analysis.whole_record.plant import LOGARITHMIC
 from rigd.beam import Beam
@@ -185,7 +185,7 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
 
 def _of_specimen(estimate: RecordEstimate) -> tuple[str, ...]:
     """Name the free parameters that are the specimen's: damping, and offsets of the modes."""
-    offsets = (name for name in estimate.parameters if name not in {*PARAMETERS, *SETTINGS})
+    offsets = (name for name in estimate.parameters if name.startswith("stiffness_offset"))
     return (*STRUCTURES[estimate.structure].free, *offsets)
 
 
@@ -240,6 +240,6 @@ def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
         delay_s=values["delay_s"],
         tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
         stiffness_offsets=tuple(
-            values[name] for name in like.parameters if name not in {*PARAMETERS, *SETTINGS}
+            values[name] for name in like.parameters if name.startswith("stiffness_offset")
         ),
     )

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.selection.candidate import Candidate
+from analysis.selection.extras import with_extras
 from analysis.selection.hum import without_leakage
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted, resonances_kept, vector
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import whiteness
 from analysis.structures import STRUCTURES
-from analysis.whole_record import SETTINGS, Plant, fit_record
+from analysis.whole_record import SETTINGS, fit_record
 from analysis.whole_record.comparison import Comparison
 from analysis.whole_record.noise import Noise
 from analysis.whole_record.unknowns import Unknowns
-from rigd.beam import Damping
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.structures import Structure
-    from analysis.whole_record import Measurement, RecordAnalysis, RecordFit, Setting
+    from analysis.whole_record import Measurement, Plant, RecordAnalysis, RecordFit, Setting
 
 FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures always tried on a beam that is not uniform: those of a material of integer order."""
@@ -111,7 +111,7 @@ class Field:
                 if _all_but_white(field, likeliest)
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
-        return field.cross_checked()
+        return with_extras(field.cross_checked())
 
     @property
     def best(self) -> Candidate:
@@ -150,20 +150,24 @@ class Field:
         """The lowest, comparable between fields whose noise has been estimated anew."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
-    def unknowns(self, structure: Structure, uniform: bool) -> Unknowns:
+    def unknowns(
+        self, structure: Structure, uniform: bool, extras: tuple[str, ...] = ()
+    ) -> Unknowns:
         """Search space of a structure on this record."""
-        measurement = self.comparison.measurement
-        nominal = Plant(
-            measurement.beam, Damping(), measurement.delay_s, measurement.tool_inertia_kg_m2
-        )
         modes = 1 if uniform else self.comparison.visible_modes
-        return Unknowns.of(structure, nominal, self.free, modes)
+        nominal = self.comparison.measurement.nominal
+        return Unknowns.of(structure, nominal, self.free, modes, extras)
 
     def refit(
-        self, structure: Structure, uniform: bool, start: Plant, max_evaluations: int = _MANY
+        self,
+        structure: Structure,
+        uniform: bool,
+        start: Plant,
+        max_evaluations: int = _MANY,
+        extras: tuple[str, ...] = (),
     ) -> Refit:
         """Descend with one structure from a plant that has its damping."""
-        unknowns = self.unknowns(structure, uniform)
+        unknowns = self.unknowns(structure, uniform, extras)
         return self.descent(unknowns, vector(unknowns, start), max_evaluations)
 
     def descent(
@@ -180,11 +184,16 @@ class Field:
         )
 
     def candidate(
-        self, structure: Structure, uniform: bool, start: Plant, max_evaluations: int = _MANY
+        self,
+        structure: Structure,
+        uniform: bool,
+        start: Plant,
+        max_evaluations: int = _MANY,
+        extras: tuple[str, ...] = (),
     ) -> Candidate:
         """Fit one structure from a plant."""
-        refit = self.refit(structure, uniform, start, max_evaluations)
-        return Candidate(structure, uniform, refit.fit(), len(self.columns))
+        refit = self.refit(structure, uniform, start, max_evaluations, extras)
+        return Candidate(structure, uniform, refit.fit(), len(self.columns), extras)
 
     def _without_leakage(self) -> Field:
         """Leave out what hum beyond the band spoils."""
@@ -195,7 +204,8 @@ class Field:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
         again = _ranked(
-            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW) for c in self.candidates
+            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW, c.extras)
+            for c in self.candidates
         )
         return replace(other, candidates=again)
 
@@ -250,7 +260,7 @@ class Field:
         structure = candidate.structure
         if (of.internal and not structure.internal) or (of.external and not structure.external):
             return candidate
-        unknowns = self.unknowns(structure, candidate.uniform)
+        unknowns = self.unknowns(structure, candidate.uniform, candidate.extras)
         start = adapted(unknowns, plant, of)
         outlook = self.descent(unknowns, start, 1)
         least = candidate.fit.cost * (1 - _MISSED)
@@ -262,7 +272,7 @@ class Field:
         found = self.descent(unknowns, first.x, _MANY)
         if found.cost > least:
             return candidate
-        return Candidate(structure, candidate.uniform, found.fit(), len(self.columns))
+        return replace(candidate, fit=found.fit(), columns=len(self.columns))
 
     def with_orders_free(self) -> Field:
         """Free the orders too on a beam that is not uniform."""
@@ -285,7 +295,8 @@ class Field:
         """Fit all again, with what is not linear beside the beam."""
         other = replace(self, columns=columns, noise=noise)
         again = _ranked(
-            other.candidate(c.structure, c.uniform, c.fit.plant) for c in self.candidates
+            other.candidate(c.structure, c.uniform, c.fit.plant, extras=c.extras)
+            for c in self.candidates
         )
         return replace(other, candidates=again).cross_checked()
 
