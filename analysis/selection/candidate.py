@@ -75,6 +75,11 @@ class Candidate:
         return self.deviance + 2 * self.parameters
 
     @property
+    def kind(self) -> tuple[bool, tuple[str, ...]]:
+        """Of rig: whether the beam is uniform, and what else was free."""
+        return self.uniform, self.extras
+
+    @property
     def name(self) -> str:
         """As tables call it."""
         beside = [] if self.uniform else ["modes free"]

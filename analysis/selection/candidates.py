@@ -32,8 +32,8 @@ FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures always tried on a beam that is not uniform: those of a material of integer order."""
 
 _FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
-"""Fitted there as well if such a beam is the best. Then the modes' frequencies say nothing of the
-orders, only their damping does."""
+"""Fitted there as well if such a beam is the best, as on any other kind. Where the modes are free
+their frequencies say nothing of the orders, only their damping does."""
 
 _DISMISSED: Final = 10.0
 """Difference of BIC by which these must be better for the noise to be taken anew."""
@@ -127,7 +127,7 @@ class Field:
         out, with its order.
         """
         best = self.best
-        alike = {c.structure.name: c for c in self.candidates if c.uniform == best.uniform}
+        alike = {c.structure.name: c for c in self.candidates if c.kind == best.kind}
         freest = alike.get(_FREEST.name)
         if freest is None:
             return best
@@ -139,6 +139,20 @@ class Field:
         """Put one candidate first: the one whose numbers are told."""
         others = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *others))
+
+    def other_kinds(self, within: float) -> tuple[Candidate, ...]:
+        """Return the best candidate of each other kind of rig that explains the record as well.
+
+        Parameters
+        ----------
+        within : float
+            By how much the BIC may be above the lowest.
+        """
+        best: dict[tuple[bool, tuple[str, ...]], Candidate] = {}
+        for candidate in self.candidates:
+            if candidate.bic < self.best.bic + within:
+                best.setdefault(candidate.kind, candidate)
+        return tuple(each for kind, each in best.items() if kind != self.best.kind)
 
     @property
     def likeliest(self) -> RecordFit:
@@ -275,21 +289,26 @@ class Field:
         return replace(candidate, fit=found.fit(), columns=len(self.columns))
 
     def with_orders_free(self) -> Field:
-        """Free the orders too on a beam that is not uniform."""
+        """Free the orders too, on a beam of the best's kind, if that was not done."""
         best = self.best
-        refits = []
+        known = {c.structure.name for c in self.candidates if c.kind == best.kind}
+        found = []
         for structure in _FREE_ORDERS:
-            unknowns = self.unknowns(structure, uniform=False)
-            start = adapted(unknowns, best.fit.plant, best.structure)
-            refits.append(self.descent(unknowns, start, _MANY))
-        found = (
-            Candidate(refit.objective.unknowns.structure, False, refit.fit(), len(self.columns))
-            for refit in refits
+            if structure.name not in known:
+                unknowns = self.unknowns(structure, best.uniform, best.extras)
+                start = adapted(unknowns, best.fit.plant, best.structure)
+                found.append((structure, self.descent(unknowns, start, _MANY)))
+        if not found:
+            return self
+        candidates = (
+            Candidate(structure, best.uniform, refit.fit(), len(self.columns), best.extras)
+            for structure, refit in found
         )
-        freed = replace(self, candidates=_ranked((*self.candidates, *found)))
+        freed = replace(self, candidates=_ranked((*self.candidates, *candidates)))
         if freed.best.bic > best.bic - _DISMISSED:
             return freed.cross_checked()
-        return freed._under(min(refits, key=lambda refit: refit.cost).noise_here())
+        lowest = min((refit for _, refit in found), key=lambda refit: refit.cost)
+        return freed._under(lowest.noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
         """Fit all again, with what is not linear beside the beam."""

@@ -11,10 +11,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from analysis.selection.candidate import Candidate
-from analysis.selection.restart import adapted, vector
+from analysis.selection.restart import adapted
 from analysis.structures import STRUCTURES
 from analysis.whole_record.plant import EXTRAS
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from analysis.selection.orders import EXCLUDED, STRONG, alike
+from analysis.selection.orders import EXCLUDED, STRONG
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -39,7 +39,12 @@ ONE_MODE: Final = (
 
 StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
-_ORDER_OF: Final[Mapping[Damping, str]] = {"internal": "alpha", "external": "lambda"}
+_NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
+    "internal": ("zeta", "alpha"),
+    "external": ("gamma", "lambda"),
+}
+"""Coefficient and order of either damping."""
+
 _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
 
 
@@ -201,6 +206,8 @@ def headline(
     }
     told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
     simpler = _simpler(field) if adequate else None
+    for other in field.other_kinds(STRONG):
+        told = _doubted_by(told, other)
     if len(visible) < _MODES_TO_TELL_DAMPINGS:
         told = replace(told, sizes=tuple(_flagged(each, ONE_MODE) for each in told.sizes))
     return replace(told, structures=structures(field), simpler=simpler)
@@ -243,7 +250,7 @@ def of_fit(
         sizes=tuple(
             # What a record shows is a loss; the size that goes with it depends on the order, if
             # only to the second degree where the two are uncorrelated.
-            _size(each, size, unexplained or reasons.get(_ORDER_OF[each]))
+            _size(each, size, unexplained or reasons.get(_NAMES[each][1]))
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None
         ),
@@ -273,7 +280,7 @@ def _status(field: Field, candidate: Candidate, freest: Candidate) -> StructureS
     if candidate is freest:
         return "selected"
     simpler = set(candidate.structure.free) < set(freest.structure.free)
-    if not (simpler and alike(candidate, freest)):
+    if not simpler or candidate.kind != freest.kind:
         return "compatible" if candidate.bic < field.best.bic + STRONG else "excluded"
     lacks = freest.parameters - candidate.parameters
     limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
@@ -286,7 +293,7 @@ def _simpler(field: Field) -> Simpler | None:
     would_do = [
         each
         for each in field.candidates
-        if alike(each, freest)
+        if each.kind == freest.kind
         and each.parameters < freest.parameters
         and _status(field, each, freest) == "compatible"
     ]
@@ -336,6 +343,29 @@ def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     spread = _NORMAL_95 * size.std / size.value
     ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
     return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
+
+
+def _doubted_by(told: Headline, other: Candidate) -> Headline:
+    """Flag what another kind of rig, which explains the record as well, would have elsewhere."""
+    flag = f"type {other.name} explains the record as well, and has it elsewhere"
+    values = other.fit.parameters
+
+    def elsewhere(quantity: Quantity, value: float) -> bool:
+        low, high = quantity.interval_95 or (-math.inf, math.inf)
+        return not low <= value <= high
+
+    parameters = {
+        name: replace(each, flag=each.flag or flag)
+        if name in values and elsewhere(each, values[name])
+        else each
+        for name, each in told.parameters.items()
+    }
+    sizes = []
+    for each in told.sizes:
+        coefficient, order = _NAMES[each.damping]
+        at = values[coefficient] * (each.omega_rad_s or 1.0) ** values[order]
+        sizes.append(_flagged(each, flag) if elsewhere(each.size, at) else each)
+    return replace(told, parameters=parameters, sizes=tuple(sizes))
 
 
 def _flagged(each: Size, flag: str) -> Size:

@@ -97,7 +97,7 @@ def _judged(
         return "not identifiable", "the record does not tell the order"
     if not adequate:
         return "open", "part of the record is unexplained"
-    if any(_integer(rival, order) for rival in rivals(field, STRONG) if not alike(rival, freest)):
+    if any(_integer(rival, order) for rival in rivals(field, STRONG) if rival.kind != freest.kind):
         return "open", "order 1 on another kind of beam explains the record about as well"
     if profile.admits_one:
         return "compatible", None
@@ -132,16 +132,6 @@ def deviance_of_one(profile: Profile) -> float:
     profile : Profile
     """
     return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
-
-
-def alike(one: Candidate, other: Candidate) -> bool:
-    """Whether two candidates have the same kind of beam.
-
-    Parameters
-    ----------
-    one, other : Candidate
-    """
-    return one.uniform == other.uniform
 
 
 def _integer(candidate: Candidate, order: Order) -> bool:

@@ -86,8 +86,7 @@ def select(
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = nonlinear_forces(linear, visible)
-    if not field.best.uniform:
-        field = field.with_orders_free()
+    field = field.with_orders_free()
     if untold_reason(field, visible) is None:
         field, of_alpha, of_lambda = profiled(field)
     else:

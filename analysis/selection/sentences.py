@@ -22,6 +22,7 @@ _DAMPING: Final = {
     "VII": "Damping by material and surroundings",
 }
 _SEVERAL: Final = 2
+_FREE: Final = "modes free"
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 
 
@@ -39,9 +40,10 @@ def of_headline(
         Whether nothing but noise remains.
     """
     free = told.fit.structure
-    beam = (
-        "" if "," not in told.name else ", on a beam whose modes each have a stiffness of their own"
-    )
+    kind = told.name.partition(", ")[2]
+    beam = ", on a beam whose modes each have a stiffness of their own" if kind == _FREE else ""
+    if kind and not beam:
+        beam = f", beside {kind}"
     if len(told.visible_modes) < _SEVERAL:
         said = [f"{ONE_MODE.capitalize()}, and nothing of orders."]
     else:
