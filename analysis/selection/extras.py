@@ -110,7 +110,7 @@ def with_extras(field: Field) -> Field:
 
 
 def _promising(field: Field, lead: Candidate) -> Iterator[Refit]:
-    """Searches with one extra each, where they have come to, that may be worth going on with."""
+    """Yield searches with one extra each that may be worth going on with."""
     values, cost = lead.values, lead.fit.cost
     needed = cost * math.exp(-_PROMISING / values)
     for name in EXTRAS:

@@ -265,7 +265,8 @@ def structures(field: Field) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures a record excludes, and which would do.
 
     A special case of the freest structure on the same beam is excluded by the likelihood ratio;
-    whatever is no special case of it, by a BIC that is higher than the lowest by 10.
+    whatever is no special case of it, where its likelihood is as much lower, and its BIC is higher
+    than the lowest by 10. One that explains the record with more than it takes is not excluded.
 
     Parameters
     ----------
@@ -281,7 +282,9 @@ def _status(field: Field, candidate: Candidate, freest: Candidate) -> StructureS
         return "selected"
     simpler = set(candidate.structure.free) < set(freest.structure.free)
     if not simpler or candidate.kind != freest.kind:
-        return "compatible" if candidate.bic < field.best.bic + STRONG else "excluded"
+        behind = candidate.deviance - freest.deviance > EXCLUDED[0]
+        worse = candidate.bic > field.best.bic + STRONG
+        return "excluded" if behind and worse else "compatible"
     lacks = freest.parameters - candidate.parameters
     limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
