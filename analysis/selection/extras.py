@@ -17,6 +17,7 @@ from analysis.selection.restart import adapted
 from analysis.selection.whiteness import whiteness
 from analysis.structures import STRUCTURES
 from analysis.whole_record.plant import EXTRAS
+from analysis.whole_record.unknowns import ln_stiffness_with_tip
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -43,13 +44,11 @@ _FIRST_SIZES: Final[Mapping[str, float]] = MappingProxyType(
 """Where the search starts for what, next to 0, does nothing that density, stiffness and delay do
 not: a share of the beam's mass, and ms (corners at 530 and 265 Hz)."""
 
-_FARTHER: Final[Mapping[str, tuple[float, ...]]] = MappingProxyType(
-    {
-        "tip_mass_kg": (0.03, 0.1, 0.3),
-        "clock_rate_difference": (2.0, -2.0, 6.0, -6.0, 12.0, -12.0),
-    }
-)
-"""Where it starts as well if what is left is not noise; clocks in units of 1e-5."""
+_FARTHER_CLOCKS: Final = (2.0, -2.0, 6.0, -6.0, 12.0, -12.0)
+"""Differences of the clocks, in units of 1e-5, from which it starts as well if what is left is not
+noise."""
+
+_HALVINGS: Final = 20
 
 _QUIETER: Final = 0.98
 """Share of the sum of squares left by an extra, below which the noise is estimated anew."""
@@ -138,21 +137,41 @@ def _promising(field: Field, lead: Candidate) -> list[Refit]:
     needed = cost * math.exp(-_PROMISING / values)
     counts = field.noise.counts
     left = whiteness(lead.fit.residual[counts], field.comparison.frequency_hz[counts])
+    # A uniform beam far from the record is astray; one whose modes are free has mode 1 and all
+    # dampings where they are.
     doubtful = left.probability < _DOUBTFUL or left.loud
     found = []
     for name in EXTRAS:
-        begun = (_begun(field, lead, name, size) for size in _starts(name, doubtful))
+        begun = (
+            _begun(field, other, name, size)
+            for other in ((lead, field.best) if doubtful else (lead,))
+            for size in _starts(name, other, doubtful=doubtful)
+        )
         first = min(begun, key=lambda refit: refit.promised_cost)
+        if doubtful:  # what a first step promises from afar means little
+            first = field.descent(first.objective.unknowns, first.x, _FEW)
         if first.promised_cost < needed:
             found.append(first)
     return sorted(found, key=lambda refit: refit.promised_cost)
 
 
-def _starts(name: str, doubtful: bool) -> Iterator[float]:
+def _starts(name: str, lead: Candidate, *, doubtful: bool) -> Iterator[float]:
     """Sizes, in the extra's unknown, from which the search for it starts."""
-    if doubtful:
-        yield from _FARTHER.get(name, ())
     yield _FIRST_SIZES.get(name, 0.0)
+    if doubtful and name == "clock_rate_difference":
+        yield from _FARTHER_CLOCKS
+    if doubtful and name == "tip_mass_kg" and lead.fit.plant.stiffness_offsets:
+        yield _tip_share(lead.fit.plant.stiffness_offsets[0])
+
+
+def _tip_share(offset: float) -> float:
+    """Mass at the tip, relative to the beam's, that makes mode 2 so much stiffer beside mode 1."""
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        rise = ln_stiffness_with_tip(2, middle) - ln_stiffness_with_tip(1, middle)
+        low, high = (middle, high) if rise < math.log1p(offset) else (low, middle)
+    return (low + high) / 2
 
 
 def _begun(field: Field, lead: Candidate, name: str, size: float) -> Refit:

@@ -32,7 +32,7 @@ import numpy as np
 
 from analysis.unknowns import ORDER_RANGE, SIZE_RANGE
 from analysis.whole_record.plant import EXTRAS, SETTINGS, Plant
-from analysis.whole_record.response import FIRST_OFFSET, offset_name
+from analysis.whole_record.response import FIRST_OFFSET, eigenvalues, offset_name
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -65,9 +65,7 @@ FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
 )
 """Delay of a filter at low frequency over its time constant."""
 
-_FIRST_ROOT: Final = 1.8751040687119611
-"""Of ``1 + cos z cosh z``."""
-
+_NEWTON_STEPS: Final = 30
 _GRADIENT_NAMES: Final[Mapping[str, str]] = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
@@ -320,17 +318,34 @@ def bare_beam(share: float) -> tuple[float, float]:
     return ln_ratio, ln_stiffness
 
 
+def ln_stiffness_with_tip(mode: int, share: float) -> float:
+    """Logarithm of the stiffness of a mode with a tip mass over that without, and all else equal.
+
+    Parameters
+    ----------
+    mode : int
+        From 1.
+    share : float
+        Of the tip's mass, relative to the beam's.
+    """
+    return _with_tip(float(eigenvalues(mode)[-1]), share)[0]
+
+
 def _bare_beam(share: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Give the same, each with its slope by the share."""
-    z = _FIRST_ROOT
-    for _ in range(30 if share else 0):
+    """Give the same as `bare_beam`, each with its slope by the share."""
+    return _with_tip(float(eigenvalues(1)[0]), share), (share, 1.0)
+
+
+def _with_tip(bare: float, share: float) -> tuple[float, float]:
+    """Fourth power of a mode's root over that of the bare beam: logarithm, and slope by share."""
+    z = bare
+    for _ in range(_NEWTON_STEPS if share else 0):
         value, by_z, _ = _tip_equation(z, share)
-        step = value / by_z
-        z -= step
-        if abs(step) < 1e-15 * z:
+        z -= value / by_z
+        if abs(value / by_z) < 1e-15 * z:
             break
     _, by_z, by_share = _tip_equation(z, share)
-    return (4 * math.log(z / _FIRST_ROOT), -4 * by_share / (by_z * z)), (share, 1.0)
+    return 4 * math.log(z / bare), -4 * by_share / (by_z * z)
 
 
 def _tip_equation(z: float, share: float) -> tuple[float, float, float]:
