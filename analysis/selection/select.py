@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from analysis.selection import sentences
 from analysis.selection.candidates import Field
 from analysis.selection.experiments import experiments
+from analysis.selection.finding import doubted
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
 from analysis.selection.headline import Headline, headline
@@ -112,7 +113,7 @@ def select(
     close = rivals(field, EVEN)
     found = findings(told, forces, multiples, visible)
     if not explained:
-        found = (*found, unexplained(white, related, fit.modes))
+        found = (*map(doubted, found), unexplained(white, related, fit.modes))
     numbers = headline(field, orders, visible, adequate=adequate)
     best = field.best
     return Selection(
