@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from analysis.selection import sentences
 from analysis.selection.candidates import Field
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
     from analysis.selection.candidate import Candidate
     from analysis.whole_record import Measurement, RecordFit, Setting
+
+_FIRST: Final = ("sign", "unit")
+"""What makes every number wrong is said before any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +139,9 @@ def select(
             input_relation=related,
             harmonics=multiples,
             sentences=(
+                *(each.sentence for each in found if each.kind in _FIRST),
                 *sentences.of_headline(numbers, orders, adequate=adequate),
-                *(finding.sentence for finding in found),
+                *(each.sentence for each in found if each.kind not in _FIRST),
             ),
             experiments=tuple(experiments(field, orders, visible, found, close)),
         ),

@@ -9,8 +9,8 @@ from analysis.selection.finding import SEEN, Finding, doubted
     ("sentence", "bare"),
     [
         (
-            "The torque comes 0.300 ms later than the file says (0.280 to 0.320 ms; 95 %): a delay.",
-            "the torque comes 0.300 ms later than the file says: a delay.",
+            "The torque comes 0.3 ms later than the file says (0.28 to 0.32 ms; 95 %): a delay.",
+            "the torque comes 0.3 ms later than the file says: a delay.",
         ),
         (
             "The modes lie elsewhere: mode 2 +1.13 % (± 0.5 %), mode 3 -0.94 % (± 0.4 %).",
