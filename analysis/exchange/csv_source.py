@@ -14,8 +14,8 @@ from analysis.exchange.source import (
     SourceChannel,
     check_samples,
     no_such_channel,
-    printable,
 )
+from rigd.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
