@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.estimates import structure_name
 from analysis.campaigns.pooled_modes import PooledMode, pooled_modes
-from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile_95
+from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile
 from analysis.structures import PARAMETERS, STRUCTURES
 from analysis.whole_record import SETTINGS, Plant
 from analysis.whole_record.plant import LOGARITHMIC
@@ -72,6 +71,8 @@ class PooledEstimate:
         Name.
     uniform : bool
         Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
+    beam : str
+        As of `RecordEstimate`.
     plant : Plant
         Of the pooled parameters.
     parameters : tuple of PooledParameter
@@ -89,6 +90,7 @@ class PooledEstimate:
 
     structure: str
     uniform: bool
+    beam: str
     plant: Plant
     parameters: tuple[PooledParameter, ...]
     modes: tuple[PooledMode, ...]
@@ -99,7 +101,7 @@ class PooledEstimate:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return structure_name(self.structure, self.uniform)
+        return f"{self.structure}{self.beam}"
 
     @property
     def by_name(self) -> dict[str, PooledParameter]:
@@ -143,7 +145,7 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
     within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
-    t = t_quantile_95(len(used) - 1)
+    t = t_quantile(0.95, len(used) - 1)
     chances = chance_of(effects.cochran_q, len(used))
     columns = (effects.mean, std, within, effects.between_std, chances)
     parameters = tuple(
@@ -154,6 +156,7 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     return PooledEstimate(
         structure=used[0].structure,
         uniform=used[0].uniform,
+        beam=used[0].beam,
         plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
         parameters=parameters,
         modes=pooled_modes(used),

@@ -86,15 +86,15 @@ def random_effects(
 
 
 @cache
-def t_quantile_95(degrees_of_freedom: int) -> float:
-    """Two-sided 95 % point of Student's t.
+def t_quantile(level: float, degrees_of_freedom: int) -> float:
+    """Two-sided point of Student's t: within it a share `level` lies.
 
     With ``t = sqrt(nu) tan(theta)`` the density of theta is ``cos(theta)^(nu-1)`` up to a factor.
     """
     theta = np.linspace(0.0, np.pi / 2, 100_001)
     density = np.cos(theta) ** (degrees_of_freedom - 1)
     reached = np.concatenate(([0.0], np.cumsum(density[1:] + density[:-1])))
-    at = float(np.interp(0.95, reached / reached[-1], theta))
+    at = float(np.interp(level, reached / reached[-1], theta))
     return float(np.sqrt(degrees_of_freedom) * np.tan(at))
 
 
