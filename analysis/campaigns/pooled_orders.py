@@ -129,12 +129,14 @@ def _judged(
         )
     if sum(v.adequate for v in verdicts) < _ADEQUATE * len(verdicts):
         return "open", "part of the records is unexplained"
-    if any(_integer(each, order) for each in rivals(ranked, STRONG) if each.beam != freest.beam):
+    integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]
+    if any(each.beam != freest.beam for each in integer):
         return "open", "order 1 on another kind of beam explains the records about as well"
     low, high = free.interval
     if low <= 1 <= high:
         return "compatible", None
-    return ("fractional" if _excludes_one(free, freest.sessions) else "open"), None
+    excluded = not integer and _excludes_one(free, freest.sessions)
+    return ("fractional" if excluded else "open"), None
 
 
 def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:

@@ -37,10 +37,16 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     best : PooledEstimate
         Of the lowest BIC.
     """
+    given = [name for name in _OF if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
+    are = "is" if len(given) == 1 else "are"
+    so = (
+        f", and takes for granted that {' and '.join(given)} {are} 1."
+        if given
+        else ", so its intervals hold whichever simpler one is true."
+    )
     said = (
         f"The numbers are those of type {freest.name}: damping {_damping(freest.structure)}"
-        f"{_on_beam(freest)}. It is the freest structure that the sessions support, so its "
-        "intervals hold whichever simpler one is true."
+        f"{_on_beam(freest)}. It is the freest structure that the sessions determine{so}"
     )
     if best.name != freest.name:
         said += (

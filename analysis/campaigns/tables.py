@@ -223,8 +223,8 @@ def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
 def role(estimate: PooledEstimate, campaign: Campaign) -> str:
     """Say what an estimate shown is for."""
     if estimate is campaign.headline:
-        return "its intervals hold whichever simpler structure is true"
-    return "lowest BIC; on condition that it is the true one"
+        return "freest structure"
+    return "lowest BIC, conditional on its being the true one"
 
 
 def used(estimate: PooledEstimate, campaign: Campaign) -> str:
