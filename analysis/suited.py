@@ -39,6 +39,31 @@ def record_band_hz(record: Record, asked_hz: Band | None = None) -> Band:
     return asked_hz or _within(RECORD_BAND_HZ, record.rate_hz)
 
 
+def check_record_band(record: Record, asked_hz: Band | None) -> None:
+    """Refuse a band that the record's rate does not hold.
+
+    Parameters
+    ----------
+    record : Record
+    asked_hz : tuple of float or None
+        In Hz.
+
+    Raises
+    ------
+    SettingsError
+        It ends too high.
+    """
+    from analysis.estimate import SettingsError
+
+    limit_hz = LARGEST_SHARE_OF_RATE * record.rate_hz
+    if asked_hz is not None and asked_hz[1] > limit_hz:
+        raise SettingsError(
+            f"{record.path}: the band reaches {asked_hz[1]:g} Hz, but whole-record fits end at "
+            f"{limit_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
+            "lower --band."
+        )
+
+
 def welch_settings(
     record: Record, settings: WelchSettings, asked_hz: Band | None = None
 ) -> WelchSettings:

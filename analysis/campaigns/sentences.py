@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled_modes import PooledMode
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.validation import LeftOutError, LostTrial
+    from analysis.selection.profile import Order
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
@@ -37,7 +39,7 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     best : PooledEstimate
         Of the lowest BIC.
     """
-    given = [name for name in _OF if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
+    given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
     are = "is" if len(given) == 1 else "are"
     so = (
         f", and takes for granted that {' and '.join(given)} {are} 1."

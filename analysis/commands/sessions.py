@@ -213,12 +213,14 @@ def _analyse_file(
     from analysis.record import load_record
     from analysis.report.folder import new_folder
     from analysis.report.write import write_report
-    from analysis.suited import remarks, welch_analysis
+    from analysis.suited import check_record_band, remarks, welch_analysis
     from analysis.whole_record import MeasurementError
 
     record = load_record(file)
     record = _with_warnings(record, remarks(record, routes.band_hz))
     on_step("read")
+    if not routes.paper:
+        check_record_band(record, routes.band_hz)
     analysis, left_out = None, None
     if routes.paper:
         analysis, left_out = welch_analysis(
