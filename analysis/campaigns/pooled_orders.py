@@ -29,6 +29,9 @@ _ADEQUATE: Final = 0.9
 _SURE: Final = 0.999
 """Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
 
+_ONE: Final = ("compatible", "integer")
+"""What a session says of an order that may be 1."""
+
 _FEW_MODES: Final = "one mode alone shows how much damping there is, not of which order"
 
 
@@ -47,7 +50,7 @@ class PooledOrder:
     value : float or None
         Pooled estimate, where the order is identifiable.
     interval : tuple of float or None
-        Its 95 % interval, scatter between sessions included.
+        Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
     reason : str or None
         Why the number must not be taken for a property of the specimen; None: it may.
     alone : mapping of str to int
@@ -89,7 +92,7 @@ def pooled_order(
     freest = freest_estimate(ranked)
     assert freest is not None
     free = freest.by_name.get(order)
-    status, reason = _judged(order, ranked, freest, verdicts)
+    status, reason = _judged(order, ranked, freest, verdicts, alone)
     known = free is not None and status not in ("not identifiable", "absent")
     mixture = known and (alike.is_mixed(order) or (alike.mixed and freest.sessions < len(verdicts)))
     if mixture:
@@ -98,7 +101,7 @@ def pooled_order(
     return PooledOrder(
         order=order,
         status=status,
-        value=free.value if free and known else None,
+        value=free.value if free and known else 1.0 if status == "compatible" else None,
         interval=free.interval if free and known else None,
         reason=reason,
         alone=alone,
@@ -111,6 +114,7 @@ def _judged(
     ranked: Sequence[PooledEstimate],
     freest: PooledEstimate,
     verdicts: Sequence[Verdict],
+    alone: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
     structure = STRUCTURES[freest.structure]
     modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
@@ -120,6 +124,9 @@ def _judged(
     if ("zeta" if order == "alpha" else "gamma") not in structure.free:
         return "absent", "no such damping shows"
     free = freest.by_name.get(order)
+    if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) in _ONE:
+        # None of those fitted has it free: the sessions' own verdicts are all that there is.
+        return "compatible", None
     if free is None or _wide(free.interval) > WIDEST_SHARE:
         return "not identifiable", "the sessions do not tell the order"
     if not freest.uniform and len(structure.free) > modes:

@@ -148,7 +148,9 @@ def order(found: PooledOrder) -> str:
     alone = " " + _alone(counts, sum(counts.values()), "say")
     if found.status == "absent":
         return f"No {of} shows, so its order {name} means nothing here.{alone}"
-    if found.status == "not identifiable" or found.value is None or found.interval is None:
+    if found.status == "compatible" and found.interval is None:
+        return f"The order {name} of the {of} is taken to be 1, as it may be.{alone}"
+    if found.value is None or found.interval is None:
         return f"The order {name} of the {of} is not identifiable: {found.reason}.{alone}"
     low, high = found.interval
     is_ = (
