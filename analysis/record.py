@@ -28,6 +28,7 @@ from analysis.stated_values import (
     stated_delay_s,
     stated_rate_hz,
     stated_tool_inertia_kg_m2,
+    stated_torque_filter_s,
 )
 from rigd.session import Session, Status, read_session, readable_texts
 
@@ -113,6 +114,8 @@ class Record:
         Age of either value at its time stamp.
     tool_inertia_kg_m2
         Inertia between torque sensor and beam.
+    torque_filter_s
+        Time constants of the torque channel's low-pass filter, of first and of second order.
     sweep
         Range of samples with the excitation.
     rest_angle_rad
@@ -141,6 +144,7 @@ class Record:
     angle_delay_s: float
     torque_delay_s: float
     tool_inertia_kg_m2: float
+    torque_filter_s: tuple[float, float]
     sweep: slice
     rest_angle_rad: float | None
     gaps: Gaps
@@ -226,6 +230,7 @@ def load_record(path: Path) -> Record:
         angle_delay_s=stated_delay_s(session, "angle_delay_s"),
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
+        torque_filter_s=stated_torque_filter_s(session),
         sweep=sweep,
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,

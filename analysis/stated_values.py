@@ -114,6 +114,27 @@ def stated_delay_s(session: Session, key: str) -> float:
     return delay_s
 
 
+def stated_torque_filter_s(session: Session) -> tuple[float, float]:
+    """Time constants of the torque channel's low-pass filter of first and of second order.
+
+    ``1 / (2 pi torque_filter_hz)`` for the order stated (`torque_filter_order`, 1 without it), 0
+    for the other; both 0 if the file states no filter.
+
+    Raises
+    ------
+    RecordError
+        There is no such corner frequency, or the order is neither 1 nor 2.
+    """
+    corner_hz = session.number("torque_filter_hz", math.inf)
+    order = session.number("torque_filter_order", 1.0)
+    if not corner_hz > 0.0:
+        raise _wrong(session, "torque_filter_hz", corner_hz, "Hz", "must be positive")
+    if order not in (1.0, 2.0):
+        raise _wrong(session, "torque_filter_order", order, "", "must be 1 or 2 (Butterworth)")
+    constant_s = 1 / (2 * math.pi * corner_hz)
+    return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
+
+
 def _wrong(session: Session, key: str, value: float, unit: str, rule: str) -> RecordError:
     return RecordError(
         f"{session.path}: {key} is {value:g} {unit}, but {rule}; correct the file's metadata."

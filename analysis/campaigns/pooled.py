@@ -10,9 +10,10 @@ import numpy as np
 
 from analysis.campaigns.pooled_modes import PooledMode, pooled_modes
 from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile
-from analysis.structures import PARAMETERS, STRUCTURES
+from analysis.structures import STRUCTURES
 from analysis.whole_record import SETTINGS, Plant
 from analysis.whole_record.plant import LOGARITHMIC
+from analysis.whole_record.uncertainty import damping_size
 from rigd.beam import Beam
 
 if TYPE_CHECKING:
@@ -22,8 +23,13 @@ if TYPE_CHECKING:
 
     from analysis.campaigns.estimates import RecordEstimate
     from analysis.campaigns.session import SessionResult
+    from analysis.selection.profile import Order
 
 _FEWEST: Final = 2
+_DAMPINGS: Final[tuple[tuple[str, str, Order], ...]] = (
+    ("internal", "zeta", "alpha"),
+    ("external", "gamma", "lambda"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +68,32 @@ class PooledParameter:
 
 
 @dataclass(frozen=True, slots=True)
+class PooledSize:
+    """Size of one damping over all sessions, where it does not depend on its order.
+
+    Attributes
+    ----------
+    damping : str
+        "internal" or "external".
+    order : str
+        "alpha" or "lambda".
+    omega_rad_s : float or None
+        That frequency; None if the order is fixed: then the size is the coefficient.
+    value, std : float
+        ``zeta omega^alpha`` (no unit) or ``gamma omega^lambda`` (1/m⁴).
+    interval : (float, float)
+        95 %.
+    """
+
+    damping: str
+    order: Order
+    omega_rad_s: float | None
+    value: float
+    std: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class PooledEstimate:
     """One structure over all sessions.
 
@@ -77,6 +109,8 @@ class PooledEstimate:
         Of the pooled parameters.
     parameters : tuple of PooledParameter
         Those that every session used determines.
+    covariance : ndarray, shape (k, k)
+        Of these, positive ones as logarithms.
     modes : tuple of PooledMode
     sessions : int
         Used: those that determine the structure's damping.
@@ -93,6 +127,7 @@ class PooledEstimate:
     beam: str
     plant: Plant
     parameters: tuple[PooledParameter, ...]
+    covariance: NDArray[np.float64]
     modes: tuple[PooledMode, ...]
     sessions: int
     misfit: float
@@ -102,6 +137,20 @@ class PooledEstimate:
     def name(self) -> str:
         """As tables call it."""
         return f"{self.structure}{self.beam}"
+
+    @property
+    def sizes(self) -> tuple[PooledSize, ...]:
+        """Sizes of the dampings that all sessions together determine."""
+        names = tuple(each.name for each in self.parameters)
+        t, found = t_quantile(0.95, self.sessions - 1), []
+        for damping, coefficient, order in _DAMPINGS:
+            size = damping_size(coefficient, order, self.plant.parameters, names, self.covariance)
+            if size is not None:
+                factor = math.exp(t * size.std / size.value)
+                ends = size.value / factor, size.value * factor
+                at = PooledSize(damping, order, size.omega_rad_s, size.value, size.std, ends)
+                found.append(at)
+        return tuple(found)
 
     @property
     def by_name(self) -> dict[str, PooledParameter]:
@@ -159,6 +208,7 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
         beam=used[0].beam,
         plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
         parameters=parameters,
+        covariance=effects.covariance,
         modes=pooled_modes(used),
         sessions=len(used),
         misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used])),
@@ -188,7 +238,7 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
 
 def _of_specimen(estimate: RecordEstimate) -> tuple[str, ...]:
     """Name the free parameters that are the specimen's: damping, and offsets of the modes."""
-    offsets = (name for name in estimate.parameters if name not in {*PARAMETERS, *SETTINGS})
+    offsets = (name for name in estimate.parameters if name.startswith("stiffness_offset"))
     return (*STRUCTURES[estimate.structure].free, *offsets)
 
 
@@ -243,6 +293,7 @@ def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
         delay_s=values["delay_s"],
         tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
         stiffness_offsets=tuple(
-            values[name] for name in like.parameters if name not in {*PARAMETERS, *SETTINGS}
+            values[name] for name in like.parameters if name.startswith("stiffness_offset")
         ),
+        **{name: values.get(name, own) for name, own in like.plant.extras.items()},
     )

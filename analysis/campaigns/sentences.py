@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
+_SIZES: Final = {"internal": ("ζω^α", ""), "external": ("γω^λ", " m⁻⁴")}
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
@@ -57,6 +58,21 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
             "that condition only."
         )
     return said
+
+
+def sizes(freest: PooledEstimate) -> list[str]:
+    """Say how large each damping is where it does not depend on its order."""
+    said = []
+    for each in freest.sizes:
+        if each.omega_rad_s is None:
+            continue
+        low, high = each.interval
+        symbol, unit = _SIZES[each.damping]
+        said.append(
+            f"{symbol} = {each.value:.4g}{unit} (95 %: {low:.4g} to {high:.4g}) at "
+            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
+        )
+    return [f"Damping at the pivot frequency: {'; '.join(said)}."] if said else []
 
 
 def selected(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from analysis.settings import RECORD_BAND_HZ, WelchSettings
 from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -69,6 +70,8 @@ class SessionResult:
     verdict : Verdict or None
         What the whole record says by itself, None without estimates.
     warnings : tuple of str
+    headline : mapping or None
+        What the session says first, as of a single file's document; None without a verdict.
     settings : WelchSettings
         As used.
     record_band_hz : tuple of float
@@ -87,6 +90,7 @@ class SessionResult:
     record_estimates: tuple[RecordEstimate, ...]
     verdict: Verdict | None
     warnings: tuple[str, ...]
+    headline: Mapping[str, Any] | None = None
     settings: WelchSettings = _USUAL
     record_band_hz: tuple[float, float] = RECORD_BAND_HZ
 
@@ -158,10 +162,10 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
     warnings = record.warnings if welch is None else welch.warnings
     warnings = (*warnings, *remarks(record, task.band_hz), *((left_out,) if left_out else ()))
     estimates: tuple[RecordEstimate, ...] = ()
-    verdict = None
+    verdict = headline = None
     if task.structures:
         try:
-            estimates, verdict = _whole_record(record, task, measured)
+            estimates, verdict, headline = _whole_record(record, task, measured)
         except failures as error:
             if welch is None:
                 return SessionFailure(path, str(error), experiment)
@@ -182,6 +186,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
         record_estimates=estimates,
         verdict=verdict,
         warnings=warnings,
+        headline=headline,
         settings=welch_settings(record, task.settings, task.band_hz),
         record_band_hz=record_band_hz(record, task.band_hz),
     )
@@ -189,9 +194,9 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
 
 def _whole_record(
     record: Record, task: SessionTask, measured: FrequencyResponse
-) -> tuple[tuple[RecordEstimate, ...], Verdict]:
+) -> tuple[tuple[RecordEstimate, ...], Verdict, dict[str, Any]]:
     """Select a structure on the whole record; of all fits, keep it and those asked for."""
-    from analysis.selection import select
+    from analysis.selection import headline_json, select
     from analysis.structures import STRUCTURES
     from analysis.suited import record_band_hz
     from analysis.whole_record import Measurement
@@ -219,4 +224,7 @@ def _whole_record(
         if each.fit.structure.name in task.structures or each.fit is selection.fit
     ]
     asked.sort(key=lambda each: (not each.uniform, order.index(each.structure)))
-    return tuple(asked), selection.verdict
+    said = selection.verdict
+    orders = (said.alpha, said.lambda_)
+    told = headline_json(str(record.path), selection.headline, orders, said.findings)
+    return tuple(asked), said, told

@@ -137,6 +137,7 @@ def campaign_verdict(
             *specimen_sentences.specimens(alike),
             sentences.headline(freest, best),
             sentences.left_over(freest, adequate, len(verdicts)),
+            *sentences.sizes(freest),
             *sentences.modes(freest, mixed=alike.mixed),
             sentences.order(alpha),
             sentences.order(lambda_),

@@ -129,7 +129,7 @@ def _print_tables(
         for subject in subjects:
             console.print(record_text(subject))
     if single and analyses:
-        withheld = subjects[0].verdict.unsupported if subjects else frozenset()
+        withheld = subjects[0].unsupported if subjects else frozenset()
         console.print(analysis_tables(analyses[0], withheld))
     elif analyses:
         console.print(summary_table(analyses))

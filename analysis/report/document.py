@@ -40,12 +40,13 @@ def document(
     Returns
     -------
     dict
-        ``versions``, ``files`` (what was read, and how the paper's route estimated it), ``fits``,
-        ``modes``, ``peaks``, ``records``, ``errors``: lists of flat objects that name their file.
+        ``versions``, ``headlines`` (what each whole record says, with flags), ``files`` (what was
+        read, and how the paper's route estimated it), ``fits``, ``modes``, ``peaks``, ``records``,
+        ``errors``: lists of objects that name their file.
         Finite numbers only.
     """
     of_records = [_record_entries(subject) for subject in subjects]
-    withheld = {subject.record.path: subject.verdict.unsupported for subject in subjects}
+    withheld = {subject.record.path: subject.unsupported for subject in subjects}
     content: dict[str, Any] = _finite(
         {
             "versions": {
@@ -78,6 +79,7 @@ def document(
                 ),
                 *(mode for entries in of_records for mode in entries["modes"]),
             ],
+            "headlines": [entries["headline"] for entries in of_records],
             "records": [record for entries in of_records for record in entries["records"]],
             "peaks": [
                 {

@@ -10,7 +10,8 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from analysis.report.html.record_tables import modes_table, parameters_table
+from analysis.report.html.damping_sentences import damping_sentences
+from analysis.report.html.record_tables import modes_table, parameters_table, sizes_table
 from analysis.report.html.table import Number
 
 if TYPE_CHECKING:
@@ -30,18 +31,19 @@ def record_text(subject: Subject) -> RenderableType:
     """
     verdict = subject.verdict
     said = [
-        Text(sentence, style="bold" if number == 0 else "")
-        for number, sentence in enumerate(verdict.sentences)
+        *(Text(sentence, style="bold") for sentence in damping_sentences(subject.headline)),
+        *map(Text, verdict.sentences),
     ]
     return Group(
         Text(f"{subject.name}: verdict", style="italic"),
         *(Padding(sentence, (0, 0, 0, 2)) for sentence in said),
         *(Padding(Text(text, style="dim"), (0, 0, 0, 2)) for text in verdict.experiments),
         "",
-        _text_table(parameters_table(subject)),
-        "",
-        _text_table(modes_table(subject)),
-        "",
+        *(
+            part
+            for table in (modes_table, sizes_table, parameters_table)
+            for part in (_text_table(table(subject)), "")
+        ),
     )
 
 

@@ -34,7 +34,7 @@ def supported_band_hz(subject: Subject) -> Band | None:
     tuple of float or None
         First and last frequency in Hz; None if there is no such band.
     """
-    if not subject.verdict.withheld:
+    if not subject.withheld:
         return excited_band_hz(subject.record, subject.analysis)
     shown = subject.visible_modes
     frequencies = [mode.frequency_hz for mode in subject.fit.modes if mode.number in shown]

@@ -96,7 +96,7 @@ def _draw(
 def _text(analysis: WelchAnalysis | None, subject: Subject | None) -> str:
     """Return the tables of the paper's route, or without it those of the whole record."""
     if analysis is not None:
-        return tables_text(analysis, () if subject is None else subject.verdict.withheld)
+        return tables_text(analysis, () if subject is None else subject.withheld)
     if subject is None:
         return ""
     from analysis.report.record_text import record_text

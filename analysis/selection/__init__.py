@@ -3,6 +3,7 @@
 from analysis.selection.candidate import Candidate
 from analysis.selection.finding import Finding
 from analysis.selection.harmonics import Harmonic
+from analysis.selection.headline import Headline, Quantity, Size, headline_json, of_fit
 from analysis.selection.orders import OrderVerdict
 from analysis.selection.profile import Profile
 from analysis.selection.select import Selection, select
@@ -13,13 +14,18 @@ __all__ = [
     "Candidate",
     "Finding",
     "Harmonic",
+    "Headline",
     "InputRelation",
     "OrderVerdict",
     "Profile",
+    "Quantity",
     "Row",
     "Selection",
+    "Size",
     "Verdict",
     "Whiteness",
     "cumulative_periodogram",
+    "headline_json",
+    "of_fit",
     "select",
 ]

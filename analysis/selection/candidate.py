@@ -4,11 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from analysis.structures import Structure
     from analysis.whole_record import RecordFit
+
+EXTRA_WORDS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "root_compliance_rad_per_nm": "elastic clamp",
+        "tip_mass_kg": "tip mass",
+        "filter_time_constant_s": "first-order filter",
+        "second_order_filter_time_constant_s": "second-order filter",
+        "clock_rate_difference": "clock rate difference",
+    }
+)
+"""What tables call the extras of a candidate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +37,15 @@ class Candidate:
     fit : RecordFit
     columns : int
         Parameters of what is not linear, beside those of the fit.
+    extras : tuple of str
+        What else of `analysis.whole_record.EXTRAS` was free.
     """
 
     structure: Structure
     uniform: bool
     fit: RecordFit
     columns: int = 0
+    extras: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> int:
@@ -58,6 +75,13 @@ class Candidate:
         return self.deviance + 2 * self.parameters
 
     @property
+    def kind(self) -> tuple[bool, tuple[str, ...]]:
+        """Of rig: whether the beam is uniform, and what else was free."""
+        return self.uniform, self.extras
+
+    @property
     def name(self) -> str:
         """As tables call it."""
-        return self.structure.name if self.uniform else f"{self.structure.name}, modes free"
+        beside = [] if self.uniform else ["modes free"]
+        beside += [EXTRA_WORDS[name] for name in self.extras]
+        return ", ".join([self.structure.name, *beside])

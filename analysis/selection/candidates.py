@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.selection.candidate import Candidate
+from analysis.selection.extras import with_extras
 from analysis.selection.hum import without_leakage
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted, resonances_kept, vector
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import whiteness
 from analysis.structures import STRUCTURES
-from analysis.whole_record import SETTINGS, Plant, fit_record
+from analysis.whole_record import SETTINGS, fit_record
 from analysis.whole_record.comparison import Comparison
 from analysis.whole_record.noise import Noise
 from analysis.whole_record.unknowns import Unknowns
-from rigd.beam import Damping
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,17 +26,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.structures import Structure
-    from analysis.whole_record import Measurement, RecordAnalysis, RecordFit, Setting
+    from analysis.whole_record import Measurement, Plant, RecordAnalysis, RecordFit, Setting
 
 FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
 """Structures always tried on a beam that is not uniform: those of a material of integer order."""
 
 _FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
-"""Tried there as well if such a beam is the best. Then the modes' frequencies say nothing of the
-orders, only their damping does."""
+"""Fitted there as well if such a beam is the best, as on any other kind. Where the modes are free
+their frequencies say nothing of the orders, only their damping does."""
 
 _DISMISSED: Final = 10.0
-"""Difference of BIC by which these must be better."""
+"""Difference of BIC by which these must be better for the noise to be taken anew."""
+
+_SHOWS: Final = 4.0
+"""Deviance that a damping must save to stay in the freest structure: one that saves less moves no
+other parameter by more than two standard deviations, and only makes them uncertain."""
+
+_FREEST: Final = STRUCTURES["VI"]
+_ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 
 _CROSS_CHECKS: Final = 3
 _FEW: Final = 8
@@ -105,12 +111,48 @@ class Field:
                 if _all_but_white(field, likeliest)
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
-        return field.cross_checked()
+        return with_extras(field.cross_checked())
 
     @property
     def best(self) -> Candidate:
-        """The lowest BIC."""
+        """The first: the lowest BIC, unless the field is led by another (`led_by`)."""
         return self.candidates[0]
+
+    @property
+    def freest(self) -> Candidate:
+        """The freest structure that the record supports, on the beam of the best.
+
+        All orders are free, so its intervals hold whichever simpler structure is the true one;
+        those of the lowest BIC hold only if that is. A damping that does not show at all is left
+        out, with its order.
+        """
+        best = self.best
+        alike = {c.structure.name: c for c in self.candidates if c.kind == best.kind}
+        freest = alike.get(_FREEST.name)
+        if freest is None:
+            return best
+        lesser = [alike[s.name] for s in _ONE_DAMPING if s.name in alike]
+        least = min(lesser, key=lambda c: c.deviance, default=freest)
+        return least if least.deviance - freest.deviance < _SHOWS else freest
+
+    def led_by(self, candidate: Candidate) -> Field:
+        """Put one candidate first: the one whose numbers are told."""
+        others = (c for c in self.candidates if c is not candidate)
+        return replace(self, candidates=(candidate, *others))
+
+    def other_kinds(self, within: float) -> tuple[Candidate, ...]:
+        """Return the best candidate of each other kind of rig that explains the record as well.
+
+        Parameters
+        ----------
+        within : float
+            By how much the BIC may be above the lowest.
+        """
+        best: dict[tuple[bool, tuple[str, ...]], Candidate] = {}
+        for candidate in self.candidates:
+            if candidate.bic < self.best.bic + within:
+                best.setdefault(candidate.kind, candidate)
+        return tuple(each for kind, each in best.items() if kind != self.best.kind)
 
     @property
     def likeliest(self) -> RecordFit:
@@ -122,20 +164,24 @@ class Field:
         """The lowest, comparable between fields whose noise has been estimated anew."""
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
-    def unknowns(self, structure: Structure, uniform: bool) -> Unknowns:
+    def unknowns(
+        self, structure: Structure, uniform: bool, extras: tuple[str, ...] = ()
+    ) -> Unknowns:
         """Search space of a structure on this record."""
-        measurement = self.comparison.measurement
-        nominal = Plant(
-            measurement.beam, Damping(), measurement.delay_s, measurement.tool_inertia_kg_m2
-        )
         modes = 1 if uniform else self.comparison.visible_modes
-        return Unknowns.of(structure, nominal, self.free, modes)
+        nominal = self.comparison.measurement.nominal
+        return Unknowns.of(structure, nominal, self.free, modes, extras)
 
     def refit(
-        self, structure: Structure, uniform: bool, start: Plant, max_evaluations: int = _MANY
+        self,
+        structure: Structure,
+        uniform: bool,
+        start: Plant,
+        max_evaluations: int = _MANY,
+        extras: tuple[str, ...] = (),
     ) -> Refit:
         """Descend with one structure from a plant that has its damping."""
-        unknowns = self.unknowns(structure, uniform)
+        unknowns = self.unknowns(structure, uniform, extras)
         return self.descent(unknowns, vector(unknowns, start), max_evaluations)
 
     def descent(
@@ -152,11 +198,16 @@ class Field:
         )
 
     def candidate(
-        self, structure: Structure, uniform: bool, start: Plant, max_evaluations: int = _MANY
+        self,
+        structure: Structure,
+        uniform: bool,
+        start: Plant,
+        max_evaluations: int = _MANY,
+        extras: tuple[str, ...] = (),
     ) -> Candidate:
         """Fit one structure from a plant."""
-        refit = self.refit(structure, uniform, start, max_evaluations)
-        return Candidate(structure, uniform, refit.fit(), len(self.columns))
+        refit = self.refit(structure, uniform, start, max_evaluations, extras)
+        return Candidate(structure, uniform, refit.fit(), len(self.columns), extras)
 
     def _without_leakage(self) -> Field:
         """Leave out what hum beyond the band spoils."""
@@ -167,7 +218,8 @@ class Field:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
         again = _ranked(
-            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW) for c in self.candidates
+            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW, c.extras)
+            for c in self.candidates
         )
         return replace(other, candidates=again)
 
@@ -222,7 +274,7 @@ class Field:
         structure = candidate.structure
         if (of.internal and not structure.internal) or (of.external and not structure.external):
             return candidate
-        unknowns = self.unknowns(structure, candidate.uniform)
+        unknowns = self.unknowns(structure, candidate.uniform, candidate.extras)
         start = adapted(unknowns, plant, of)
         outlook = self.descent(unknowns, start, 1)
         least = candidate.fit.cost * (1 - _MISSED)
@@ -234,35 +286,36 @@ class Field:
         found = self.descent(unknowns, first.x, _MANY)
         if found.cost > least:
             return candidate
-        return Candidate(structure, candidate.uniform, found.fit(), len(self.columns))
+        return replace(candidate, fit=found.fit(), columns=len(self.columns))
 
     def with_orders_free(self) -> Field:
-        """Free the orders too on a beam that is not uniform, if that explains far more."""
+        """Free the orders too, on a beam of the best's kind, if that was not done."""
         best = self.best
-        needed = best.fit.cost * math.exp(-_DISMISSED / best.values)
-        refits = []
+        known = {c.structure.name for c in self.candidates if c.kind == best.kind}
+        found = []
         for structure in _FREE_ORDERS:
-            unknowns = self.unknowns(structure, uniform=False)
-            start = adapted(unknowns, best.fit.plant, best.structure)
-            first = self.descent(unknowns, start, _FEW)
-            if first.promised_cost < needed:
-                refits.append(self.descent(unknowns, first.x, _MANY))
-        if not refits:
+            if structure.name not in known:
+                unknowns = self.unknowns(structure, best.uniform, best.extras)
+                start = adapted(unknowns, best.fit.plant, best.structure)
+                found.append((structure, self.descent(unknowns, start, _MANY)))
+        if not found:
             return self
-        found = (
-            Candidate(refit.objective.unknowns.structure, False, refit.fit(), len(self.columns))
-            for refit in refits
+        candidates = (
+            Candidate(structure, best.uniform, refit.fit(), len(self.columns), best.extras)
+            for structure, refit in found
         )
-        freed = replace(self, candidates=_ranked((*self.candidates, *found)))
+        freed = replace(self, candidates=_ranked((*self.candidates, *candidates)))
         if freed.best.bic > best.bic - _DISMISSED:
-            return self
-        return freed._under(min(refits, key=lambda refit: refit.cost).noise_here())
+            return freed.cross_checked()
+        lowest = min((refit for _, refit in found), key=lambda refit: refit.cost)
+        return freed._under(lowest.noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
         """Fit all again, with what is not linear beside the beam."""
         other = replace(self, columns=columns, noise=noise)
         again = _ranked(
-            other.candidate(c.structure, c.uniform, c.fit.plant) for c in self.candidates
+            other.candidate(c.structure, c.uniform, c.fit.plant, extras=c.extras)
+            for c in self.candidates
         )
         return replace(other, candidates=again).cross_checked()
 

@@ -39,7 +39,7 @@ def experiments(
                 "the modes, or a wider sweep that reaches one more mode."
             )
     unexplained = any(finding.kind == "unexplained" for finding in found)
-    if close or (not unexplained and any(o.status == "not supported" for o in orders)):
+    if close or (not unexplained and any(o.status == "open" for o in orders)):
         advice.append(
             "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
         )

@@ -77,7 +77,7 @@ def nonlinear_forces(
     forces : tuple of NonlinearForce
     """
     best = field.best
-    here = field.refit(best.structure, best.uniform, best.fit.plant)
+    here = field.refit(best.structure, best.uniform, best.fit.plant, extras=best.extras)
     if _gain(best, here.cost, _most_wanted(field, here, modes, [])[1]) < _HINT:
         return field, ()
     for lead in _leads(field):
@@ -92,7 +92,11 @@ def _leads(field: Field) -> tuple[Candidate, ...]:
     best = field.best
     if best.uniform and "alpha" not in best.structure.free:
         return (best,)
-    simple = (c for c in field.candidates if c.uniform and c.structure in FREE_STIFFNESS)
+    simple = (
+        c
+        for c in field.candidates
+        if c.uniform and c.extras == best.extras and c.structure in FREE_STIFFNESS
+    )
     return (*simple, best)
 
 
@@ -103,7 +107,7 @@ def _added(
     terms: list[Term] = []
     sizes = std = np.zeros(0)
     best = field.best
-    here = field.refit(lead.structure, lead.uniform, lead.fit.plant)
+    here = field.refit(lead.structure, lead.uniform, lead.fit.plant, extras=lead.extras)
     while len(terms) < _MOST_TERMS:
         term, cost = _most_wanted(field, here, modes, terms)
         behind = _gain(best, cost, best.fit.cost)

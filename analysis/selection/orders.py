@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
 
 if TYPE_CHECKING:
     from analysis.selection.candidate import Candidate
     from analysis.selection.candidates import Field
     from analysis.selection.profile import Order, Profile
 
-Status = Literal["integer", "fractional", "not supported", "not identifiable", "absent"]
+Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 
 STRONG: Final = 10.0
 """Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
 Statistical Association 90 (1995) 773-795); below `EVEN` the data do not tell the two apart."""
 
 EVEN: Final = 6.0
-BARE: Final = 2.0
-"""Difference of BIC "not worth more than a bare mention" (the same): none is preferred."""
 
-_MODES_FOR_ALPHA: Final = 2
+EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
+"""Deviance above the freest structure's from which a simpler one is excluded, by the number of
+parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a thousand records."""
+
+_MODES_FOR_AN_ORDER: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +36,15 @@ class OrderVerdict:
     order : str
         "alpha" (internal damping, of the material) or "lambda" (external, of the surroundings).
     status : str
-        "integer": 1 fits and no other value is called for; "fractional": the record excludes 1;
-        "not supported": a fractional order fits, but something else does as well or something is
-        unexplained; "not identifiable": it could be almost anything; "absent": such damping does
-        not show, though the record would show it.
+        "compatible": the 95 % interval holds 1; "fractional": the record excludes 1; "open": 1 is
+        doubtful but not excluded, or something else explains as much; "not identifiable": it could
+        be almost anything; "absent": such damping does not show, though the record would show it.
     value : float or None
-        To be used further: 1, the estimate, or none.
+        The estimate with the order free, where the order is identifiable.
     interval : tuple of float or None
-        95 %, with the order free, where the order is identifiable.
+        Its 95 % interval, by the likelihood ratio.
+    reason : str or None
+        Why the number must not be taken for a property of the beam; None: it may.
     profile : Profile
     """
 
@@ -48,6 +52,7 @@ class OrderVerdict:
     status: Status
     value: float | None
     interval: tuple[float, float] | None
+    reason: str | None
     profile: Profile
 
 
@@ -59,38 +64,74 @@ def order_verdict(
     Parameters
     ----------
     field : Field
-        With the candidates ranked.
     profile : Profile
-        Of the order, in the structure selected.
+        Of the order, in the freest structure on the beam selected.
     visible : tuple of int
         Modes that the record shows.
     adequate : bool
-        Whether the selected structure leaves nothing but noise.
+        Whether that structure leaves nothing but noise.
     """
-    status = _status(field, profile, visible, adequate=adequate)
-    value = {"integer": 1.0, "fractional": profile.estimate}.get(status)
-    identifiable = status not in ("not identifiable", "absent")
-    interval = profile.interval if identifiable else None
-    return OrderVerdict(profile.order, status, value, interval, profile)
+    status, reason = _judged(field, profile, visible, adequate=adequate)
+    known = status not in ("not identifiable", "absent")
+    return OrderVerdict(
+        order=profile.order,
+        status=status,
+        value=profile.estimate if known else None,
+        interval=profile.interval if known else None,
+        reason=reason,
+        profile=profile,
+    )
 
 
-def _status(field: Field, profile: Profile, visible: tuple[int, ...], *, adequate: bool) -> Status:
-    best, order = field.best, profile.order
+def _judged(
+    field: Field, profile: Profile, visible: tuple[int, ...], *, adequate: bool
+) -> tuple[Status, str | None]:
+    freest, order = field.freest, profile.order
     coefficient = "zeta" if order == "alpha" else "gamma"
-    if coefficient not in best.fit.interval and len(visible) > 1:
-        return "absent"
-    # The loss at one frequency is all that one mode shows; what may narrow the order then is how
-    # exactly the beam is uniform. The surroundings' damping shows below the first mode as well.
-    if not profile.identifiable or (order == "alpha" and len(visible) < _MODES_FOR_ALPHA):
-        return "not identifiable"
+    untold = untold_reason(field, visible)
+    if coefficient not in freest.structure.free and len(visible) >= _MODES_FOR_AN_ORDER:
+        return "absent", "no such damping shows"
+    if untold is not None:
+        return "not identifiable", untold
+    if not profile.identifiable:
+        return "not identifiable", "the record does not tell the order"
+    if not adequate:
+        return "open", "part of the record is unexplained"
+    if any(_integer(rival, order) for rival in rivals(field, STRONG) if rival.kind != freest.kind):
+        return "open", "order 1 on another kind of beam explains the record about as well"
     if profile.admits_one:
-        return "integer"
-    if order not in best.fit.interval:
-        freed = math.log(best.values) - profile.gain
-        return "integer" if freed > BARE else "not supported"
-    if not adequate or any(_integer(rival, order) for rival in rivals(field, STRONG)):
-        return "not supported"
-    return "fractional"
+        return "compatible", None
+    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
+
+
+def untold_reason(field: Field, visible: tuple[int, ...]) -> str | None:
+    """Say why no order can be told from a record, whatever its likelihood says; None if it may.
+
+    Parameters
+    ----------
+    field : Field
+    visible : tuple of int
+        Modes that the record shows.
+    """
+    freest = field.freest
+    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
+    # exactly the beam is uniform.
+    if len(visible) < _MODES_FOR_AN_ORDER:
+        return "one mode alone shows how much damping there is, not of which order"
+    if not freest.uniform and len(freest.structure.free) > len(visible):
+        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
+        return f"on a beam that is not uniform it rests on {len(visible)} loss factors alone"
+    return None
+
+
+def deviance_of_one(profile: Profile) -> float:
+    """Deviance of order 1 above the lowest; infinite where the walk along the order ended before.
+
+    Parameters
+    ----------
+    profile : Profile
+    """
+    return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
 
 
 def _integer(candidate: Candidate, order: Order) -> bool:
@@ -99,6 +140,6 @@ def _integer(candidate: Candidate, order: Order) -> bool:
 
 
 def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
-    """Candidates whose BIC is less than so much above the lowest, without the best."""
+    """Candidates whose BIC is less than so much above that of the first, without the first."""
     limit = field.best.bic + within
     return tuple(c for c in field.candidates[1:] if c.bic < limit)

@@ -61,6 +61,23 @@ class Profile:
     open_above: bool
     gain: float
 
+    @classmethod
+    def unwalked(cls, candidate: Candidate, order: Order) -> Profile:
+        """Stand for an order that nothing could tell: one value, and no limit to either side.
+
+        Parameters
+        ----------
+        candidate : Candidate
+        order : str
+        """
+        at = candidate.fit.parameters[order]
+        return cls(order, candidate.name, (at,), (0.0,), at, (at,), ORDER_RANGE, True, True, 0.0)
+
+    @property
+    def walked(self) -> bool:
+        """Whether any other value was looked at."""
+        return len(self.values) > 1
+
     @property
     def share(self) -> float:
         """Part of the range that the interval spans."""

@@ -15,7 +15,7 @@ _MISSED: Final = 1e-5
 
 
 def profiled(field: Field) -> tuple[Field, Profile, Profile]:
-    """Profile alpha and lambda in the best structure.
+    """Profile alpha and lambda in the freest structure on the best beam.
 
     What a walk finds lower than the candidates are, or in another valley, is where all of them
     start once more, so that the fit selected and the profile tell of one minimum.
@@ -31,7 +31,8 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
     alpha, lambda_ : Profile
     """
     for round_ in range(1, _ROUNDS + 1):
-        alpha, lambda_ = profile(field, field.best, "alpha"), profile(field, field.best, "lambda")
+        freest = field.freest
+        alpha, lambda_ = profile(field, freest, "alpha"), profile(field, freest, "lambda")
         before = [candidate.fit.cost for candidate in field.candidates]
         if round_ == _ROUNDS:
             break

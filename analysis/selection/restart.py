@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.whole_record.unknowns import Unknowns
 from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from analysis.structures import Structure
     from analysis.whole_record import ModeEstimate, Plant, RecordFit
+    from analysis.whole_record.unknowns import Unknowns
 
 _SMALL: Final = 1e-5
 """Loss, relative to stiffness or inertia, at which a damping is brought in."""
@@ -48,6 +49,7 @@ def vector(unknowns: Unknowns, plant: Plant) -> NDArray[np.float64]:
             for name, value in plant.parameters.items()
             if name.startswith("stiffness_offset")
         },
+        **{name: value / unknowns.units[name] for name, value in plant.extras.items()},
     }
     if unknowns.structure.internal:
         size = damping.zeta * second**damping.alpha
@@ -80,7 +82,7 @@ def adapted(unknowns: Unknowns, plant: Plant, of: Structure) -> NDArray[np.float
     of : Structure
         The other.
     """
-    own = Unknowns(of, unknowns.nominal, unknowns.free, unknowns.offsets, unknowns.omega_rad_s)
+    own = replace(unknowns, structure=of)
     start = dict(zip(own.names, vector(own, plant).tolist(), strict=True))
     for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
         start.setdefault(coefficient, math.log(_SMALL))

@@ -10,8 +10,10 @@ from analysis.selection.candidates import Field
 from analysis.selection.experiments import experiments
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
+from analysis.selection.headline import Headline, headline
 from analysis.selection.nonlinear_search import nonlinear_forces
-from analysis.selection.orders import EVEN, order_verdict, rivals
+from analysis.selection.orders import EVEN, order_verdict, rivals, untold_reason
+from analysis.selection.profile import Profile
 from analysis.selection.profiles import profiled
 from analysis.selection.verdict import Row, Verdict
 from analysis.selection.visible import visible_modes
@@ -33,6 +35,8 @@ class Selection:
     Attributes
     ----------
     verdict : Verdict
+    headline : Headline
+        The numbers to be told first, with flags.
     candidates : tuple of Candidate
         All fits, the lowest BIC first.
     analysis : RecordAnalysis
@@ -40,13 +44,14 @@ class Selection:
     """
 
     verdict: Verdict
+    headline: Headline
     candidates: tuple[Candidate, ...]
     analysis: RecordAnalysis
 
     @property
     def fit(self) -> RecordFit:
-        """The fit selected, for parameters with their uncertainty."""
-        return self.candidates[0].fit
+        """The fit that the headline's numbers are of."""
+        return self.headline.fit
 
 
 def select(
@@ -59,8 +64,10 @@ def select(
 
     All structures are fitted under one spectrum of the noise, on a uniform beam, and those of
     integer internal order also with the modes' stiffness free; if one of those is the best, its
-    orders are freed as well. The lowest BIC is selected. If restoring forces that are not linear
-    save far more than chance would, all are fitted again with these beside the beam.
+    orders are freed as well. The lowest BIC decides on the kind of beam. What is told is of the
+    freest structure on that beam, every order free, so that intervals hold whichever simpler one is
+    true. If restoring forces that are not linear save far more than chance would, all are fitted
+    again with these beside the beam.
 
     Parameters
     ----------
@@ -79,11 +86,17 @@ def select(
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = nonlinear_forces(linear, visible)
-    if not field.best.uniform:
-        field = field.with_orders_free()
-    field, of_alpha, of_lambda = profiled(field)
-    white, related = _tests(field)
-    comparison, fit = field.comparison, field.best.fit
+    field = field.with_orders_free()
+    if untold_reason(field, visible) is None:
+        field, of_alpha, of_lambda = profiled(field)
+    else:
+        of_alpha, of_lambda = (
+            Profile.unwalked(field.freest, "alpha"),
+            Profile.unwalked(field.freest, "lambda"),
+        )
+    told = field.led_by(field.freest)
+    white, related = _tests(told)
+    comparison, fit = field.comparison, told.best.fit
     multiples = harmonics(
         comparison.angle_rad[comparison.kept],
         in_time(fit.residual, comparison.bins, comparison.samples),
@@ -92,44 +105,40 @@ def select(
     )
     explained = white.white and not related.related
     adequate = explained and not any(h.present for h in multiples)
-    alpha, lambda_ = (
-        order_verdict(field, profile, visible, adequate=adequate)
-        for profile in (of_alpha, of_lambda)
+    orders = (
+        order_verdict(field, of_alpha, visible, adequate=adequate),
+        order_verdict(field, of_lambda, visible, adequate=adequate),
     )
     close = rivals(field, EVEN)
-    found = findings(field, forces, multiples, visible)
+    found = findings(told, forces, multiples, visible)
     if not explained:
         found = (*found, unexplained(white, related, fit.modes))
-    unsure = {
-        o.order for o in (alpha, lambda_) if o.status in ("not identifiable", "not supported")
-    }
-    said = [
-        *sentences.selected(field, close, (alpha, lambda_), adequate=adequate),
-        sentences.order(alpha, visible, adequate=adequate),
-        sentences.order(lambda_, visible, adequate=adequate),
-        *(finding.sentence for finding in found),
-    ]
+    numbers = headline(field, orders, visible, adequate=adequate)
     best = field.best
     return Selection(
         candidates=field.candidates,
+        headline=numbers,
         analysis=_analysis(field),
         verdict=Verdict(
             name=measurement.name,
             structure=best.structure.name,
             uniform=best.uniform,
             rivals=tuple(c.name for c in close),
-            parameters={k: v for k, v in fit.parameters.items() if k not in unsure},
+            parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
             adequate=adequate,
-            alpha=alpha,
-            lambda_=lambda_,
+            alpha=orders[0],
+            lambda_=orders[1],
             visible_modes=visible,
             findings=found,
             table=_table(field),
             whiteness=white,
             input_relation=related,
             harmonics=multiples,
-            sentences=tuple(said),
-            experiments=tuple(experiments(field, (alpha, lambda_), visible, found, close)),
+            sentences=(
+                *sentences.of_headline(numbers, orders, adequate=adequate),
+                *(finding.sentence for finding in found),
+            ),
+            experiments=tuple(experiments(field, orders, visible, found, close)),
         ),
     )
 

@@ -2,106 +2,164 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
+from analysis.selection.headline import ONE_MODE
+from analysis.selection.orders import deviance_of_one
+
 if TYPE_CHECKING:
-    from analysis.selection.candidate import Candidate
-    from analysis.selection.candidates import Field
+    from analysis.selection.headline import Headline, Quantity, Simpler
     from analysis.selection.orders import OrderVerdict
 
 _DAMPING: Final = {
-    "I": "damping of the material only, proportional to the rate of strain",
-    "II": "viscous damping by the surroundings only",
-    "III": "viscous damping by material and surroundings, both of order 1",
-    "IV": "damping of the material only, of fractional order",
-    "V": "damping by the surroundings only, of fractional order",
-    "VI": "damping by material and surroundings, both of fractional order",
-    "VII": "damping of the material of order 1, and by the surroundings of fractional order",
+    "I": "Damping by the material only",
+    "II": "Damping by the surroundings only",
+    "III": "Damping by material and surroundings",
+    "IV": "Damping by the material only",
+    "V": "Damping by the surroundings only",
+    "VI": "Damping by material and surroundings",
+    "VII": "Damping by material and surroundings",
 }
+_SEVERAL: Final = 2
+_FREE: Final = "modes free"
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 
 
-def selected(
-    field: Field,
-    close: tuple[Candidate, ...],
-    orders: tuple[OrderVerdict, ...],
-    *,
-    adequate: bool,
+def of_headline(
+    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, adequate: bool
 ) -> list[str]:
-    """Say what was selected, and what it cannot be told from."""
-    best = field.best
-    beam = "" if best.uniform else ", on a beam whose modes each have a stiffness of their own"
-    said = [f"Type {best.structure.name}: {_DAMPING[best.structure.name]}{beam}."]
-    loose = [o.order for o in orders if o.value is None and o.order in best.structure.free]
-    if loose:
-        said.append(
-            f"It describes the record best, but its {' and '.join(loose)} must not be taken for a "
-            "property of the beam."
-        )
-    if close:
-        margin = min(c.bic for c in close) - best.bic
-        said.append(
-            f"The data cannot tell type {best.name} from "
-            f"{' or '.join(f'type {c.name}' for c in close)} (BIC differs by {margin:.1f}; "
-            "10 would be clear)."
-        )
+    """Say what the beam does, what is excluded, and what would do.
+
+    Parameters
+    ----------
+    told : Headline
+    orders : tuple of OrderVerdict
+        Alpha's and lambda's.
+    adequate : bool
+        Whether nothing but noise remains.
+    """
+    free = told.fit.structure
+    kind = told.name.partition(", ")[2]
+    beam = ", on a beam whose modes each have a stiffness of their own" if kind == _FREE else ""
+    if kind and not beam:
+        beam = f", beside {kind}"
+    if len(told.visible_modes) < _SEVERAL:
+        said = [f"{ONE_MODE.capitalize()}, and nothing of orders."]
     else:
-        others = [c for c in field.candidates[1:] if c.structure is not best.structure]
-        if others:
-            next_best = others[0]
-            behind = next_best.bic - best.bic
-            said.append(
-                f"The next, type {next_best.name}, is worse by "
-                f"{behind:.{0 if behind > 100 else 1}f} in BIC (10 would be clear)."
-            )
+        said = [
+            f"{_DAMPING[free.name]}{beam}: the numbers are those of type {told.name}, every order "
+            "free."
+        ]
+        excluded = told.with_status("excluded")
+        if adequate and excluded:
+            said.append(f"Excluded: {_types(excluded)}.")
+        if told.simpler is not None and told.simpler.fixed:
+            said.append(_condition(told.simpler))
+    said += [order(each) for each in orders]
     if adequate:
         said.append("What it leaves is noise: nothing in the record asks for more.")
     return said
 
 
-def order(verdict: OrderVerdict, visible: tuple[int, ...], *, adequate: bool) -> str:
-    """Say what is known of one order."""
+def _types(names: tuple[str, ...]) -> str:
+    """List structures, those of a uniform beam first."""
+    plain = sorted(name for name in names if "," not in name)
+    others: dict[str, list[str]] = {}
+    for name in sorted(set(names) - set(plain)):
+        structure, beam = name.split(", ", 1)
+        others.setdefault(beam, []).append(structure)
+    groups = [_listed(plain)] if plain else []
+    groups += [f"with {beam} {_listed(each)}" for beam, each in others.items()]
+    return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _condition(simpler: Simpler) -> str:
+    """Say what a simpler structure would give."""
+    taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
+    numbers = [
+        f"{name} = {_with_interval(simpler.parameters[name])}"
+        for name in ("zeta", "alpha", "gamma", "lambda")
+        if name in simpler.parameters
+    ]
+    they = "it is" if len(simpler.fixed) == 1 else "they are"
+    return (
+        f"{taken[0].upper()}{taken[1:]} {'is' if they == 'it is' else 'are'} not excluded (type "
+        f"{simpler.name}); only if {they} true, {', '.join(numbers)}."
+    )
+
+
+def _with_interval(quantity: Quantity) -> str:
+    """Write a number with its 95 % interval, to the digits that this gives a meaning."""
+    if quantity.interval_95 is None or not quantity.std:
+        return f"{quantity.value:.4g}"
+    low, high = quantity.interval_95
+    power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
+    scale = 10.0**power if power < -2 else 1.0
+    digits = max(0, 1 - math.floor(math.log10(quantity.std / scale)))
+    exponent = f"e{power}" if power < -2 else ""
+    return (
+        f"{quantity.value / scale:.{digits}f}{exponent} "
+        f"({low / scale:.{digits}f}{exponent} to {high / scale:.{digits}f}{exponent})"
+    )
+
+
+def order(verdict: OrderVerdict) -> str:
+    """Say what is known of one order.
+
+    Parameters
+    ----------
+    verdict : OrderVerdict
+    """
     profile = verdict.profile
     low, high = profile.interval
-    ends = f"95 %: {low:.3f} to {high:.3f}"
     name, of = verdict.order, _OF[verdict.order]
+    value = f"{profile.estimate:.3f} (95 %: {low:.3f} to {high:.3f})"
     if verdict.status == "absent":
         return f"No {of} shows, so its order {name} means nothing here."
-    if verdict.status == "not identifiable" and len(profile.valleys) > 1:
+    if verdict.status == "not identifiable":
+        return f"The order {name} of the {of} is not identifiable: {_why_not(verdict)}."
+    if verdict.reason is not None:
+        return (
+            f"The order {name} of the {of} stays open: {value} would fit, but {verdict.reason}. It "
+            "must not be taken for a property of the beam."
+        )
+    if verdict.status == "compatible":
+        return f"The order {name} of the {of} is {value}: 1 would do."
+    if verdict.status == "fractional":
+        return f"The order {name} of the {of} is {value}; 1 is excluded."
+    return (
+        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (chance would "
+        f"be as far off in one record of {_one_in(deviance_of_one(profile))})."
+    )
+
+
+def _why_not(verdict: OrderVerdict) -> str:
+    profile = verdict.profile
+    low, high = profile.interval
+    if verdict.reason is not None and (profile.identifiable or not profile.walked):
+        return verdict.reason
+    if len(profile.valleys) > 1:
         equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
         return (
-            f"The order {name} of the {of} is not identifiable: {equal} explain the record equally "
-            f"well, each with a damping of its own ({ends}, with all that lies between)."
+            f"{equal} explain the record equally well, each with a damping of its own "
+            f"(95 %: {low:.3f} to {high:.3f}, with all that lies between)"
         )
-    if verdict.status == "not identifiable":
-        span = (
-            "any value between 0 and 2 fits"
-            if profile.open_below and profile.open_above
-            else f"anything below {high:.2f} fits"
-            if profile.open_below
-            else f"anything above {low:.2f} fits"
-            if profile.open_above
-            else f"anything from {low:.2f} to {high:.2f} fits"
-        )
-        if len(visible) < 2 and name == "alpha":
-            span = "one mode alone shows how much damping there is, not of which order" + (
-                "" if profile.identifiable else f"; {span}"
-            )
-        return f"The order {name} of the {of} is not identifiable: {span}."
-    if verdict.status == "integer":
-        chance = "" if profile.admits_one else ", which differs from 1 by no more than chance may"
-        return (
-            f"The order {name} of the {of} is 1 as far as the data tell "
-            f"({ends} if it is left free{chance})."
-        )
-    if verdict.status == "fractional":
-        return f"The order {name} of the {of} is {profile.estimate:.3f} ({ends}); 1 is excluded."
-    but = (
-        "a structure of order 1 explains the record about as well"
-        if adequate
-        else "part of the record is unexplained"
-    )
     return (
-        f"The order {name} of the {of} stays open: {profile.estimate:.3f} would fit ({ends}), but "
-        f"{but}. It is not reported."
+        "any value between 0 and 2 fits"
+        if profile.open_below and profile.open_above
+        else f"anything below {high:.2f} fits"
+        if profile.open_below
+        else f"anything above {low:.2f} fits"
+        if profile.open_above
+        else f"anything from {low:.2f} to {high:.2f} fits"
     )
+
+
+def _one_in(deviance: float) -> int:
+    """Of how many records chance gives one with such a deviance, of one degree of freedom."""
+    return 10 * round(0.1 / math.erfc(math.sqrt(deviance / 2)))

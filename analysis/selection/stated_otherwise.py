@@ -205,7 +205,7 @@ def _as_stated(field: Field, name: Setting) -> bool:
     held = replace(field, free=tuple(other for other in field.free if other != name))
     for candidate in field.candidates:
         structure, uniform, values = candidate.structure, candidate.uniform, candidate.values
-        unknowns = held.unknowns(structure, uniform)
+        unknowns = held.unknowns(structure, uniform, candidate.extras)
         start = vector(unknowns, candidate.fit.plant)
         saved = field.best.bic + STRONG - (candidate.parameters - 1) * math.log(values)
         enough = values * math.exp(saved / values)

@@ -50,16 +50,16 @@ class Verdict:
     name : str
         The file.
     structure : str
-        Selected: "I" to "VII".
+        Of the lowest BIC: "I" to "VII".
     uniform : bool
-        Whether the beam selected is uniform.
+        Whether its beam is uniform.
     rivals : tuple of str
         Structures that the data cannot tell from it.
     parameters : mapping of str to float
-        Of the structure selected, as `RecordFit` names them; orders that are not identifiable or
-        not supported are left out.
+        Of the freest structure on that beam, as `RecordFit` names them; those that carry a flag
+        are left out.
     adequate : bool
-        Whether what remains is noise.
+        Whether what remains of that is noise.
     alpha, lambda_ : OrderVerdict
     visible_modes : tuple of int
         Modes that stand out of the noise.

@@ -64,7 +64,9 @@ class Walk:
         self.order = order
         self.structure = with_order(candidate.structure, order)
         self._field, self._values = field, candidate.values
-        self._unknowns = unknowns = field.unknowns(self.structure, candidate.uniform)
+        self._unknowns = unknowns = field.unknowns(
+            self.structure, candidate.uniform, candidate.extras
+        )
         self._place = unknowns.names.index(order)
         seed = adapted(unknowns, candidate.fit.plant, candidate.structure)
         first = field.descent(unknowns, seed, _MAX_EVALUATIONS)

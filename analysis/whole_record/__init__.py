@@ -3,7 +3,7 @@
 from analysis.whole_record.estimate import BAND_HZ, fit_record
 from analysis.whole_record.measurement import Measurement, MeasurementError
 from analysis.whole_record.noise import Line
-from analysis.whole_record.plant import SETTINGS, Plant, Setting
+from analysis.whole_record.plant import EXTRAS, SETTINGS, Extra, Plant, Setting
 from analysis.whole_record.result import (
     DampingSize,
     ModeEstimate,
@@ -14,8 +14,10 @@ from analysis.whole_record.result import (
 
 __all__ = [
     "BAND_HZ",
+    "EXTRAS",
     "SETTINGS",
     "DampingSize",
+    "Extra",
     "Line",
     "Measurement",
     "MeasurementError",

@@ -9,13 +9,12 @@ from analysis.settings import RECORD_BAND_HZ
 from analysis.structures import STRUCTURES
 from analysis.whole_record.comparison import Comparison
 from analysis.whole_record.objective import Objective
-from analysis.whole_record.plant import SETTINGS, Plant
+from analysis.whole_record.plant import SETTINGS
 from analysis.whole_record.result import RecordAnalysis
 from analysis.whole_record.rough import RoughResponse
 from analysis.whole_record.search import Descent, Search
 from analysis.whole_record.summary import summary
 from analysis.whole_record.unknowns import Unknowns
-from rigd.beam import Damping
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -79,9 +78,7 @@ def fit_record(
         raise ValueError(f"{unknown} cannot be fixed: choose from {SETTINGS}.")
     free = tuple(name for name in SETTINGS if name not in fixed)
     comparison = Comparison.of(measurement, band_hz)
-    nominal = Plant(
-        measurement.beam, Damping(), measurement.delay_s, measurement.tool_inertia_kg_m2
-    )
+    nominal = measurement.nominal
     rough = RoughResponse(comparison)
     searches = [
         Search.of(Objective(comparison, unknowns), rough)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.whole_record.response import FIRST_OFFSET, eigenvalues, offset_name
+from rigd.beam import LoadedBeam
 from rigd.beam.modes import poles_for_eigenvalues
 
 if TYPE_CHECKING:
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 
 _HARDLY: Final = 1e-6
+_OF_ENDS: Final = frozenset({"tip_mass_kg", "root_compliance_rad_per_nm"})
+"""Extras that move poles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,8 @@ def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]
     wrt : sequence of str
         Names that `ResponseGrid` knows; some do not move a pole.
     """
+    if plant.tip_mass_kg or plant.root_compliance_rad_per_nm or not _OF_ENDS.isdisjoint(wrt):
+        return _loaded_poles(plant, count, wrt)
     z = eigenvalues(count).copy()
     for mode, offset in enumerate(plant.stiffness_offsets[: count - 1], start=FIRST_OFFSET):
         z[mode - 1] *= (1 + offset) ** 0.25
@@ -70,6 +75,38 @@ def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]
         for pole in pair[: 1 if pair[0].imag else 2]:
             moved = _pole_derivative(complex(pole), stiffness, i + 1, plant, wrt)
             found.append(Pole(i + 1, complex(pole), moved))
+    return tuple(found)
+
+
+def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]:
+    """Compute the same with a tip mass or an elastic clamp, on a uniform beam.
+
+    The derivatives are those of a root of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
+    is as large as rounding lets it be, but the ratios of its derivatives are as they should be.
+    """
+    damping, ratio = plant.damping, plant.beam.density_over_stiffness
+    loaded = LoadedBeam(plant.beam, damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm)
+    found = []
+    for mode, pair in enumerate(loaded.poles(eigenvalues(count)), start=1):
+        if np.isnan(pair).any():
+            continue
+        for pole in pair[: 1 if pair[0].imag else 2]:
+            s = np.array([pole])
+            at, log_s = loaded.at(s), np.log(s)
+            s_alpha, s_lambda = np.exp(damping.alpha * log_s), np.exp(damping.lambda_ * log_s)
+            by: dict[str, NDArray[np.complex128]] = {
+                "zeta": at.by_elastic * s_alpha,
+                "alpha": at.by_elastic * damping.zeta * log_s * s_alpha,
+                "gamma": at.by_inertial * s_lambda,
+                "lambda": at.by_inertial * damping.gamma * log_s * s_lambda,
+                "ln_density_over_stiffness": at.by_inertial * ratio * s * s,
+                "ln_stiffness": at.response - plant.tip_mass_kg * at.by_mass,
+                "tip_mass_kg": at.by_mass,
+                "root_compliance_rad_per_nm": -at.response * at.response,
+            }
+            slope = loaded.slope(s, at)
+            moved = [-(by[name] / slope)[0] if name in by else 0.0 for name in wrt]
+            found.append(Pole(mode, complex(pole), np.array(moved, dtype=np.complex128)))
     return tuple(found)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from analysis.record_checks import too_much_unknown
 from analysis.whole_record.bridging import bridged, longest_run
+from analysis.whole_record.plant import Plant
+from rigd.beam import Damping
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,6 +52,8 @@ class Measurement:
         By how much the torque is older than the angle at one time stamp, as the file states it.
     tool_inertia_kg_m2 : float
         Inertia between torque sensor and beam, as the file states it.
+    filter_time_constant_s, second_order_filter_time_constant_s : float
+        Low-pass filter of the torque's channel, as the file states it: see `Plant`.
     reference_rad : ndarray, shape (n,), or None
         Angle that a controller was asked for, if one held the motor: what of the angle does not
         follow it is taken to be the noise's doing.
@@ -66,6 +70,8 @@ class Measurement:
     delay_s: float = 0.0
     tool_inertia_kg_m2: float = 0.0
     reference_rad: NDArray[np.float64] | None = None
+    filter_time_constant_s: float = 0.0
+    second_order_filter_time_constant_s: float = 0.0
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -93,6 +99,8 @@ class Measurement:
             delay_s=record.torque_delay_s - record.angle_delay_s,
             tool_inertia_kg_m2=record.tool_inertia_kg_m2,
             reference_rad=record.reference_rad,
+            filter_time_constant_s=record.torque_filter_s[0],
+            second_order_filter_time_constant_s=record.torque_filter_s[1],
         )
 
     def check(self, highest_hz: float) -> None:
@@ -144,6 +152,18 @@ class Measurement:
                 f"{self.name}: the angle never changes, so nothing was excited; check the encoder "
                 "and that the motor moved."
             )
+
+    @property
+    def nominal(self) -> Plant:
+        """Rig and specimen as the file states them, without damping."""
+        return Plant(
+            beam=self.beam,
+            damping=Damping(),
+            delay_s=self.delay_s,
+            tool_inertia_kg_m2=self.tool_inertia_kg_m2,
+            filter_time_constant_s=self.filter_time_constant_s,
+            second_order_filter_time_constant_s=self.second_order_filter_time_constant_s,
+        )
 
     @property
     def torque_share(self) -> float:

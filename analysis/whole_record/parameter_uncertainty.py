@@ -56,7 +56,7 @@ def parameter_uncertainty(
     """
     chain = unknowns.estimates_by_unknowns(x)
     every_covariance = chain @ of_unknowns @ chain.T
-    names, values = unknowns.names, unknowns.plant(x).parameters
+    names, values = unknowns.names, unknowns.parameters(x)
     logarithmic = np.array([name in LOGARITHMIC for name in names])
     known = known & ~(logarithmic & (np.diag(every_covariance) > _UNDETERMINED**2))
     covariance = every_covariance[np.ix_(known, known)]

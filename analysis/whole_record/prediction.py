@@ -24,6 +24,9 @@ still does after a whole record, and is a free decay, of which no fit takes noti
 what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
+CLOCK: Final = "clock_rate_difference"
+
+
 class Prediction:
     """Response of the exact model to one angle, and its derivatives.
 
@@ -87,9 +90,39 @@ class Prediction:
         torque : ndarray, shape (m,)
         gradient : ndarray, shape (k, m)
         """
+        if plant.clock_rate_difference or CLOCK in wrt:
+            places = np.arange(self._kept.start, self._kept.stop)
+            return self._by_other_clock(plant, wrt, places / self.rate_hz)
         spectra = self._response.evaluate(plant, wrt, self._spectrum)
         in_time = np.fft.irfft(spectra, self._length)[:, self._kept] * self._growth
         return in_time[0], in_time[1:]
+
+    def _by_other_clock(
+        self, plant: Plant, wrt: Sequence[str], time_s: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Predict where a clock of another rate than the angle's takes its samples.
+
+        Parameters
+        ----------
+        time_s : ndarray, shape (m,)
+            Equally spaced, by the angle's clock.
+        """
+        of_beam = tuple(name for name in wrt if name != CLOCK)
+        spectra = self._response.evaluate(plant, of_beam, self._spectrum)
+        if CLOCK in wrt:
+            faster = self._response.s * spectra[0]
+            spectra = np.insert(spectra, 1 + wrt.index(CLOCK), faster, axis=0)
+        rate = 1 + plant.clock_rate_difference
+        weights = np.full(spectra.shape[1], 2.0)  # a bin and its mirror image
+        weights[0] = 1.0
+        weights[self._length // 2 :] = 2.0 - (self._length % 2 == 0)
+        step_s = float(time_s[1] - time_s[0]) if time_s.size > 1 else 0.0
+        turn = 2 * np.pi * self.rate_hz / self._length * rate
+        at = _fourier_sums(spectra * weights, turn * float(time_s[0]), turn * step_s, time_s.size)
+        at *= np.exp(self._sigma * rate * time_s) / self._length
+        if CLOCK in wrt:
+            at[1 + wrt.index(CLOCK)] *= time_s
+        return at[0], at[1:]
 
     def torque_between(
         self, plant: Plant, factor: int, places: NDArray[np.intp], wrt: Sequence[str] = ()
@@ -108,6 +141,10 @@ class Prediction:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
+        if plant.clock_rate_difference or CLOCK in wrt:
+            every = np.arange(factor * self._length) / (factor * self.rate_hz)
+            torque, gradient = self._by_other_clock(plant, wrt, every)
+            return torque[places], gradient[:, places]
         growth = np.exp(self._sigma * places / (factor * self.rate_hz))
         spectra = self._response.evaluate(plant, wrt, self._spectrum)
         # As many short transforms, each of them shifted by a tick, as the factor says: they stay
@@ -122,3 +159,27 @@ class Prediction:
             row[:] = np.fft.irfft(shifts * spectrum, self._length).T.ravel()[places]
         at *= growth
         return at[0], at[1:]
+
+
+def _fourier_sums(
+    spectra: NDArray[np.complex128], first: float, step: float, count: int
+) -> NDArray[np.float64]:
+    """Real parts of ``sum_k S_k exp(j k (first + step n))``, shape (r, count).
+
+    At any spacing: kn is written as ``(k² + n² - (n - k)²) / 2``, which leaves a convolution
+    (L. I. Bluestein, IEEE Trans. Audio and Electroacoustics 18 (1970) 451-455).
+
+    Parameters
+    ----------
+    spectra : ndarray of complex, shape (r, K)
+    first, step : float
+        In rad.
+    count : int
+    """
+    bins, places = np.arange(spectra.shape[1]), np.arange(count)
+    length = fast_length(bins.size + count)
+    lags = np.concatenate([places, np.zeros(length - count - bins.size + 1), bins[:0:-1]])
+    chirp = np.fft.fft(np.exp(-0.5j * step * lags**2))
+    turned = spectra * np.exp(1j * (first * bins + 0.5 * step * bins**2))
+    sums = np.fft.ifft(np.fft.fft(turned, length) * chirp)[:, :count]
+    return np.ascontiguousarray((sums * np.exp(0.5j * step * places**2)).real)

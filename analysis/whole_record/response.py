@@ -2,7 +2,7 @@
 
 ::
 
-    H(s) = (G(s) + sum_i G_i(s) + J_tool s²) exp(-s tau)
+    H(s) = (R(s) + J_tool s²) Q(s) exp(-s tau),    R = G' / (1 + kappa G'),    G' = G + sum_i G_i
 
 G is Eq. 25. A real link is not quite uniform, which moves its modes one by one: G_i replaces mode i
 of the sum that G is (`rigd.beam.modes`) by one of another stiffness. With p the inertial and c the
@@ -10,6 +10,10 @@ elastic factor, ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, k
 stiffness and d its offset::
 
     G_i = a² EI p² c k⁴ d / ((c k⁴ (1 + d) + p) (c k⁴ + p))
+
+kappa is the clamp's compliance, between tool and beam; with a tip mass G is that of
+`rigd.beam.tip_mass`. Q holds the low-pass filters of the torque's channel,
+``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)``.
 """
 
 from __future__ import annotations
@@ -19,14 +23,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues
+from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, loaded_response
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
     from analysis.whole_record.plant import Plant
+
+_BUTTERWORTH: Final = 2**0.5
 
 FIRST_OFFSET: Final = 2
 """Mode whose offset comes first: that of mode 1 is 0, its frequency is what rho/EI says."""
@@ -65,6 +71,11 @@ class ResponseGrid:
         self._log_s = np.log(self._s)
         self._beam = TransferGrid(self._s)
 
+    @property
+    def s(self) -> NDArray[np.complex128]:
+        """The grid, shape (n,)."""
+        return self._s
+
     def evaluate(
         self,
         plant: Plant,
@@ -78,8 +89,8 @@ class ResponseGrid:
         plant : Plant
             Where to evaluate.
         wrt : sequence of str
-            Names from `rigd.beam.PARAMETERS`, "delay_s", "tool_inertia_kg_m2" and those of
-            offsets; each derivative holds all others constant.
+            Names from `rigd.beam.PARAMETERS`, "delay_s", "tool_inertia_kg_m2", those of offsets and
+            `EXTRAS` but the clocks' difference; each derivative holds all others constant.
         angle : ndarray of complex, shape (n,), or float
             Transform of the angle.
 
@@ -88,26 +99,77 @@ class ResponseGrid:
         ndarray of complex, shape (1 + k, n)
             The torque's transform, then the derivatives in the order of `wrt`.
         """
-        of_beam = [name for name in wrt if name in PARAMETERS]
-        rows: dict[str, NDArray[np.complex128]] = {}
-        if of_beam:
-            response, gradient = self._beam.evaluate_with_gradient(
-                plant.beam, plant.damping, of_beam
-            )
-            rows.update(zip(of_beam, gradient, strict=True))
-        else:
-            response = self._beam.evaluate(plant.beam, plant.damping)
+        response, rows = self._of_beam(plant, wrt)
         if plant.stiffness_offsets:
             response += self._offset_modes(plant, rows)
+        if plant.root_compliance_rad_per_nm or "root_compliance_rad_per_nm" in wrt:
+            softened = 1 / (1 + plant.root_compliance_rad_per_nm * response)
+            for name in rows:
+                rows[name] = rows[name] * softened**2
+            response = response * softened
+            rows["root_compliance_rad_per_nm"] = -response * response
         response += plant.tool_inertia_kg_m2 * self._s_squared
         rows["tool_inertia_kg_m2"] = self._s_squared
+        late = np.exp(-plant.delay_s * self._s) * angle
         if "delay_s" in wrt:
             rows["delay_s"] = -self._s * response
-        late = np.exp(-plant.delay_s * self._s) * angle
+        for name, numerator, divisor in self._filters(plant):
+            if name in wrt:
+                rows[name] = -(numerator / divisor) * response
+            if plant.extras[name]:
+                late = late / divisor
         found = np.empty((1 + len(wrt), late.size), dtype=np.complex128)
         for out, row in zip(found, [response, *(rows[name] for name in wrt)], strict=True):
             np.multiply(row, late, out=out)
         return found
+
+    def _of_beam(
+        self, plant: Plant, wrt: Sequence[str]
+    ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
+        """G on a rigid clamp, and its derivatives by what of `wrt` it depends on."""
+        if plant.tip_mass_kg or "tip_mass_kg" in wrt:
+            return self._with_tip_mass(plant, wrt)
+        of_beam = [name for name in wrt if name in PARAMETERS]
+        if not of_beam:
+            return self._beam.evaluate(plant.beam, plant.damping), {}
+        response, gradient = self._beam.evaluate_with_gradient(plant.beam, plant.damping, of_beam)
+        return response, dict(zip(of_beam, gradient, strict=True))
+
+    def _with_tip_mass(
+        self, plant: Plant, wrt: Sequence[str]
+    ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
+        """Compute the same with a mass at the tip."""
+        damping = plant.damping
+        inertia = plant.beam.density_over_stiffness * self._s_squared
+        s_alpha = np.exp(damping.alpha * self._log_s).astype(np.complex128)
+        s_lambda = np.exp(damping.lambda_ * self._log_s).astype(np.complex128)
+        elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
+        found = loaded_response(self._s_squared, elastic, inertial, plant.beam, plant.tip_mass_kg)
+        slopes: dict[str, Callable[[], NDArray[np.complex128]]] = {
+            "zeta": lambda: found.by_elastic * s_alpha,
+            "alpha": lambda: found.by_elastic * (damping.zeta * self._log_s * s_alpha),
+            "gamma": lambda: found.by_inertial * s_lambda,
+            "lambda": lambda: found.by_inertial * (damping.gamma * self._log_s * s_lambda),
+            "ln_density_over_stiffness": lambda: found.by_inertial * inertia,
+            "ln_stiffness": lambda: found.response - plant.tip_mass_kg * found.by_mass,
+            "tip_mass_kg": lambda: found.by_mass,
+        }
+        return found.response, {name: slopes[name]() for name in wrt if name in slopes}
+
+    def _filters(
+        self, plant: Plant
+    ) -> tuple[tuple[str, NDArray[np.complex128], NDArray[np.complex128]], ...]:
+        """Denominators of the torque channel's filters, after their derivatives by the constant."""
+        s, first = self._s, plant.filter_time_constant_s
+        second = plant.second_order_filter_time_constant_s
+        return (
+            ("filter_time_constant_s", s, 1 + first * s),
+            (
+                "second_order_filter_time_constant_s",
+                _BUTTERWORTH * s + 2 * second * self._s_squared,
+                1 + second * (_BUTTERWORTH * s + second * self._s_squared),
+            ),
+        )
 
     def _offset_modes(
         self, plant: Plant, rows: dict[str, NDArray[np.complex128]]

@@ -45,7 +45,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> Recor
     jacobian = _compared_jacobian(objective, x, projected, noise)
     of_unknowns, known = covariance_of_unknowns(jacobian, scatter, held)
     names, plant = unknowns.names, unknowns.plant(x)
-    values = plant.parameters
+    values = unknowns.parameters(x)
     of = parameter_uncertainty(unknowns, x, held, of_unknowns, known)
     std, intervals = dict(of.std), dict(of.interval)
     tool = "tool_inertia_kg_m2"

@@ -13,24 +13,28 @@ directly; orders then change alone:
   density over stiffness, ``rho/EI |1 - g exp(j lambda pi/2)| / |1 + z exp(j alpha pi/2)|``, both
   as logarithms relative to the nominal beam's;
 * the delay in ms, the tool's inertia relative to the nominal beam's, and the relative offsets of
-  the modes' stiffness.
+  the modes' stiffness;
+* of the `EXTRAS` those that a candidate carries: the root's compliance relative to the nominal
+  beam's L/EI, the tip's mass relative to its mass, time constants in ms, the clocks' difference in
+  units of 1e-5.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.unknowns import ORDER_RANGE, SIZE_RANGE
-from analysis.whole_record.plant import SETTINGS, Plant
+from analysis.whole_record.plant import EXTRAS, SETTINGS, Plant
 from analysis.whole_record.response import FIRST_OFFSET, offset_name
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from numpy.typing import NDArray
 
@@ -41,6 +45,17 @@ _BEAM_RANGE: Final = math.log(3.0)
 _DELAY_UNIT_S: Final = 1e-3
 _DELAY_RANGE_S: Final = 0.02
 _OFFSET_RANGE: Final = 0.5
+_TIME_CONSTANT_UNIT_S: Final = 1e-3
+_CLOCK_UNIT: Final = 1e-5
+_EXTRA_RANGES: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
+    {
+        "root_compliance_rad_per_nm": (0.0, 0.5),
+        "tip_mass_kg": (0.0, 1.0),
+        "filter_time_constant_s": (0.0, 10.0),
+        "second_order_filter_time_constant_s": (0.0, 10.0),
+        "clock_rate_difference": (-100.0, 100.0),
+    }
+)
 _GRADIENT_NAMES: Final[Mapping[str, str]] = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
@@ -50,7 +65,7 @@ _QUARTER_TURN: Final = math.pi / 2
 
 @dataclass(frozen=True, slots=True)
 class Unknowns:
-    """Vector of unknowns of one structure: those of its damping, then the free settings.
+    """Vector of unknowns of one structure: its damping, the free settings, offsets and extras.
 
     Attributes
     ----------
@@ -63,6 +78,8 @@ class Unknowns:
         Free offsets of the modes' stiffness: "stiffness_offset_2", ….
     omega_rad_s : tuple of float
         Undamped first and second mode of the nominal beam.
+    extras : tuple of str
+        Free extras, in the order of `EXTRAS`.
     """
 
     structure: Structure
@@ -70,10 +87,16 @@ class Unknowns:
     free: tuple[Setting, ...]
     offsets: tuple[str, ...]
     omega_rad_s: tuple[float, float]
+    extras: tuple[str, ...] = ()
 
     @classmethod
     def of(
-        cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...], modes: int = 1
+        cls,
+        structure: Structure,
+        nominal: Plant,
+        free: tuple[Setting, ...],
+        modes: int = 1,
+        extras: Collection[str] = (),
     ) -> Unknowns:
         """Unknowns of a structure with some settings free, and the stiffness of all but mode 1.
 
@@ -81,16 +104,19 @@ class Unknowns:
         ----------
         modes : int
             How many modes count; with 1 the beam is uniform.
+        extras : collection of str
+            Of `EXTRAS`, those that are free.
         """
         first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
         ordered = tuple(name for name in SETTINGS if name in free)
         offsets = tuple(offset_name(mode) for mode in range(FIRST_OFFSET, modes + 1))
-        return cls(structure, nominal, ordered, offsets, (first, second))
+        free_extras = tuple(name for name in EXTRAS if name in extras)
+        return cls(structure, nominal, ordered, offsets, (first, second), free_extras)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, in the vector's order."""
-        return (*self.structure.free, *self.free, *self.offsets)
+        return (*self.structure.free, *self.free, *self.offsets, *self.extras)
 
     @property
     def gradient_names(self) -> tuple[str, ...]:
@@ -113,6 +139,7 @@ class Unknowns:
             "tool_inertia_kg_m2": (0.0, 1.0),
         }
         ranges |= dict.fromkeys(self.offsets, (-_OFFSET_RANGE, _OFFSET_RANGE))
+        ranges |= _EXTRA_RANGES
         low, high = zip(*(ranges[name] for name in self.names), strict=True)
         return np.array(low), np.array(high)
 
@@ -133,6 +160,7 @@ class Unknowns:
             "delay_s": nominal.delay_s / _DELAY_UNIT_S,
             "tool_inertia_kg_m2": nominal.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
             **dict.fromkeys(self.offsets, 0.0),
+            **{name: value / self.units[name] for name, value in nominal.extras.items()},
         }
         for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
             if coefficient in self.names:
@@ -149,7 +177,28 @@ class Unknowns:
             delay_s=values["delay_s"],
             tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
             stiffness_offsets=tuple(values[name] for name in self.offsets),
+            **{name: values[name] for name in EXTRAS},
         )
+
+    def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """All parameters at `x`, those of `names` even where they are neutral."""
+        plant = self.plant(x)
+        return plant.parameters | {name: plant.extras[name] for name in self.extras}
+
+    @property
+    def units(self) -> dict[str, float]:
+        """What 1 stands for in the unknowns that are linear."""
+        beam = self.nominal.beam
+        return {
+            "delay_s": _DELAY_UNIT_S,
+            "tool_inertia_kg_m2": beam.inertia_kg_m2,
+            **dict.fromkeys(self.offsets, 1.0),
+            "root_compliance_rad_per_nm": beam.length_m / beam.bending_stiffness_n_m2,
+            "tip_mass_kg": beam.density_kg_per_m * beam.length_m,
+            "filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
+            "second_order_filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
+            "clock_rate_difference": _CLOCK_UNIT,
+        }
 
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
@@ -174,7 +223,11 @@ class Unknowns:
         """All parameters at `x`, and `estimates_by_unknowns`."""
         place = {name: i for i, name in enumerate(self.names)}
         given: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
-        values: dict[str, float] = {**self.nominal.parameters, **dict(self.structure.fixed.items())}
+        values: dict[str, float] = {
+            **self.nominal.parameters,
+            **self.nominal.extras,
+            **dict(self.structure.fixed.items()),
+        }
         derivative = np.eye(x.size)
         first, second = self.omega_rad_s
         # How much the damping adds to stiffness and inertia, as logarithms, and who moves that.
@@ -202,8 +255,7 @@ class Unknowns:
             values["gamma"] = ratio * math.exp(ln_g + (2 - values["lambda"]) * math.log(first))
             if "density_over_stiffness" in place:
                 derivative[place["gamma"]] += derivative[place["density_over_stiffness"]]
-        units = dict.fromkeys(self.offsets, 1.0)
-        units |= {"delay_s": _DELAY_UNIT_S, "tool_inertia_kg_m2": self.nominal.beam.inertia_kg_m2}
+        units = self.units
         for name in units.keys() & place.keys():
             values[name] = given[name] * units[name]
             derivative[place[name], place[name]] = units[name]

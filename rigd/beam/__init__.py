@@ -14,6 +14,7 @@ from rigd.beam.modes import (
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.realisation import RealisationError, realise
 from rigd.beam.state_space import Realisation
+from rigd.beam.tip_mass import LoadedBeam, LoadedResponse, loaded_response
 from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
 
 __all__ = [
@@ -22,12 +23,15 @@ __all__ = [
     "CoupledModel",
     "Damping",
     "DeflectionFilter",
+    "LoadedBeam",
+    "LoadedResponse",
     "Mode",
     "Realisation",
     "RealisationError",
     "TransferGrid",
     "clamped_free_eigenvalues",
     "couple",
+    "loaded_response",
     "mode_shape",
     "modes",
     "participation",

@@ -58,6 +58,6 @@ def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
     )  # fmt: skip
     verdict = order_verdict(without_delay, found, (1,), adequate=True)
     assert (verdict.status, verdict.value, verdict.interval) == ("not identifiable", None, None)
-    said = order_sentence(verdict, (1,), adequate=True)
+    said = order_sentence(verdict)
     assert "0.657 and 1.235 explain the record equally well" in said
     assert "not identifiable" in said

@@ -1,34 +1,34 @@
-"""What a fit says of the damping, in two or three sentences with intervals."""
+"""What a record says of the damping, in two or three sentences with intervals."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from analysis.report.html.table import estimate
-from analysis.report.record_figure_bands import NORMAL_95
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from analysis.selection import Headline, Quantity, Size
+    from analysis.selection.headline import Mode
 
-    from analysis.whole_record import DampingSize, ModeEstimate, RecordFit
-
-_SMALL = 1e-3
+_SMALL: Final = 1e-3
 """Sizes below are told in the power of ten that zeta has in the paper."""
 
+_SYMBOLS: Final = {
+    "internal": ("ζ", "ω^α", "", "zeta", "alpha", "α"),
+    "external": ("γ", "ω^λ", " 1/m⁴", "gamma", "lambda", "λ"),
+}
 
-def damping_sentences(
-    fit: RecordFit, withheld: Collection[str], visible: Collection[int] | None = None
-) -> tuple[str, ...]:
+
+def damping_sentences(told: Headline) -> tuple[str, ...]:
     """Say how the modes are damped, and by which internal and external damping.
+
+    Of modes that the record does not show nothing is said. Where part of the record is unexplained
+    the numbers are named as what they would be, without intervals.
 
     Parameters
     ----------
-    fit : RecordFit
-    withheld : collection of str
-        Orders that the data do not support.
-    visible : collection of int, optional
-        Modes that the record shows, by default all: of others nothing is said.
+    told : Headline
 
     Returns
     -------
@@ -36,52 +36,66 @@ def damping_sentences(
         95 % intervals in brackets.
     """
     found = []
-    shown = [_mode(mode) for mode in fit.modes if visible is None or mode.number in visible]
+    shown = [_mode(mode) for mode in told.modes if mode.shown]
+    if not told.explained:
+        if not shown:
+            return ()
+        return (
+            "Part of the record is unexplained. If that spoilt nothing, the antenna's damping "
+            f"ratio would be {_listed(shown)}.",
+        )
     if shown:
         found.append(
             f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals)."
         )
     found.extend(
-        f"The {what} damping is {_size(size, symbol, unit)}{_order(fit, order, name, withheld)}."
-        for what, size, symbol, unit, order, name in (
-            ("internal", fit.internal, ("ζ", "ω^α"), "", "alpha", "α"),
-            ("external", fit.external, ("γ", "ω^λ"), " 1/m⁴", "lambda", "λ"),
-        )
+        f"The {each.damping} damping is {_size(each)}{_order(told, each)}."
+        for each in told.sizes
         # A size that holds for one assumed order says nothing of the antenna.
-        if size is not None and (size.omega_rad_s is not None or order not in withheld)
+        if each.omega_rad_s is not None or not _flagged(told, each)
     )
     return tuple(found)
 
 
-def _mode(mode: ModeEstimate) -> str:
-    ratio, std = mode.damping_ratio, mode.damping_ratio_std
+def _mode(mode: Mode) -> str:
+    ratio = mode.damping_ratio
+    return f"{_percent(ratio)} at {mode.frequency_hz.value:.4g} Hz"
+
+
+def _percent(ratio: Quantity) -> str:
     value, low, high = estimate(
-        (ratio, ratio - NORMAL_95 * std, ratio + NORMAL_95 * std), std, 100.0
+        (ratio.value, *(ratio.interval_95 or (None, None))), ratio.std, 100.0
     )
-    return f"{value.text} % ({low.text} to {high.text} %) at {mode.frequency_hz:.4g} Hz"
+    if ratio.flag is not None:
+        return f"{value.text} %"
+    return f"{value.text} % ({low.text} to {high.text} %)"
 
 
-def _size(size: DampingSize, symbols: tuple[str, str], unit: str) -> str:
-    coefficient, power = symbols
-    half = NORMAL_95 * size.std
+def _size(each: Size) -> str:
+    coefficient, power, unit, *_names = _SYMBOLS[each.damping]
+    size = each.size
     factor, tenth = (1e5, " · 10⁻⁵") if size.value < _SMALL else (1.0, "")
-    value, low, high = estimate(
-        (size.value, size.value - half, size.value + half), size.std, factor
-    )
+    value, low, high = estimate((size.value, *(size.interval_95 or (None, None))), size.std, factor)
     bounds = f"{value.text} ({low.text} to {high.text}){tenth}{unit}"
-    if size.omega_rad_s is None:
+    if each.omega_rad_s is None:
         return f"{coefficient}\u00a0=\u00a0{bounds}"
-    hertz = size.omega_rad_s / (2 * math.pi)
+    hertz = each.omega_rad_s / (2 * math.pi)
     return f"{coefficient}\u00a0{power}\u00a0=\u00a0{bounds} at {hertz:.3g} Hz"
 
 
-def _order(fit: RecordFit, name: str, symbol: str, withheld: Collection[str]) -> str:
-    interval = fit.interval.get(name)
-    if name not in fit.structure.free:
-        return f", of the fixed order {symbol}\u00a0=\u00a0{fit.parameters[name]:g}"
-    if interval is None or name in withheld:
+def _flagged(told: Headline, each: Size) -> bool:
+    """Whether coefficient and order of a damping carry a flag."""
+    return told.parameters[_SYMBOLS[each.damping][3]].flag is not None
+
+
+def _order(told: Headline, each: Size) -> str:
+    *_others, name, symbol = _SYMBOLS[each.damping]
+    order = told.parameters[name]
+    if name not in told.fit.structure.free:
+        return f", of the fixed order {symbol}\u00a0=\u00a0{order.value:g}"
+    if order.interval_95 is None or order.flag is not None:
         return f"; its order {symbol} is not known"
-    value, low, high = estimate((fit.parameters[name], *interval), fit.std[name])
+    value, low, high = estimate((order.value, *order.interval_95), order.std)
     return f", of the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
 
 

@@ -60,7 +60,7 @@ def illustrations(subject: Subject) -> Iterator[Illustration]:
             fit,
             (float(measured.frequency_hz[0]), highest_hz),
             supported_band_hz(subject),
-            withheld=subject.verdict.withheld,
+            withheld=subject.withheld,
         ),
         _loss_description(subject),
     )
@@ -81,7 +81,7 @@ def illustrations(subject: Subject) -> Iterator[Illustration]:
 
 
 def _loss_description(subject: Subject) -> str:
-    if subject.verdict.withheld:
+    if subject.withheld:
         return (
             "Loss factor of all damping against frequency with its 95 % band, and at each mode "
             "that shows (points: twice its damping ratio). It is drawn between these modes only, "

@@ -84,10 +84,7 @@ def page(
 
 def _verdict(subject: Subject, title: str) -> Markup:
     damping = [
-        element("p", sentence, class_="damping")
-        for sentence in damping_sentences(
-            subject.fit, subject.verdict.withheld, subject.visible_modes
-        )
+        element("p", sentence, class_="damping") for sentence in damping_sentences(subject.headline)
     ]
     said = [element("p", sentence) for sentence in subject.verdict.sentences]
     advice = [element("li", sentence) for sentence in subject.verdict.experiments]

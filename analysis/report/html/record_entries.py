@@ -11,6 +11,7 @@ from analysis.report.html.reported import unreported
 from analysis.report.record_figure_bands import loss_factors, response_band
 from analysis.report.record_indices import NOT_COMPARED, indices_of_record_fit
 from analysis.report.supported_band import supported_band_hz
+from analysis.selection import headline_json
 
 if TYPE_CHECKING:
     from analysis.report.html.subject import Subject
@@ -26,7 +27,8 @@ def record_entries(subject: Subject) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``fits`` and ``modes``: lists of objects as the document has them of the paper's route,
+        ``headline``: what the record says, with flags; ``fits`` and ``modes``: lists of objects as
+        the document has them of the paper's route,
         with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
         selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
         not finite, as `analysis.report.document` takes them. What is not reported is flagged, not
@@ -43,7 +45,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
                 "type": fit.structure.name,
                 "weighting": None,
                 "candidate": name,
-                "selected": name == subject.verdict.selected,
+                "selected": name == subject.headline.name,
             },
             fit,
         )
@@ -54,13 +56,16 @@ def record_entries(subject: Subject) -> dict[str, Any]:
         (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
         for _, fit in names
     ]
+    file = str(subject.record.path)
+    verdict = subject.verdict
     return {
+        "headline": headline_json(file, subject.headline, verdict.orders, verdict.findings),
         "fits": [
             {
                 **name,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
-                "withheld": sorted(unreported(fit.structure, subject.verdict.unsupported)),
+                "withheld": sorted(unreported(fit.structure, subject.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
                     key: None if ends is None else list(ends) for key, ends in fit.interval.items()
@@ -96,10 +101,10 @@ def record_entries(subject: Subject) -> dict[str, Any]:
         "records": [
             {
                 "file": str(subject.record.path),
-                "selected": subject.verdict.selected,
+                "selected": subject.headline.name,
                 "verdict": list(subject.verdict.sentences),
                 "experiments": list(subject.verdict.experiments),
-                "withheld": sorted(subject.verdict.withheld),
+                "withheld": sorted(subject.withheld),
                 "orders": {
                     each.order: {
                         "status": each.status,

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.report.html.reported import MARK, footnotes, greyed, has, marked, unreported
+from analysis.report.html.reported import MARK, greyed, marked
 from analysis.report.html.table import ABSENT, Cell, Column, Table, count, estimate, number
-from analysis.report.record_figure_bands import NORMAL_95
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from analysis.report.html.subject import Subject
-    from analysis.whole_record import DampingSize, RecordFit
+    from analysis.selection import Headline, Quantity, Size
 
 PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
     "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
@@ -26,27 +27,27 @@ PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
 """Symbol, meaning, unit shown, and how many of that make one SI unit."""
 
 _STRONG_CORRELATION: Final = 0.9
-_HOLDS_FOR: Final = {"zeta": "depends on α", "gamma": "depends on λ"}
+_MARKED: Final = (
+    f"{MARK} must not be taken for a property of the antenna; the remark says why. The number "
+    "belongs to the model's curve."
+)
 
 
 def modes_table(subject: Subject) -> Table:
-    """Frequencies and damping ratios of the selected fit; modes that do not show are marked."""
+    """Frequencies and damping ratios; modes that do not show, or are doubtful, are marked."""
+    told = subject.headline
     rows: list[tuple[Cell, ...]] = []
-    visible = subject.visible_modes
-    for mode in subject.fit.modes:
-        f, f_std = mode.frequency_hz, mode.frequency_std_hz
-        ratio, ratio_std = mode.damping_ratio, mode.damping_ratio_std
-        half = NORMAL_95 * ratio_std
+    for mode in told.modes:
+        f, ratio = mode.frequency_hz, mode.damping_ratio
         row = (
             count(mode.number),
-            *estimate((f, f_std), f_std),
-            *estimate((ratio, ratio_std, ratio - half, ratio + half), ratio_std, 100.0),
+            *estimate((f.value, f.std), f.std),
+            *estimate((ratio.value, ratio.std, *_ends(ratio)), ratio.std, 100.0),
         )
-        shows = mode.number in visible
-        rows.append(row if shows else (marked(row[0]), *map(greyed, row[1:])))
+        rows.append(row if ratio.flag is None else (marked(row[0]), *map(greyed, row[1:])))
     return Table(
         "modes",
-        f"Modes of the beam on a motor that stands still: type {subject.verdict.selected}",
+        f"Modes of the beam on a motor that stands still: type {told.name}",
         (
             Column("Mode", "mode"),
             Column("Frequency (Hz)", "frequency_hz"),
@@ -57,24 +58,16 @@ def modes_table(subject: Subject) -> Table:
             Column("to (%)", "damping_ratio_high"),
         ),
         tuple(rows),
-        ()
-        if len(visible) == len(rows)
-        else (f"{MARK} computed from the model: the record does not show this mode.",),
+        _reasons(mode.damping_ratio for mode in told.modes),
     )
 
 
 def parameters_table(subject: Subject) -> Table:
-    """Parameters of the selected fit with their uncertainty."""
-    fit = subject.fit
-    doubtful = unreported(fit.structure, subject.verdict.withheld)
-    rows = tuple(
-        _unreported_row(name) if name in doubtful else _parameter_row(fit, name)
-        for name in fit.parameters
-        if has(fit.structure, name)
-    )
+    """All parameters with their uncertainty; those with a flag are marked, with the reason."""
+    told = subject.headline
     return Table(
         "parameters",
-        f"Parameters, type {subject.verdict.selected}",
+        f"Parameters, type {told.name}",
         (
             Column("Parameter", "parameter", numeric=False),
             Column("Meaning", "meaning", numeric=False),
@@ -85,26 +78,18 @@ def parameters_table(subject: Subject) -> Table:
             Column("to", "high_si"),
             Column("Remark", "remark", numeric=False),
         ),
-        rows,
+        tuple(_parameter_row(told, name, each) for name, each in told.parameters.items()),
         (
             "std is one standard deviation; intervals of ζ, γ, ρ/EI and EI are symmetric in the "
             "logarithm. The CSV file has SI units.",
+            *((_MARKED,) if told.flags else ()),
         ),
     )
 
 
 def sizes_table(subject: Subject) -> Table:
     """Sizes of the damping where they are uncorrelated with its orders."""
-    fit, withheld = subject.fit, subject.verdict.withheld
-    rows = [
-        # Without its frequency a size is the coefficient for an order that was only assumed.
-        _size_row(what, symbol, unit, size, doubtful=size.omega_rad_s is None and order in withheld)
-        for what, symbol, unit, size, order in (
-            ("internal", "ζ ω^α", "1", fit.internal, "alpha"),
-            ("external", "γ ω^λ", "1/m⁴", fit.external, "lambda"),
-        )
-        if size is not None
-    ]
+    told = subject.headline
     return Table(
         "damping_sizes",
         "Size of the damping at the frequency where it does not depend on the order found",
@@ -116,9 +101,50 @@ def sizes_table(subject: Subject) -> Table:
             Column("Value", "value"),
             Column("std", "std"),
             Column("std (%)", "relative_std"),
+            Column("95 % from", "low"),
+            Column("to", "high"),
+        ),
+        tuple(_size_row(told, each) for each in told.sizes),
+        (
+            "Coefficient and order are strongly correlated; these are not.",
+            *_reasons(each.size for each in told.sizes),
+        ),
+    )
+
+
+def condition_table(subject: Subject) -> Table | None:
+    """Set what a simpler structure would give beside what is told; None if none would do."""
+    told, simpler = subject.headline, subject.headline.simpler
+    if simpler is None:
+        return None
+    taken = " and ".join(f"{PARAMETERS[name][0]} = {at:g}" for name, at in simpler.fixed.items())
+    rows: list[tuple[Cell, ...]] = []
+    for name, each in simpler.parameters.items():
+        symbol, _meaning, unit, factor = _described(name)
+        free = told.parameters[name]
+        rows.append(
+            (
+                symbol,
+                unit,
+                *estimate((each.value, *_ends(each)), each.std, factor),
+                *estimate((free.value, *_ends(free)), free.std, factor),
+            )
+        )
+    return Table(
+        "on_condition",
+        f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which would do",
+        (
+            Column("Parameter", "parameter", numeric=False),
+            Column("Unit shown", "unit_shown", numeric=False),
+            Column("Then", "value_si"),
+            Column("95 % from", "low_si"),
+            Column("to", "high_si"),
+            Column("Free", "free_value_si"),
+            Column("95 % from", "free_low_si"),
+            Column("to", "free_high_si"),
         ),
         tuple(rows),
-        ("Coefficient and order are strongly correlated; these are not.", *footnotes(withheld)),
+        ("The intervals on the left hold only if what is taken for granted is true.",),
     )
 
 
@@ -128,7 +154,7 @@ def correlations_table(subject: Subject) -> Table:
     symbols = [_symbol(name) for name in fit.determined]
     return Table(
         "correlations",
-        f"Correlations of the parameters, type {subject.verdict.selected}",
+        f"Correlations of the parameters, type {subject.headline.name}",
         (
             Column("Parameter", "parameter", numeric=False),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
@@ -141,40 +167,47 @@ def correlations_table(subject: Subject) -> Table:
     )
 
 
-def _parameter_row(fit: RecordFit, name: str) -> tuple[Cell, ...]:
-    default = (_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
-    symbol, meaning, unit, factor = PARAMETERS.get(name, default)
-    std = fit.std[name]
-    low, high = fit.interval.get(name) or (None, None)
-    free = name in fit.interval
-    if name in fit.at_bounds:
-        status = "at the edge of its range"
-    elif not free:
-        status = "fixed"
-    else:
-        status = "" if name in fit.determined else "not determined by the data"
-    shown = estimate((fit.parameters[name], std if free else None, low, high), std, factor)
-    return (symbol, meaning, unit, *shown, status)
+def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Cell, ...]:
+    symbol, meaning, unit, factor = _described(name)
+    shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
+    if each.flag is not None:
+        shown = (marked(shown[0]), *map(greyed, shown[1:]))
+    fixed = name not in told.fit.interval
+    return (symbol, meaning, unit, *shown, "fixed" if fixed else each.flag or "")
 
 
-def _unreported_row(name: str) -> tuple[Cell, ...]:
-    symbol, meaning, unit, _factor = PARAMETERS[name]
-    unknown = [number(None)] * 4
-    remark = _HOLDS_FOR.get(name, "not supported by the data")
-    return (symbol, meaning, unit, *unknown, remark)
-
-
-def _size_row(
-    what: str, symbol: str, unit: str, size: DampingSize, *, doubtful: bool
-) -> tuple[Cell, ...]:
-    if size.omega_rad_s is None:
+def _size_row(told: Headline, each: Size) -> tuple[Cell, ...]:
+    size, internal = each.size, each.damping == "internal"
+    symbol, unit = ("ζ ω^α", "1") if internal else ("γ ω^λ", "1/m⁴")
+    flag = size.flag
+    if each.omega_rad_s is None:
+        # Without its frequency a size is the coefficient for an order that was only assumed.
+        flag = flag or told.parameters["zeta" if internal else "gamma"].flag
         symbol, unit = symbol[0], ABSENT
-    at = number(size.omega_rad_s, ".4g")
-    value, std = estimate((size.value, size.std), size.std)
-    relative = number(size.std / size.value, "#.2g", 100.0)
-    if doubtful:
-        value, std, relative = marked(value), greyed(std), greyed(relative)
-    return (what, symbol, unit, at, value, std, relative)
+    at = number(each.omega_rad_s, ".4g")
+    shown = [
+        *estimate((size.value, size.std), size.std),
+        number(None if size.std is None else size.std / size.value, "#.2g", 100.0),
+        *estimate(_ends(size), size.std),
+    ]
+    if flag is not None:
+        shown = [marked(shown[0]), *map(greyed, shown[1:])]
+    return (each.damping, symbol, unit, at, *shown)
+
+
+def _ends(quantity: Quantity) -> tuple[float | None, float | None]:
+    return quantity.interval_95 or (None, None)
+
+
+def _reasons(quantities: Iterable[Quantity]) -> tuple[str, ...]:
+    """Say once what each mark means."""
+    reasons = dict.fromkeys(each.flag for each in quantities if each.flag is not None)
+    return tuple(f"{MARK} {reason}." for reason in reasons)
+
+
+def _described(name: str) -> tuple[str, str, str, float]:
+    default = (_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
+    return PARAMETERS.get(name, default)
 
 
 def _symbol(name: str) -> str:

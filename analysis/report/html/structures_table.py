@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from analysis.report.html.record_tables import PARAMETERS
 from analysis.report.html.reported import footnotes, greyed, has, marked, unreported
-from analysis.report.html.table import Cell, Column, Number, Table, count, estimate, number
+from analysis.report.html.table import ABSENT, Cell, Column, Number, Table, count, estimate, number
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -21,14 +21,17 @@ _DAMPING = ("zeta", "alpha", "gamma", "lambda")
 def structures_table(subject: Subject) -> Table:
     """All fits beside each other; orders that the data do not support are marked in each."""
     lowest = min(fit.cost for fit in subject.fits.values())
-    withheld = subject.verdict.unsupported
+    withheld = subject.unsupported
     delta_bic = subject.verdict.delta_bic
+    status = dict(subject.headline.structures)
     rows: list[tuple[Cell, ...]] = []
     for name, fit in subject.fits.items():
+        its = status.get(name, "")
         rows.append(
             (
                 name,
-                *_damping(fit, withheld),
+                its,
+                *_damping(fit, withheld, excluded=its == "excluded"),
                 *([number(delta_bic[name], ".4g")] if delta_bic else []),
                 number(fit.cost / fit.degrees_of_freedom, ".4g"),
                 count(fit.free_parameters),
@@ -43,6 +46,7 @@ def structures_table(subject: Subject) -> Table:
         "All structures on the whole record",
         (
             Column("Type", "type", numeric=False),
+            Column("", "status", numeric=False),
             *(
                 column
                 for parameter in _DAMPING
@@ -65,13 +69,14 @@ def structures_table(subject: Subject) -> Table:
             "ΔBIC: Bayesian information criterion above the lowest; 10 is clear. Residual: its "
             "power over that of the noise, 1 if nothing but noise is left. Free: number of free "
             "parameters, those of rig and beam included. * rests on the edge of the range "
-            "searched. The marked row is the one selected. The CSV file has the sums of squares.",
+            "searched. The marked row is the one that the numbers are of. What the record excludes "
+            "has numbers in the CSV file only, beside the sums of squares.",
         ),
-        selected=list(subject.fits).index(subject.verdict.selected),
+        selected=list(subject.fits).index(subject.headline.name),
     )
 
 
-def _damping(fit: RecordFit, withheld: Collection[str]) -> list[Number]:
+def _damping(fit: RecordFit, withheld: Collection[str], *, excluded: bool) -> list[Number]:
     """Value and standard deviation of each parameter of the damping."""
     doubtful = unreported(fit.structure, withheld)
     shown: list[Number] = []
@@ -84,6 +89,9 @@ def _damping(fit: RecordFit, withheld: Collection[str]) -> list[Number]:
         cells = estimate((fit.parameters[name], std if free else None), std, PARAMETERS[name][3])
         held = "*" if name in fit.at_bounds else ""
         value, spread = replace(cells[0], text=cells[0].text + held), cells[1]
+        if excluded:
+            shown += [replace(each, text=ABSENT, doubtful=True) for each in (value, spread)]
+            continue
         shown += [marked(value), greyed(spread)] if name in doubtful else [value, spread]
     return shown
 

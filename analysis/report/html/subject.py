@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.record import Record
-    from analysis.selection import OrderVerdict, Selection
+    from analysis.selection import Finding, Headline, OrderVerdict, Selection
     from analysis.welch_route import WelchAnalysis
     from analysis.whole_record import RecordAnalysis, RecordFit, Setting
+
+_ORDERS: Final = frozenset({"alpha", "lambda"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,47 +22,34 @@ class Verdict:
 
     Attributes
     ----------
-    selected : str
-        Name of the fit to be believed, among `Subject.fits`.
     sentences : tuple of str
         What can be told from the data and what cannot, in the operator's words.
     experiments : tuple of str
         What would tell more.
-    withheld : frozenset of str
-        Orders of the selected fit that the data do not support: they are not reported.
     delta_bic : dict of str to float
         BIC above the lowest by the name of the fit; may be empty.
     orders : tuple of OrderVerdict
         What is known of each order; may be empty.
-    visible : tuple of int or None
-        Modes that stand out of the noise; None if that was not asked.
+    findings : tuple of Finding
+        What else is in the record.
     """
 
-    selected: str
     sentences: tuple[str, ...]
     experiments: tuple[str, ...] = ()
-    withheld: frozenset[str] = frozenset()
     delta_bic: Mapping[str, float] = field(default_factory=dict)
     orders: tuple[OrderVerdict, ...] = ()
-    visible: tuple[int, ...] | None = None
-
-    @property
-    def unsupported(self) -> frozenset[str]:
-        """Orders that no fit of this record can tell: those withheld, and of absent damping."""
-        return self.withheld | {each.order for each in self.orders if each.value is None}
+    findings: tuple[Finding, ...] = ()
 
     @classmethod
     def of(cls, selection: Selection) -> Verdict:
         """Take over what `analysis.selection` says."""
         said, best = selection.verdict, selection.candidates[0]
         return cls(
-            selected=best.name,
             sentences=said.sentences,
             experiments=said.experiments,
-            withheld=frozenset(best.fit.parameters.keys() - said.parameters.keys()),
             delta_bic={each.name: each.bic - best.bic for each in selection.candidates},
             orders=(said.alpha, said.lambda_),
-            visible=said.visible_modes,
+            findings=said.findings,
         )
 
 
@@ -75,6 +64,8 @@ class Subject:
         Its noise, lines and bins are those of all `fits`.
     fits : dict of str to RecordFit
         Whole-record fits by the name that tables call them, in the order of the tables.
+    headline : Headline
+        The numbers that are told first; its fit is one of `fits`.
     verdict : Verdict
     band_hz : tuple of float
         Of the whole-record fits.
@@ -87,6 +78,7 @@ class Subject:
     record: Record
     analysis: RecordAnalysis
     fits: Mapping[str, RecordFit]
+    headline: Headline
     verdict: Verdict
     band_hz: tuple[float, float]
     fixed: tuple[Setting, ...] = ()
@@ -106,6 +98,7 @@ class Subject:
             record=record,
             analysis=selection.analysis,
             fits={candidate.name: candidate.fit for candidate in selection.candidates},
+            headline=selection.headline,
             verdict=Verdict.of(selection),
             band_hz=band_hz,
             fixed=fixed,
@@ -114,15 +107,23 @@ class Subject:
 
     @property
     def fit(self) -> RecordFit:
-        """The selected fit."""
-        return self.fits[self.verdict.selected]
+        """The fit that the headline's numbers are of."""
+        return self.headline.fit
 
     @property
     def visible_modes(self) -> tuple[int, ...]:
-        """Numbers of the selected fit's modes that the record shows."""
-        visible = self.verdict.visible
-        numbers = (mode.number for mode in self.fit.modes)
-        return tuple(number for number in numbers if visible is None or number in visible)
+        """Numbers of its modes that the record shows."""
+        return self.headline.visible_modes
+
+    @property
+    def withheld(self) -> frozenset[str]:
+        """Orders of that fit whose numbers carry a flag."""
+        return frozenset(_ORDERS & self.headline.flags.keys())
+
+    @property
+    def unsupported(self) -> frozenset[str]:
+        """Orders that no fit of this record can tell: those withheld, and of absent damping."""
+        return self.withheld | {each.order for each in self.verdict.orders if each.value is None}
 
     @property
     def name(self) -> str:

@@ -10,6 +10,7 @@ from analysis.report.html.drawing import drawing, photograph, svg_text
 from analysis.report.html.figures import NAMES, illustrations
 from analysis.report.html.page import page
 from analysis.report.html.record_tables import (
+    condition_table,
     correlations_table,
     modes_table,
     parameters_table,
@@ -88,17 +89,17 @@ def write_html_report(
 
 def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Make the table of modes, those of the whole-record fits, and those of the paper's route."""
+    condition = condition_table(subject)
     tables = (
-        parameters_table(subject),
         sizes_table(subject),
+        parameters_table(subject),
+        *(() if condition is None else (condition,)),
         correlations_table(subject),
         structures_table(subject),
     )
     welch = subject.welch
     of_paper = (
-        ()
-        if welch is None
-        else (welch_fits_table(welch, subject.verdict.unsupported), peaks_table(welch))
+        () if welch is None else (welch_fits_table(welch, subject.unsupported), peaks_table(welch))
     )
     return modes_table(subject), tables, of_paper
 

@@ -7,6 +7,7 @@ import pytest
 from analysis.record import load_record
 from analysis.report.html import Subject, Verdict
 from analysis.report.html.write import write_html_report
+from analysis.selection import of_fit
 from analysis.settings import WelchSettings
 from analysis.structures import STRUCTURES
 from analysis.welch_route import analyse
@@ -36,8 +37,8 @@ def record_subject(make_signals, write_session, tmp_path_factory):
         record=record,
         analysis=analysis,
         fits={fit.structure.name: fit for fit in analysis.fits},
+        headline=of_fit("VI", analysis.fits[TYPES.index("VI")], (1, 2, 3)),
         verdict=Verdict(
-            selected="VI",
             sentences=("Both orders are fractional.", "Less than noise <b> remains."),
             experiments=("Sweep round mode 1 & 2.",),
             delta_bic=dict(zip(TYPES, (4e4, 2e4, 0.0, 12.5), strict=True)),

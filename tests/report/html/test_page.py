@@ -18,7 +18,10 @@ from analysis.report.html.damping_sentences import damping_sentences
 from analysis.report.html.figures import illustrations
 from analysis.report.html.page import page
 from analysis.report.html.record_entries import record_entries
+from analysis.report.html.table import Number
 from analysis.report.html.write import FIGURES, report_tables, write_html_report
+from analysis.selection import of_fit
+from analysis.selection.headline import Simpler
 
 VOID = {"meta", "br", "img"}
 LIMIT_BYTES = 2_000_000
@@ -190,7 +193,7 @@ def test_what_is_shown_is_the_number_rounded(record_subject):
     for row in modes.rows:
         for cell, factor in zip(row, shown["modes"], strict=True):
             assert float(cell.text) == pytest.approx(factor * cell.value, rel=0.06)
-    (zeta, alpha, *_) = tables[0].rows
+    (zeta, alpha, *_) = tables[1].rows
     assert zeta[3].text == f"{1e5 * zeta[3].value:.2f}"
     assert alpha[3].text == f"{alpha[3].value:.4f}"
     assert len(alpha[4].text.lstrip("0.")) == 2  # significant digits of a standard deviation
@@ -202,25 +205,54 @@ def test_what_is_shown_is_the_number_rounded(record_subject):
 
 
 def test_orders_that_the_data_do_not_support_are_not_told(record_subject):
+    reason = "the record does not tell the order"
     careful = replace(
-        record_subject, verdict=Verdict("VI", ("Nothing is sure.",), withheld=frozenset({"alpha"}))
+        record_subject,
+        headline=of_fit("VI", record_subject.fit, (1, 2, 3), {"alpha": reason}),
+        verdict=Verdict(("Nothing is sure.",)),
     )
     modes, tables, _ = report_tables(careful)
     text = page(careful, ["", ""], modes, tables, (), datetime(2026, 1, 1, tzinfo=UTC))
     told = "".join(read(text).text)
     assert "its order α is not known" in told
-    assert "not supported by the data" in told
-    (row,) = [row for row in tables[0].rows if row[0] == "α"]
-    assert [cell.value for cell in row[3:7]] == [None] * 4
+    assert reason in told
+    (row,) = [row for row in tables[1].rows if row[0] == "α"]
+    assert all(cell.doubtful and cell.value is not None for cell in row[3:7])
     assert 'href="#paper"' not in text
 
 
 def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_subject):
     fit = record_subject.fits["VII"]
-    told = " ".join(damping_sentences(fit, frozenset({"alpha"})))
+    flagged = of_fit("VII", fit, (1, 2, 3), {"alpha": "the record does not tell the order"})
+    told = " ".join(damping_sentences(flagged))
     assert "internal damping" not in told
     assert "The external damping is γ" in told
-    assert "of the fixed order α\u00a0=\u00a01." in " ".join(damping_sentences(fit, frozenset()))
+    known = " ".join(damping_sentences(of_fit("VII", fit, (1, 2, 3))))
+    assert "of the fixed order α\u00a0=\u00a01." in known
+
+
+def test_what_is_unexplained_makes_every_number_a_condition(record_subject):
+    spoilt = of_fit("VI", record_subject.fit, (1, 2, 3), unexplained="part is unexplained")
+    (told,) = damping_sentences(spoilt)
+    assert "would be" in told
+    assert "(" not in told  # no interval
+    modes, tables, _ = report_tables(replace(record_subject, headline=spoilt))
+    for table in (modes, tables[0], tables[1]):
+        for row in table.rows:
+            shown = [cell for cell in row if isinstance(cell, Number) and cell.value is not None]
+            assert sum(cell.doubtful for cell in shown) >= len(shown) - 1
+
+
+def test_a_simpler_structure_stands_beside_the_freest(record_subject):
+    taken = of_fit("VII", record_subject.fits["VII"], (1, 2, 3)).parameters
+    simpler = Simpler("VII", {"alpha": 1.0}, taken)
+    told = replace(record_subject.headline, simpler=simpler)
+    _modes, tables, _ = report_tables(replace(record_subject, headline=told))
+    (table,) = [table for table in tables if table.name == "on_condition"]
+    assert "If α = 1 is taken for granted: type VII" in table.caption
+    row = {row[0]: row for row in table.rows}["ζ"]
+    assert row[2].value == record_subject.fits["VII"].parameters["zeta"]
+    assert row[5].value == record_subject.fits["VI"].parameters["zeta"]
 
 
 def test_a_band_that_begins_beyond_a_mode_is_drawn(record_subject):

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from analysis.report import style
 from analysis.report.document import document
-from analysis.report.html import Verdict
 from analysis.report.html.damping_sentences import damping_sentences
 from analysis.report.html.figures import illustrations
 from analysis.report.html.page import page
@@ -22,17 +21,20 @@ from analysis.report.html.write import report_tables
 from analysis.report.record_text import record_text
 from analysis.report.supported_band import excited_band_hz, supported_band_hz
 from analysis.report.write import tables_text
+from analysis.selection import of_fit
 from analysis.structures import STRUCTURES
 
 ALPHA = frozenset({"alpha"})
+REASON = "order 1 on another beam explains as much"
 
 
 @pytest.fixture(scope="module")
 def careful(record_subject):
     """Type VI whose alpha the data do not support, on a record that shows two modes."""
-    order = SimpleNamespace(order="alpha", status="not supported", value=None, interval=(0.9, 1.2))
-    verdict = replace(record_subject.verdict, withheld=ALPHA, orders=(order,), visible=(1, 2))
-    return replace(record_subject, verdict=verdict)
+    order = SimpleNamespace(order="alpha", status="open", value=1.05, interval=(0.9, 1.2))
+    told = of_fit("VI", record_subject.fit, (1, 2), {"alpha": REASON}, {"alpha": (0.9, 1.2)})
+    verdict = replace(record_subject.verdict, orders=(order,))
+    return replace(record_subject, headline=told, verdict=verdict)
 
 
 def test_an_order_takes_its_coefficient_with_it():
@@ -45,12 +47,17 @@ def test_an_order_takes_its_coefficient_with_it():
 
 
 def test_tables_mark_every_such_number_and_no_other(careful):
-    modes, (parameters, _sizes, _correlations, structures), (welch, _peaks) = report_tables(careful)
+    modes, (_sizes, parameters, _correlations, structures), (welch, _peaks) = report_tables(careful)
     shown = {row[0]: row for row in parameters.rows}
-    for symbol in ("ζ", "α"):
-        assert [cell.value for cell in shown[symbol][3:7]] == [None] * 4
+    for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
+        number = shown[symbol][3]
+        assert (number.value, number.doubtful) == (careful.fit.parameters[name], True)
+        assert MARK in number.text
+        assert shown[symbol][-1] == REASON
+    assert [cell.value for cell in shown["α"][5:7]] == [0.9, 1.2]
     assert shown["λ"][3].value == careful.fit.parameters["lambda"]
-    for table, first in ((structures, 1), (welch, 2)):
+    assert MARK not in shown["λ"][3].text
+    for table, first in ((structures, 2), (welch, 2)):
         for row in table.rows:
             doubtful = [cell.doubtful for cell in row if isinstance(cell, Number)]
             known = [cell.value is not None for cell in row[first : first + 4]]
@@ -70,10 +77,10 @@ def test_of_absent_damping_no_fit_tells_the_order(record_subject):
     known = SimpleNamespace(order="alpha", status="fractional", value=0.8, interval=(0.7, 0.9))
     verdict = replace(record_subject.verdict, orders=(known, absent))
     subject = replace(record_subject, verdict=verdict)
-    assert not verdict.withheld
-    assert verdict.unsupported == {"lambda"}
+    assert not subject.withheld
+    assert subject.unsupported == {"lambda"}
     _modes, (*_others, structures), (welch, _peaks) = report_tables(subject)
-    for table, first, of_type in ((structures, 1, 0), (welch, 2, 0)):
+    for table, first, of_type in ((structures, 2, 0), (welch, 2, 0)):
         assert any(MARK in note and "λ" in note for note in table.notes)
         for row in table.rows:
             marks = [MARK in cell.text for cell in row[first : first + 8 : 2]]
@@ -95,14 +102,16 @@ def test_page_terminal_and_text_tables_show_the_mark(careful):
     made_at = datetime(2026, 1, 1, tzinfo=UTC)
     text = page(careful, ["", ""], modes, tables, of_paper, made_at)
     alpha = careful.fits["VI"].parameters["alpha"]
-    (cell,) = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
-    assert cell.endswith(MARK)
+    cells = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
+    assert len(cells) == 2  # among the parameters, and among the structures
+    assert all(cell.endswith(MARK) for cell in cells)
     console = Console(width=140)
     with console.capture() as capture:
         console.print(record_text(careful))
     assert f"3{MARK}" in capture.get()
     (row,) = [line.split() for line in capture.get().splitlines() if line.split()[:1] == ["α"]]
-    assert row[4:8] == ["–"] * 4
+    assert row[4].endswith(MARK)
+    assert REASON in capture.get()
     welch = tables_text(careful.welch, ALPHA)
     fits, *others = [line for line in welch.splitlines() if re.match(r"VI\s+omega", line)]
     assert fits.count(MARK) == 2
@@ -121,7 +130,7 @@ def test_the_document_flags_and_keeps_the_numbers(careful):
     assert selected == ["VI"]
     (record,) = content["records"]
     assert record["orders"] == {
-        "alpha": {"status": "not supported", "value": None, "interval_95": [0.9, 1.2]}
+        "alpha": {"status": "open", "value": 1.05, "interval_95": [0.9, 1.2]}
     }
     first, last = record["curves"]["loss_factor_supported_hz"]
     assert (first, last) == (careful.fit.modes[0].frequency_hz, careful.fit.modes[1].frequency_hz)
@@ -130,10 +139,11 @@ def test_the_document_flags_and_keeps_the_numbers(careful):
 
 
 def test_of_modes_that_do_not_show_no_damping_is_told(careful):
-    told = " ".join(damping_sentences(careful.fit, ALPHA, (1, 2)))
+    told = " ".join(damping_sentences(careful.headline))
     assert "at 2.57 Hz and" in told
     assert "44.8" not in told
-    assert "damping ratio" not in " ".join(damping_sentences(careful.fit, ALPHA, ()))
+    none = of_fit("VI", careful.fit, ())
+    assert "damping ratio" not in " ".join(damping_sentences(none))
 
 
 def loss_axes(subject):
@@ -158,7 +168,7 @@ def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_subj
 
 
 def test_one_mode_has_a_point_and_no_curve(careful):
-    one = replace(careful, verdict=Verdict("VI", (), withheld=ALPHA, visible=(1,)))
+    one = replace(careful, headline=of_fit("VI", careful.fit, (1,), {"alpha": REASON}))
     assert supported_band_hz(one) is None
     axes, _ = loss_axes(one)
     (point,) = {float(x) for line in axes.get_lines() for x in line.get_xdata()}

@@ -1,0 +1,456 @@
+"""The numbers that a record stands for: from the freest structure that it supports, with flags.
+
+A structure that fixes an order gives narrow intervals which hold only if that order is right, and
+the criterion that selected it forgives an error of 2.7 standard deviations. So what is told first
+comes from the structure in which every order is free: its intervals hold whichever simpler one is
+true. What a simpler one would give stands beside it, as a condition.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from analysis.selection.orders import EXCLUDED, STRONG
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from analysis.selection.candidate import Candidate
+    from analysis.selection.candidates import Field
+    from analysis.selection.finding import Finding
+    from analysis.selection.orders import OrderVerdict
+    from analysis.structures import Structure
+    from analysis.whole_record import DampingSize, ModeEstimate, RecordFit
+
+_NORMAL_95: Final = 1.959963984540054
+_COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
+_UNEXPLAINED: Final = "part of the record is unexplained"
+_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
+_NOT_DETERMINED: Final = "the record does not determine it"
+_AT_EDGE: Final = "at the edge of what is searched"
+
+_MODES_TO_TELL_DAMPINGS: Final = 2
+ONE_MODE: Final = (
+    "one mode alone does not tell damping of the material from that of the surroundings"
+)
+
+StructureStatus = Literal["selected", "compatible", "excluded"]
+Damping = Literal["internal", "external"]
+_NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
+    "internal": ("zeta", "alpha"),
+    "external": ("gamma", "lambda"),
+}
+"""Coefficient and order of either damping."""
+
+_DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number with its uncertainty.
+
+    Attributes
+    ----------
+    value : float
+        In SI units.
+    std : float or None
+        Standard deviation, None if the data do not tell.
+    interval_95 : tuple of float or None
+        None as above.
+    flag : str or None
+        Why it must not be taken for a property of the antenna or the rig; None: it may.
+    """
+
+    value: float
+    std: float | None
+    interval_95: tuple[float, float] | None
+    flag: str | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """As `json.dumps` takes it."""
+        ends = None if self.interval_95 is None else list(self.interval_95)
+        return {"value": self.value, "std": self.std, "interval_95": ends, "flag": self.flag}
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Size of a damping at the frequency where it does not depend on its order.
+
+    Attributes
+    ----------
+    damping : str
+        "internal" or "external".
+    omega_rad_s : float or None
+        That frequency; None if the order is fixed: then it is the coefficient itself.
+    size : Quantity
+        ``zeta omega^alpha`` (no unit) or ``gamma omega^lambda`` (1/m⁴).
+    """
+
+    damping: Damping
+    omega_rad_s: float | None
+    size: Quantity
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One mode of the beam on a motor that stands still."""
+
+    number: int
+    frequency_hz: Quantity
+    damping_ratio: Quantity
+    shown: bool
+    """Whether the record shows it; else it is computed from the model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simpler:
+    """What a simpler structure would give, on condition that it is the true one.
+
+    Attributes
+    ----------
+    name : str
+        As tables call it.
+    fixed : mapping of str to float
+        What it takes for granted: orders by name.
+    parameters : mapping of str to Quantity
+    """
+
+    name: str
+    fixed: Mapping[str, float]
+    parameters: Mapping[str, Quantity]
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """What a record says in numbers, whatever structure is the true one.
+
+    Attributes
+    ----------
+    name : str
+        The freest structure that the record supports, as tables call it.
+    fit : RecordFit
+        Its fit.
+    parameters : mapping of str to Quantity
+        What the structure has, by the names of `RecordFit`.
+    sizes : tuple of Size
+    modes : tuple of Mode
+    structures : tuple of (str, str)
+        Every structure fitted, as tables call it, and its status: "selected", the one that the
+        numbers are of; "compatible"; "excluded".
+    simpler : Simpler or None
+        The simplest structure that would do, if it is not that one.
+    explained : bool
+        Whether it leaves nothing but noise; else every number carries a flag.
+    """
+
+    name: str
+    fit: RecordFit
+    parameters: Mapping[str, Quantity]
+    sizes: tuple[Size, ...]
+    modes: tuple[Mode, ...]
+    structures: tuple[tuple[str, StructureStatus], ...]
+    simpler: Simpler | None
+    explained: bool
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Reasons by parameter, of those that have one."""
+        return {name: each.flag for name, each in self.parameters.items() if each.flag}
+
+    @property
+    def visible_modes(self) -> tuple[int, ...]:
+        """Numbers of the modes that the record shows."""
+        return tuple(mode.number for mode in self.modes if mode.shown)
+
+    def with_status(self, status: StructureStatus) -> tuple[str, ...]:
+        """Names of the structures with a status.
+
+        Parameters
+        ----------
+        status : str
+        """
+        return tuple(name for name, its in self.structures if its == status)
+
+
+def headline(
+    field: Field,
+    orders: tuple[OrderVerdict, OrderVerdict],
+    visible: tuple[int, ...],
+    *,
+    adequate: bool,
+) -> Headline:
+    """Put together what is told first.
+
+    Parameters
+    ----------
+    field : Field
+    orders : tuple of OrderVerdict
+        Alpha's and lambda's, judged in the freest structure.
+    visible : tuple of int
+        Modes that the record shows.
+    adequate : bool
+        Whether that structure leaves nothing but noise.
+    """
+    freest = field.freest
+    unexplained = None if adequate else _UNEXPLAINED
+    reasons: dict[str, str] = {
+        each.order: each.reason for each in orders if each.reason is not None
+    }
+    intervals: dict[str, tuple[float, float]] = {
+        each.order: each.profile.interval
+        for each in orders
+        if each.profile.walked and each.order in freest.structure.free
+    }
+    told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
+    simpler = _simpler(field) if adequate else None
+    for other in field.other_kinds(STRONG):
+        told = _doubted_by(told, other)
+    if len(visible) < _MODES_TO_TELL_DAMPINGS:
+        told = replace(told, sizes=tuple(_flagged(each, ONE_MODE) for each in told.sizes))
+    return replace(told, structures=structures(field), simpler=simpler)
+
+
+def of_fit(
+    name: str,
+    fit: RecordFit,
+    visible: Collection[int],
+    reasons: Mapping[str, str] = _NONE,
+    intervals: Mapping[str, tuple[float, float]] = _NONE,
+    unexplained: str | None = None,
+) -> Headline:
+    """Tell one fit, with flags where they belong.
+
+    Parameters
+    ----------
+    name : str
+        As tables call it.
+    fit : RecordFit
+    visible : collection of int
+        Modes that the record shows.
+    reasons : mapping of str to str
+        Why an order is not to be believed; its coefficient shares the reason.
+    intervals : mapping of str to (float, float)
+        95 % intervals of orders that are better than those of the fit.
+    unexplained : str, optional
+        Why nothing is.
+    """
+    shared = {_COEFFICIENTS[order]: reason for order, reason in reasons.items()}
+    flags = {**reasons, **shared}
+    return Headline(
+        name=name,
+        fit=fit,
+        parameters={
+            each: _parameter(fit, each, unexplained or flags.get(each), intervals.get(each))
+            for each in fit.parameters
+            if _has(fit.structure, each)
+        },
+        sizes=tuple(
+            # What a record shows is a loss; the size that goes with it depends on the order, if
+            # only to the second degree where the two are uncorrelated.
+            _size(each, size, unexplained or reasons.get(_NAMES[each][1]))
+            for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
+            if size is not None
+        ),
+        modes=tuple(_mode(mode, visible, unexplained) for mode in fit.modes),
+        structures=((name, "selected"),),
+        simpler=None,
+        explained=unexplained is None,
+    )
+
+
+def structures(field: Field) -> tuple[tuple[str, StructureStatus], ...]:
+    """Say which structures a record excludes, and which would do.
+
+    A special case of the freest structure on the same beam is excluded by the likelihood ratio;
+    whatever is no special case of it, where its likelihood is as much lower, and its BIC is higher
+    than the lowest by 10. One that explains the record with more than it takes is not excluded.
+
+    Parameters
+    ----------
+    field : Field
+        With the candidates ranked.
+    """
+    freest = field.freest
+    return tuple((each.name, _status(field, each, freest)) for each in field.candidates)
+
+
+def _status(field: Field, candidate: Candidate, freest: Candidate) -> StructureStatus:
+    if candidate is freest:
+        return "selected"
+    simpler = set(candidate.structure.free) < set(freest.structure.free)
+    if not simpler or candidate.kind != freest.kind:
+        behind = candidate.deviance - freest.deviance > EXCLUDED[0]
+        worse = candidate.bic > field.best.bic + STRONG
+        return "excluded" if behind and worse else "compatible"
+    lacks = freest.parameters - candidate.parameters
+    limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
+    return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
+
+
+def _simpler(field: Field) -> Simpler | None:
+    """Find the simplest structure that would do: of those compatible on the same beam."""
+    freest = field.freest
+    would_do = [
+        each
+        for each in field.candidates
+        if each.kind == freest.kind
+        and each.parameters < freest.parameters
+        and _status(field, each, freest) == "compatible"
+    ]
+    if not would_do:
+        return None
+    best = min(would_do, key=lambda each: each.bic)
+    fixed = {
+        order: best.structure.fixed[order]  # type: ignore[index]
+        for order, coefficient in _COEFFICIENTS.items()
+        if order in best.structure.fixed and coefficient in best.structure.free
+    }
+    return Simpler(
+        name=best.name,
+        fixed=fixed,
+        parameters={
+            name: _parameter(best.fit, name, None, None)
+            for name in best.fit.parameters
+            if _has(best.structure, name) and name not in fixed
+        },
+    )
+
+
+def _has(structure: Structure, name: str) -> bool:
+    """Whether a parameter means anything in a structure."""
+    if name in ("zeta", "alpha"):
+        return structure.internal
+    if name in ("gamma", "lambda"):
+        return structure.external
+    return True
+
+
+def _parameter(
+    fit: RecordFit, name: str, reason: str | None, interval: tuple[float, float] | None
+) -> Quantity:
+    free = name in fit.interval
+    ends = interval or fit.interval.get(name)
+    flag = reason
+    if flag is None and name in fit.at_bounds and ends is None:
+        flag = _AT_EDGE
+    if flag is None and free and ends is None:
+        flag = _NOT_DETERMINED
+    return Quantity(fit.parameters[name], fit.std[name] if free else 0.0, ends, flag)
+
+
+def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
+    # Positive, and uncertain by a factor.
+    spread = _NORMAL_95 * size.std / size.value
+    ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
+    return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
+
+
+def _doubted_by(told: Headline, other: Candidate) -> Headline:
+    """Flag what another kind of rig, which explains the record as well, would have elsewhere."""
+    flag = f"type {other.name} explains the record as well, and has it elsewhere"
+    values = other.fit.parameters
+
+    def elsewhere(quantity: Quantity, value: float) -> bool:
+        low, high = quantity.interval_95 or (-math.inf, math.inf)
+        return not low <= value <= high
+
+    parameters = {
+        name: replace(each, flag=each.flag or flag)
+        if name in values and elsewhere(each, values[name])
+        else each
+        for name, each in told.parameters.items()
+    }
+    sizes = []
+    for each in told.sizes:
+        coefficient, order = _NAMES[each.damping]
+        at = values[coefficient] * (each.omega_rad_s or 1.0) ** values[order]
+        sizes.append(_flagged(each, flag) if elsewhere(each.size, at) else each)
+    return replace(told, parameters=parameters, sizes=tuple(sizes))
+
+
+def _flagged(each: Size, flag: str) -> Size:
+    return replace(each, size=replace(each.size, flag=each.size.flag or flag))
+
+
+def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:
+    shown = mode.number in visible
+    if reason is None and not shown:
+        reason = "computed from the model: the record does not show this mode"
+    return Mode(
+        mode.number,
+        _symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
+        _symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
+        shown,
+    )
+
+
+def _symmetric(value: float, std: float, reason: str | None) -> Quantity:
+    half = _NORMAL_95 * std
+    return Quantity(value, std, (value - half, value + half), reason)
+
+
+def headline_json(
+    file: str | None,
+    told: Headline,
+    orders: tuple[OrderVerdict, ...],
+    findings: tuple[Finding, ...],
+) -> dict[str, Any]:
+    """Write a headline as the JSON document has it.
+
+    Parameters
+    ----------
+    file : str or None
+        None for the estimate of a whole campaign.
+    told : Headline
+    orders : tuple of OrderVerdict
+    findings : tuple of Finding
+
+    Returns
+    -------
+    dict
+        Numbers may be not finite.
+    """
+    return {
+        "file": file,
+        "type": told.name,
+        "parameters": {name: each.as_json() for name, each in told.parameters.items()},
+        "sizes": [
+            {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
+            for each in told.sizes
+        ],
+        "modes": [
+            {
+                "mode": each.number,
+                "frequency_hz": each.frequency_hz.as_json(),
+                "damping_ratio": each.damping_ratio.as_json(),
+            }
+            for each in told.modes
+        ],
+        "structures": [{"type": name, "status": status} for name, status in told.structures],
+        "orders": {
+            each.order: {
+                "status": each.status,
+                "interval_95": None if each.interval is None else list(each.interval),
+            }
+            for each in orders
+        },
+        "conditional": None
+        if told.simpler is None
+        else {
+            "type": told.simpler.name,
+            "on": dict(told.simpler.fixed),
+            "parameters": {n: each.as_json() for n, each in told.simpler.parameters.items()},
+        },
+        "named": [
+            {
+                "what": each.kind,
+                "value": each.value,
+                "interval_95": None if each.interval is None else list(each.interval),
+                "sentence": each.sentence,
+            }
+            for each in findings
+        ],
+    }

@@ -1,0 +1,116 @@
+"""What the analyzer says of records of rigs that are not as it takes them to be.
+
+``bench_wrong_models.py [--records N] [--defect TEXT ...] [--rig NAME ...]`` makes N records of each
+defect (those whose names hold one of the texts) and rig, judges them, and prints a line for each
+defect: in how many records nothing but noise is said to remain, what is named, and the worst error
+of what is reported without a flag, in its own standard deviations. ``--say`` prints all that is
+said of each record.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from wrong_models import DEFECTS, RIGS, Record
+
+from analysis.selection import Selection, select
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What was said of one record."""
+
+    selection: Selection
+    errors: dict[str, float]
+    cpu_s: float
+
+    @classmethod
+    def of(cls, made: Record) -> Judged:
+        """Judge a record."""
+        measurement = made.measurement()
+        start = time.process_time()
+        selection = select(measurement)
+        cpu_s = time.process_time() - start
+        return cls(selection, dict(_errors(made, selection)), cpu_s)
+
+    @property
+    def worst(self) -> tuple[float, str]:
+        """Largest error of what has no flag, and of what it is."""
+        return max(((abs(e), name) for name, e in self.errors.items()), default=(0.0, "nothing"))
+
+
+def _errors(made: Record, selection: Selection) -> Iterator[tuple[str, float]]:
+    """Give by name the error of what is reported without a flag, in its standard deviations."""
+    verdict, fit = selection.verdict, selection.fit
+    if not verdict.adequate:
+        return
+    for name, true in made.rig.parameters.items():
+        std = fit.std.get(name)
+        if name in verdict.parameters and std:
+            yield name, (fit.parameters[name] - true) / std
+    for mode, true in zip(fit.modes, made.rig.damping_ratios.tolist(), strict=False):
+        yield f"xi{mode.number}", (mode.damping_ratio - true) / mode.damping_ratio_std
+    for mode, pole in zip(fit.modes, made.rig.poles().tolist(), strict=False):
+        error_hz = mode.frequency_hz - pole.imag / (2 * math.pi)
+        yield f"f{mode.number}", error_hz / mode.frequency_std_hz
+
+
+def main() -> None:
+    """Judge the records asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--records", type=int, default=1, help="of each defect and rig")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--defect", nargs="+", default=[""], help="only those that hold this text")
+    parser.add_argument("--rig", nargs="+", choices=list(RIGS), default=list(RIGS))
+    parser.add_argument("--say", action="store_true", help="print every verdict")
+    given = parser.parse_args()
+    print("| defect | only noise | named | worst error without a flag | CPU s |")
+    print("|---|---|---|---|---|")
+    for defect, (rigs, make) in DEFECTS.items():
+        if not any(text in defect for text in given.defect):
+            continue
+        judged = []
+        for name in rigs:
+            if name not in given.rig:
+                continue
+            for seed in range(given.first, given.first + given.records):
+                one = Judged.of(make(RIGS[name], seed))
+                judged.append(one)
+                if given.say:
+                    _say(f"{defect}, {name}, {seed}", one)
+        if judged:
+            _show(defect, judged)
+
+
+def _say(title: str, one: Judged) -> None:
+    print(f"\n{title}: {one.selection.candidates[0].name}, {one.cpu_s:.1f} s")
+    for sentence in one.selection.verdict.sentences:
+        print(f"    {sentence}")
+    print("   ", ", ".join(f"{name} {error:+.1f}" for name, error in one.errors.items()))
+    for row in one.selection.verdict.table[:6]:
+        print("   ", row)
+
+
+def _show(defect: str, judged: list[Judged]) -> None:
+    white = sum(one.selection.verdict.adequate for one in judged)
+    named = Counter(
+        kind
+        for one in judged
+        for kind in dict.fromkeys(f.kind for f in one.selection.verdict.findings)
+    )
+    names = ", ".join(f"{kind} {count}" for kind, count in named.most_common()) or "nothing"
+    worst, what = max(one.worst for one in judged)
+    cpu_s = max(one.cpu_s for one in judged)
+    print(
+        f"| {defect} | {white}/{len(judged)} | {names} | {worst:.1f} ({what}) | {cpu_s:.1f} |",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()

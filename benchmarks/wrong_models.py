@@ -1,0 +1,475 @@
+"""Records of rigs that are not as the analyzer takes them to be, made apart from its code.
+
+A chirp of 0.025 rad, 0.05-50 Hz in 120 s, 1 s of rest before and 15 s after, at 1 kHz behind a
+motor loop of 20 Hz; white noise of 5 mN·m. Linear rigs by the closed form of the beam with its ends
+as they are, written with the hyperbolic functions of the textbook, on a grid four times as fine as
+a record's. What is not linear, or changes with time, by Runge and Kutta's method on the equations
+of motion of the modes, as the difference that it makes beside the closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.whole_record import Measurement
+from rigd.beam import Beam
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+RATE_HZ = 1000.0
+TICKS = 136_000
+LENGTH_M, DENSITY, STIFFNESS = 0.98, 4.7e-3, 0.090275
+NOISE_NM = 5e-3
+_AMPLITUDE_RAD = 0.025
+_ROOTS = np.array([1.8751040687119611, 4.694091132974175, 7.854757438237613, 10.995540734875467])
+"""Of 1 + cos z cosh z."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """What is simulated: damping, ends of the beam, and the torque's channel."""
+
+    zeta: float
+    alpha: float
+    gamma: float
+    lambda_: float
+    root_nm_per_rad: float = np.inf
+    tip_mass_kg: float = 0.0
+    first_order_hz: float = np.inf
+    second_order_hz: float = np.inf
+    clock: float = 0.0
+
+    def response(self, s: Complex) -> Complex:
+        """Torque per angle, without the channel."""
+        external = DENSITY / STIFFNESS * s**2 + self.gamma * s**self.lambda_
+        elastic = STIFFNESS * (1 + self.zeta * s**self.alpha)
+        k = (-STIFFNESS * external / elastic + 0j) ** 0.25
+        z, tip = k * LENGTH_M, self.tip_mass_kg * s**2 / (elastic * k**3)
+        sine, cosine, sinh, cosh = np.sin(z), np.cos(z), np.sinh(z), np.cosh(z)
+        pinned = cosine * sinh - sine * cosh
+        rigid = elastic * k * (pinned + 2 * tip * sinh * sine)
+        rigid = rigid / (1 + cosine * cosh - tip * pinned)
+        found: Complex = rigid / (1 + rigid / self.root_nm_per_rad)
+        return found
+
+    def channel(self, s: Complex) -> Complex:
+        """What the sensor's filters make of a torque."""
+        first, second = (s / (2 * np.pi * hz) for hz in (self.first_order_hz, self.second_order_hz))
+        found: Complex = 1 / ((1 + first) * (1 + 2**0.5 * second + second**2))
+        return found
+
+    def poles(self) -> Complex:
+        """Poles of the first three modes, by the secant method on the reciprocal response."""
+        found = []
+        for root in _ROOTS[:3]:
+            omega = (root / LENGTH_M) ** 2 * np.sqrt(STIFFNESS / DENSITY)
+            grid = omega * np.linspace(0.75, 1.05, 6001)
+            start = 1j * grid[np.argmax(np.abs(self.response(1j * grid)))]
+            before, here = start, start * (1 + 1e-4j)
+            at_before, at_here = (1 / self.response(np.array([p]))[0] for p in (before, here))
+            for _ in range(60):
+                if at_here == at_before:
+                    break
+                step = at_here * (here - before) / (at_here - at_before)
+                before, at_before, here = here, at_here, here - step
+                at_here = 1 / self.response(np.array([here]))[0]
+                if abs(step) < 1e-13 * abs(here):
+                    break
+            found.append(here)
+        return np.array(found)
+
+    @property
+    def damping_ratios(self) -> Real:
+        """Of the first three modes."""
+        poles = self.poles()
+        return -poles.real / np.abs(poles)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """As the analyzer names them."""
+        return {
+            "zeta": self.zeta,
+            "alpha": self.alpha,
+            "gamma": self.gamma,
+            "lambda": self.lambda_,
+        }
+
+
+RIGS = MappingProxyType(
+    {
+        "alpha .92": Rig(1.24e-4, 0.92, 5.5e-2, 0.55),
+        "alpha 1": Rig(7.1e-5, 1.0, 5.5e-2, 0.7),
+        "III": Rig(7.1e-5, 1.0, 1.2e-2, 1.0),
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Angle and torque of one record, with the rig that is the truth."""
+
+    rig: Rig
+    angle_rad: Real
+    torque_nm: Real
+    known: NDArray[np.bool_] | None = None
+
+    def measurement(self) -> Measurement:
+        """As the analyzer is given it: ideal channels, the beam as it is."""
+        known = np.ones(self.angle_rad.size, dtype=bool) if self.known is None else self.known
+        return Measurement(
+            "record", self.angle_rad, self.torque_nm, RATE_HZ,
+            Beam(LENGTH_M, DENSITY, STIFFNESS), known, known,
+        )  # fmt: skip
+
+
+def _time_s() -> Real:
+    return np.arange(TICKS) / RATE_HZ
+
+
+def _chirp() -> Real:
+    t = _time_s() - 1
+    chirp = _AMPLITUDE_RAD * np.sin(2 * np.pi * (0.05 * t + (50 - 0.05) * t**2 / 240))
+    return np.where((t >= 0) & (t < 120), chirp, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Angle, and what makes a torque of it."""
+
+    s: Complex
+    spectrum: Complex
+    decay: Real
+
+    def at(self, spectrum: Complex, factor: int = 1) -> Real:
+        """Signal of a spectrum, at a multiple of the rate."""
+        n = TICKS * factor
+        grown: Real = np.fft.irfft(spectrum * factor, 4 * n)[:n] * np.exp(5.0 * np.arange(n) / n)
+        return grown
+
+
+@cache
+def _motion() -> _Motion:
+    decay = np.exp(-5.0 * np.arange(TICKS) / TICKS)
+    s = 5.0 * RATE_HZ / TICKS + 2j * np.pi * np.fft.rfftfreq(4 * TICKS, 1 / RATE_HZ)
+    loop = 2 * np.pi * 20
+    spectrum = np.fft.rfft(_chirp() * decay, 4 * TICKS) / (1 + 1.4 * s / loop + (s / loop) ** 2)
+    return _Motion(s, spectrum, decay)
+
+
+@cache
+def _exact(rig: Rig) -> tuple[Real, Real]:
+    """Angle and torque without noise."""
+    motion = _motion()
+    torque = motion.spectrum * rig.response(motion.s) * rig.channel(motion.s)
+    if rig.clock == 0:
+        return motion.at(motion.spectrum), motion.at(torque)
+    # Seen at t (1 + clock): cubic interpolation between samples eight times as close.
+    fine = motion.at(torque, 8)
+    place = _time_s() * (1 + rig.clock) * 8 * RATE_HZ
+    first = np.clip(place.astype(int), 1, fine.size - 3)
+    x = place - first
+    weights = (
+        -x * (x - 1) * (x - 2) / 6,
+        (x + 1) * (x - 1) * (x - 2) / 2,
+        -(x + 1) * x * (x - 2) / 2,
+        (x + 1) * x * (x - 1) / 6,
+    )
+    seen = sum(w * fine[first + k] for k, w in enumerate(weights, start=-1))
+    return motion.at(motion.spectrum), np.asarray(seen)
+
+
+def record(rig: Rig, seed: int, **more: float) -> Record:
+    """Make a record of a linear rig."""
+    rig = replace(rig, **more)
+    angle_rad, torque_nm = _exact(rig)
+    noise = np.random.default_rng(seed).normal(scale=NOISE_NM, size=TICKS)
+    return Record(rig, angle_rad, torque_nm + noise)
+
+
+Force = Callable[[int, float, float, float, float], float]
+"""Of the tick, the deflection relative to the hub, its speed, the absolute speed, and k."""
+
+
+@cache
+def _hub() -> tuple[list[float], list[float]]:
+    """Angle and its speed, two values a tick."""
+    motion = _motion()
+    angle, speed = (motion.at(motion.spectrum * motion.s**k, 2) for k in (0, 1))
+    return angle.tolist(), speed.tolist()
+
+
+def _mode(rig: Rig, mode: int, force: Force | None) -> tuple[Real, float]:
+    """Torque of one mode of a beam of integer orders, shape (n,), and its largest deflection.
+
+    ``rho/EI y'' + gamma y' + k (r + zeta r') + force = 0``, y the absolute deflection per
+    eigenfunction and r that relative to the turning hub.
+    """
+    k = float(_ROOTS[mode - 1] / LENGTH_M) ** 4
+    ratio, gamma, zeta = DENSITY / STIFFNESS, rig.gamma, rig.zeta
+    hub, turning = _hub()
+    step = 1 / RATE_HZ
+    out, y, v, largest = np.zeros(TICKS), 0.0, 0.0, 0.0
+
+    def pull(j: int, y: float, v: float) -> float:
+        r, w = y - hub[j], v - turning[j]
+        elastic = k * (r + zeta * w)
+        return elastic if force is None else elastic + force(j // 2, r, w, v, k)
+
+    for i in range(TICKS - 1):
+        j = 2 * i
+        out[i] = f = pull(j, y, v)
+        largest = max(largest, abs(y - hub[j]))
+        d1 = -(gamma * v + f) / ratio
+        v2 = v + step / 2 * d1
+        d2 = -(gamma * v2 + pull(j + 1, y + step / 2 * v, v2)) / ratio
+        v3 = v + step / 2 * d2
+        d3 = -(gamma * v3 + pull(j + 1, y + step / 2 * v2, v3)) / ratio
+        v4 = v + step * d3
+        d4 = -(gamma * v4 + pull(j + 2, y + step * v3, v4)) / ratio
+        y += step / 6 * (v + 2 * v2 + 2 * v3 + v4)
+        v += step / 6 * (d1 + 2 * d2 + 2 * d3 + d4)
+    out[-1] = out[-2]
+    share = 4 * LENGTH_M**3 / _ROOTS[mode - 1] ** 4 * STIFFNESS
+    return -share * out, largest
+
+
+@cache
+def _linear_mode(rig: Rig, mode: int) -> tuple[Real, float]:
+    return _mode(rig, mode, None)
+
+
+def _with_forces(made: Record, forces: dict[int, Force]) -> Record:
+    """Add what forces on its modes change."""
+    changes = [
+        _mode(made.rig, mode, force)[0] - _linear_mode(made.rig, mode)[0]
+        for mode, force in forces.items()
+    ]
+    return replace(made, torque_nm=made.torque_nm + np.sum(changes, axis=0))
+
+
+def damping_changes(share: float, rig: Rig, seed: int) -> Record:
+    """All damping from 1 - share to 1 + share of its mean, from the first tick to the last."""
+    ramp = (share * (2 * np.arange(TICKS) / TICKS - 1)).tolist()
+
+    def force(i: int, _r: float, w: float, v: float, k: float) -> float:
+        return ramp[i] * (k * rig.zeta * w + rig.gamma * v)
+
+    return _with_forces(record(rig, seed), {1: force, 2: force, 3: force})
+
+
+def stiffens(shares: dict[int, float], power: int, rig: Rig, seed: int) -> Record:
+    """Let the stiffness of modes rise by a share up to their largest deflection."""
+
+    def rising(mode: int, share: float) -> Force:
+        size = share / _linear_mode(rig, mode)[1] ** power
+        return lambda _i, r, _w, _v, k: k * size * abs(r) ** power * r
+
+    return _with_forces(record(rig, seed), {m: rising(m, x) for m, x in shares.items()})
+
+
+def air_drag(diameter_m: float, rig: Rig, seed: int) -> Record:
+    """Drag of a wire, ``rho_air C_D d v abs(v) / 2`` per length, C_D = 1.2; three modes."""
+    xi = (np.arange(24) + 0.5) / 24
+    shapes = np.array([_shape(z, xi) for z in _ROOTS[:3]])
+    # In units of an eigenfunction's expansion of the rigid turn x.
+    shares = np.array([2 / z**2 * LENGTH_M * np.sign(_shape(z, np.ones(1))[0]) for z in _ROOTS[:3]])
+    k = (_ROOTS[:3] / LENGTH_M) ** 4
+    ratio, step = DENSITY / STIFFNESS, 1 / RATE_HZ
+    per_speed = 0.5 * 1.2 * 1.2 * diameter_m / STIFFNESS / 24
+    field = shapes * shares[:, None]
+    norm = per_speed * shapes / shares[:, None]
+    hub, turning = (np.array(x) for x in _hub())
+
+    def run(size: float) -> Real:
+        out, y, v = np.zeros((TICKS, 3)), np.zeros(3), np.zeros(3)
+
+        def pull(j: int, y: Real, v: Real) -> tuple[Real, Real]:
+            elastic = k * (y - hub[j] + rig.zeta * (v - turning[j]))
+            if size == 0:
+                return elastic, elastic + rig.gamma * v
+            speed = v @ field
+            return elastic, elastic + rig.gamma * v + norm @ (speed * np.abs(speed))
+
+        for i in range(TICKS - 1):
+            j = 2 * i
+            out[i], f = pull(j, y, v)
+            v2 = v - step / 2 * f / ratio
+            d2 = pull(j + 1, y + step / 2 * v, v2)[1]
+            v3 = v - step / 2 * d2 / ratio
+            d3 = pull(j + 1, y + step / 2 * v2, v3)[1]
+            v4 = v - step * d3 / ratio
+            d4 = pull(j + 2, y + step * v3, v4)[1]
+            y = y + step / 6 * (v + 2 * v2 + 2 * v3 + v4)
+            v = v - step / 6 * (f + 2 * d2 + 2 * d3 + d4) / ratio
+        torque: Real = -out @ (4 * LENGTH_M**3 / _ROOTS[:3] ** 4 * STIFFNESS)
+        return torque
+
+    made = record(rig, seed)
+    return replace(made, torque_nm=made.torque_nm + run(1.0) - run(0.0))
+
+
+def _shape(z: float, xi: Real) -> Real:
+    """Clamped-free eigenfunction of mean square 1."""
+    share = (np.cos(z) + np.cosh(z)) / (np.sin(z) + np.sinh(z))
+    x = z * xi
+    shape: Real = np.cosh(x) - np.cos(x) - share * (np.sinh(x) - np.sin(x))
+    return shape
+
+
+def play(width_rad: float, rig: Rig, seed: int) -> Record:
+    """Let the hub follow the encoder's shaft only once a gap is closed."""
+    made, here = record(rig, seed), 0.0
+    follows = np.empty(TICKS)
+    for i, angle in enumerate(made.angle_rad.tolist()):
+        here = min(max(here, angle - width_rad / 2), angle + width_rad / 2)
+        follows[i] = here
+    motion = _motion()
+    lag = np.fft.rfft((follows - made.angle_rad) * motion.decay, 4 * TICKS)
+    more = motion.at(lag * rig.response(motion.s) * rig.channel(motion.s))
+    return replace(made, torque_nm=made.torque_nm + more)
+
+
+def drifts(kind: str, rig: Rig, seed: int) -> Record:
+    """Zero of the sensor that drifts by 50 mN·m."""
+    made, t = record(rig, seed), np.arange(TICKS) / TICKS
+    walk = np.cumsum(np.random.default_rng(seed + 1000).normal(size=TICKS)) / TICKS**0.5
+    return replace(
+        made, torque_nm=made.torque_nm + 0.05 * ((2 * t - 1) ** 2 if kind == "parabola" else walk)
+    )
+
+
+def scaled(torque: float, rig: Rig, seed: int) -> Record:
+    """Multiply the torque."""
+    made = record(rig, seed)
+    return replace(made, torque_nm=torque * made.torque_nm)
+
+
+def hums(frequency_hz: float, size_nm: float, rig: Rig, seed: int) -> Record:
+    """Hum whose frequency wanders by 0.02 Hz."""
+    made, rng = record(rig, seed), np.random.default_rng(seed + 2000)
+    slow = np.interp(np.arange(TICKS), np.arange(0, TICKS + 4000, 4000), rng.normal(size=35))
+    phase = 2 * np.pi * np.cumsum(frequency_hz + 0.02 * slow) / RATE_HZ
+    return replace(made, torque_nm=made.torque_nm + size_nm * np.sin(phase))
+
+
+def clipped(share: float, rig: Rig, seed: int) -> Record:
+    """Clip the torque at a share of its peak; no value is flagged."""
+    made = record(rig, seed)
+    most = share * np.abs(made.torque_nm).max()
+    return replace(made, torque_nm=np.clip(made.torque_nm, -most, most))
+
+
+def missing(share: float, rig: Rig, seed: int) -> Record:
+    """Leave single ticks unknown."""
+    made = record(rig, seed)
+    known = np.random.default_rng(seed + 3000).random(TICKS) > share
+    known[[0, -1]] = True
+    return replace(made, known=known)
+
+
+def repeated(share: float, rig: Rig, seed: int) -> Record:
+    """Repeat the torque of the tick before, without a flag."""
+    made = record(rig, seed)
+    stale = np.random.default_rng(seed + 3000).random(TICKS) < share
+    fresh = np.maximum.accumulate(np.where(stale, 0, np.arange(TICKS)))
+    return replace(made, torque_nm=made.torque_nm[fresh])
+
+
+def disturbed(kind: str, rig: Rig, seed: int) -> Record:
+    """Add a burst of 20 ms, a kick that lets mode 1 ring, or spikes."""
+    made, rng = record(rig, seed), np.random.default_rng(seed + 4000)
+    torque = made.torque_nm.copy()
+    if kind == "burst":
+        torque[60_000:60_020] += 5.0
+    elif kind == "kick":
+        torque[60_000:] += 0.2 * np.imag(np.exp(rig.poles()[0] * _time_s()[: TICKS - 60_000]))
+    else:
+        torque[rng.random(TICKS) < 1e-3] += 1.0
+    return replace(made, torque_nm=torque)
+
+
+def second_beam(share: float, rig: Rig, seed: int) -> Record:
+    """Let a lighter beam of 0.8 of the length move along."""
+    made, motion = record(rig, seed), _motion()
+    # A shorter beam answers as this one does at frequencies that are lower by length².
+    shorter = rig.response(motion.s * 0.64) * share
+    return replace(made, torque_nm=made.torque_nm + motion.at(motion.spectrum * shorter))
+
+
+def rings(mode: int, size_nm: float, rig: Rig, seed: int) -> Record:
+    """Let a mode ring when the record begins."""
+    made = record(rig, seed)
+    decay = np.real(np.exp(rig.poles()[mode - 1] * _time_s()))
+    return replace(made, torque_nm=made.torque_nm + size_nm * decay)
+
+
+Make = Callable[[Rig, int], Record]
+ALL = tuple(RIGS)
+_III = ("III",)
+_TWO = ("alpha .92", "III")
+
+
+def _linear(**more: Any) -> Make:
+    return partial(record, **more)
+
+
+_MODE_3_HZ = float((_ROOTS[2] / LENGTH_M) ** 2 * np.sqrt(STIFFNESS / DENSITY) / (2 * np.pi))
+
+DEFECTS: dict[str, tuple[tuple[str, ...], Make]] = {
+    "none": (ALL, record),
+    **{
+        f"elastic clamp {k:g} N·m/rad": (ALL, _linear(root_nm_per_rad=k))
+        for k in (1000.0, 300.0, 100.0, 20.0)
+    },
+    **{f"tip mass {m:g} g": (_TWO, _linear(tip_mass_kg=1e-3 * m)) for m in (0.05, 0.5)},
+    "low-pass 100 Hz, 1st order": (ALL, _linear(first_order_hz=100.0)),
+    "low-pass 300 Hz, 1st order": (ALL, _linear(first_order_hz=300.0)),
+    "low-pass 300 Hz, 2nd order": (_TWO, _linear(second_order_hz=300.0)),
+    "low-pass 150 Hz, 2nd order": (_TWO, _linear(second_order_hz=150.0)),
+    **{f"clocks {e} ppm": (ALL, _linear(clock=1e-6 * e)) for e in (1, 10, 100)},
+    "damping ±10 % over the session": (_III, partial(damping_changes, 0.1)),
+    "damping ±2 % over the session": (_III, partial(damping_changes, 0.02)),
+    "air drag, wire of 0.2 mm": (_III, partial(air_drag, 2e-4)),
+    "air drag, wire of 1 mm": (_III, partial(air_drag, 1e-3)),
+    "cubic stiffness +1 % (mode 1)": (_III, partial(stiffens, {1: 0.01}, 2)),
+    "cubic stiffness -3 % (mode 1)": (_III, partial(stiffens, {1: -0.03}, 2)),
+    "cubic stiffness +0.3 % (three modes)": (
+        _III,
+        partial(stiffens, {1: 0.003, 2: 0.003, 3: 0.003}, 2),
+    ),
+    "stiffness with abs(q), 1 % (mode 1)": (_III, partial(stiffens, {1: 0.01}, 1)),
+    "stiffness with abs(q), 1 % (all)": (
+        _III,
+        partial(stiffens, {1: 0.01, 2: 0.01, 3: 0.01}, 1),
+    ),
+    **{f"play {w:g} mrad": (ALL, partial(play, 1e-3 * w)) for w in (0.1, 0.5, 2.0)},
+    "drift 50 mN·m, parabola": (_TWO, partial(drifts, "parabola")),
+    "drift 50 mN·m, random walk": (_TWO, partial(drifts, "walk")),
+    "gain +2 %": (_TWO, partial(scaled, 1.02)),
+    "hum 50 Hz, 2 mN·m": (_TWO, partial(hums, 50.0, 2e-3)),
+    "hum 50 Hz, 10 mN·m": (_TWO, partial(hums, 50.0, 1e-2)),
+    "hum on mode 3, 5 mN·m": (_TWO, partial(hums, _MODE_3_HZ, 5e-3)),
+    "clipped at 80 %": (_TWO, partial(clipped, 0.8)),
+    "clipped at 50 %": (_TWO, partial(clipped, 0.5)),
+    "missing ticks 1 %": (_TWO, partial(missing, 0.01)),
+    "missing ticks 4.5 %": (_TWO, partial(missing, 0.045)),
+    "torque repeated in 3 %": (_TWO, partial(repeated, 0.03)),
+    "burst 20 ms, 5 N·m": (_TWO, partial(disturbed, "burst")),
+    "kick 0.2 N·m": (_TWO, partial(disturbed, "kick")),
+    "spikes 1 N·m in 0.1 %": (_TWO, partial(disturbed, "spikes")),
+    "second beam 10 %": (ALL, partial(second_beam, 0.1)),
+    "second beam 1 %": (ALL, partial(second_beam, 0.01)),
+    "torque with the wrong sign": (ALL, partial(scaled, -1.0)),
+    "torque 57.3 times too large": (ALL, partial(scaled, 180 / np.pi)),
+    "mode 1 rings, 0.1 N·m": (ALL, partial(rings, 1, 0.1)),
+    "mode 2 rings, 0.48 N·m": (ALL, partial(rings, 2, 0.48)),
+}
+"""By name: the rigs of which it is made, and how."""
