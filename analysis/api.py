@@ -56,7 +56,8 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     ----------
     record : Record
     settings : WelchSettings, optional
-        Estimator, segments and band; by default the paper's.
+        Estimator, segments and band; by default the paper's, as far as the record's rate holds
+        it.
 
     Returns
     -------
@@ -70,8 +71,9 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     """
     from analysis.estimate import estimate
     from analysis.settings import WelchSettings
+    from analysis.suited import welch_settings
 
-    return estimate(record, settings or WelchSettings())[0]
+    return estimate(record, welch_settings(record, settings or WelchSettings()))[0]
 
 
 @overload
@@ -134,7 +136,8 @@ def fit(
         Not with "record": "const", "omega", "omega^K"; by default the first two, with
         "welch-aware" the second.
     band_hz : tuple of float, optional
-        First and last frequency; by default 0 to 50 Hz, else than with "record" the paper's band.
+        First and last frequency; by default 0 to 50 Hz, else than with "record" the paper's band,
+        either up to 0.4 of the record's rate.
 
     Returns
     -------
@@ -158,24 +161,25 @@ def fit(
             f"{', '.join(STRUCTURES)}."
         )
     if method == "record":
-        from analysis.whole_record import BAND_HZ, Measurement, fit_record
+        from analysis.suited import record_band_hz
+        from analysis.whole_record import Measurement, fit_record
 
         return fit_record(
             Measurement.of_record(record),
             [STRUCTURES[name] for name in types or STRUCTURES],
             fixed=fixed,
-            band_hz=band_hz or BAND_HZ,
+            band_hz=record_band_hz(record, band_hz),
         )
     if method == "welch":
-        from analysis.settings import PAPER_BAND_HZ, PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
+        from analysis.settings import PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
+        from analysis.suited import welch_settings
         from analysis.welch_route import analyse
 
         settings = WelchSettings(
-            band_hz=band_hz or PAPER_BAND_HZ,
             types=tuple(types or PAPER_TYPES),
             weightings=tuple(weightings or PAPER_WEIGHTINGS),
         )
-        return analyse(record, settings)
+        return analyse(record, welch_settings(record, settings, band_hz))
     if method == "welch-aware":
         from analysis.settings import PAPER_BAND_HZ, WelchSettings
         from analysis.welch_aware import fit_record_welch_aware
@@ -203,7 +207,7 @@ def select(
     fixed : iterable of str
         Settings that stay at the file's values.
     band_hz : tuple of float, optional
-        By default 0 to 50 Hz.
+        By default 0 to 50 Hz, up to 0.4 of the record's rate.
 
     Returns
     -------
@@ -216,9 +220,12 @@ def select(
         The record cannot be used.
     """
     from analysis.selection import select as select_structure
-    from analysis.whole_record import BAND_HZ, Measurement
+    from analysis.suited import record_band_hz
+    from analysis.whole_record import Measurement
 
-    return select_structure(Measurement.of_record(record), fixed=fixed, band_hz=band_hz or BAND_HZ)
+    return select_structure(
+        Measurement.of_record(record), fixed=fixed, band_hz=record_band_hz(record, band_hz)
+    )
 
 
 def campaign(

@@ -21,6 +21,7 @@ from analysis.commands.welch_options import (
     Nfft,
     Overlap,
     Segment,
+    band_hz,
     choice,
     welch_settings,
 )
@@ -40,7 +41,8 @@ Example: analyze session.mcap --types III,VI --json fits.json
 Writes figures, tables and JSON into session.report/ beside the file (session.report-2/ if that
 exists). Several files are a campaign: statistics, nominal models, pooled estimate and validation go
 to campaign.report/ beside the first. Records of other programs: analyze import --help; results for
-them: analyze export --help.
+them: analyze export --help. Sessions that do not suit Welch's method (steps, multisines, narrow
+sweeps, short or stopped ones) get the whole-record analysis alone, and a line that says why.
 Exit code: 0 done; 1 a file could not be analysed, being too short for --segment for one; 2 wrong
 use, options that contradict each other or the record's rate included; 130 stopped by Ctrl-C."""
 
@@ -48,8 +50,8 @@ use, options that contradict each other or the record's rate included; 130 stopp
 _METHODS: Final = ("welch", "record", "all")
 """Ways from a record to models."""
 
-_OF_PAPER: Final = ("types", "weights", "band", "frf", "segment", "overlap", "nfft")
-"""Options of the paper's route alone."""
+_OF_WELCH: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
+"""Options of the Welch fits alone."""
 
 _TYPED: Final = "COMMANDLINE"
 """What click calls the source of an option's value that is no default."""
@@ -110,7 +112,7 @@ def analyze(
             help="Weightings of the cost: const, omega (1/omega), omega^K for any power K.",
         ),
     ] = "const,omega",
-    band: Band = "0.5875,50",
+    band: Band = None,
     frf: Estimator = "h1",
     segment: Segment = None,
     overlap: Overlap = None,
@@ -175,12 +177,13 @@ def analyze(
         )
     if method == "record":
         _check_without_paper(context, is_campaign=is_campaign, rerun=rerun)
-    settings = welch_settings(types, weights, band, frf, segment, overlap, nfft)
+    settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     routes = Routes(
         settings,
         paper=method != "record",
         whole_record=method != "welch",
         fixed=_fixed(fix),
+        band_hz=band_hz(band),
     )
     try:
         to_stdout = json is not None and str(json) == "-"
@@ -197,8 +200,8 @@ def analyze(
             try:
                 code = campaign_command(
                     files, settings, structures=tuple(STRUCTURES) if routes.whole_record else (),
-                    fixed=routes.fixed, report=report, json=json, jobs=jobs, dask=dask,
-                    with_paper=paper,
+                    fixed=routes.fixed, band_hz=routes.band_hz, report=report, json=json,
+                    jobs=jobs, dask=dask, with_paper=paper,
                 )  # fmt: skip
             except LoneSessionError as lone:
                 code = _lone_session(lone, routes, report, json)
@@ -239,12 +242,13 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Pa
             "all.",
             param_hint="--rerun",
         )
-    sources = {name: context.get_parameter_source(name) for name in _OF_PAPER}
+    sources = {name: context.get_parameter_source(name) for name in _OF_WELCH}
     given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]
     if given:
         typer.echo(
-            f"Warning: {', '.join(given)} concern the paper's route alone, which --method record "
-            "leaves out: the whole record is fitted by every type, from 0 to 50 Hz.",
+            f"Warning: {', '.join(given)} {'concerns' if len(given) == 1 else 'concern'} the Welch "
+            "fits alone, which --method record leaves out: the whole record is fitted by every "
+            "type.",
             err=True,
         )
 

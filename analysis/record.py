@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.record_checks import (
-    MAX_FILLED_SHARE,
     MAX_GAP_S,
     MAX_TICKS,
+    MAX_UNKNOWN_SHARE,
     RecordError,
     check_clock,
     check_fillable,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from rigd.beam import Beam
 
-__all__ = ["MAX_FILLED_SHARE", "MAX_GAP_S", "Gaps", "Record", "RecordError", "load_record"]
+__all__ = ["MAX_GAP_S", "MAX_UNKNOWN_SHARE", "Gaps", "Record", "RecordError", "load_record"]
 
 MAX_SAMPLES = MAX_TICKS
 """Most samples of a session that are read."""
@@ -57,6 +57,8 @@ _REPORTED_FLAGS = (
     (Status.TORQUE_OFF, "torque off"),
     (Status.LATE, "late tick"),
 )
+
+_UNKNOWN = "do not count in the whole-record fits; for the Welch fits they are interpolated."
 
 _CONSEQUENCES: tuple[tuple[str, str], ...] = (
     ("wrench saturated", "The torque is clipped there and the estimate is wrong near it."),
@@ -161,9 +163,9 @@ def load_record(path: Path) -> Record:
     """Read a session file and put it on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
-    fresh neighbours, up to `MAX_FILLED_SHARE` of the sweep and `MAX_GAP_S` at a time; the counts
-    are in the result. Without segments the whole record is the sweep, and a sweep that was
-    stopped is cut to what was recorded.
+    fresh neighbours, up to `MAX_UNKNOWN_SHARE` of the sweep and `MAX_GAP_S` at a time; the counts
+    are in the result, and masks that say which they are. Without segments the whole record is the
+    sweep, and a sweep that was stopped is cut to what was recorded.
 
     Parameters
     ----------
@@ -315,15 +317,15 @@ def _warnings(
         )
     if gaps.sweep_missing_ticks:
         found.append(
-            f"{gaps.sweep_missing_ticks} missing ticks in the sweep were interpolated linearly "
-            f"(longest gap of the record {gaps.longest_gap_ticks} ticks)."
+            f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
+            f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN}"
         )
     for channel, count in (
         ("angle", gaps.sweep_stale_angles),
         ("torque", gaps.sweep_stale_torques),
     ):
         if count:
-            found.append(f"{count} stale values of the {channel} were interpolated linearly.")
+            found.append(f"{count} stale values of the {channel} {_UNKNOWN}")
     for flag, consequence in _CONSEQUENCES:
         if flag in flags:
             found.append(f"{flags[flag]} samples of the sweep: {flag}. {consequence}")

@@ -11,8 +11,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-MAX_FILLED_SHARE = 0.01
-"""Largest share of the sweep that may be interpolated, in each of angle and torque."""
+MAX_UNKNOWN_SHARE = 0.05
+"""Largest share of angle or torque that may be missing or flagged: one limit for import, loading
+and estimation. Whole-record fits stand so much of it (within their own uncertainty at 4.5 %)."""
 
 MAX_GAP_S = 0.1
 """Longest single gap in the sweep that is interpolated; a longer one is refused."""
@@ -120,14 +121,9 @@ def check_fillable(
         Of the sweep.
     rate_hz : float
     """
-    count = int(unknown.sum())
-    share = count / len(unknown)
-    if share > MAX_FILLED_SHARE:
-        raise RecordError(
-            f"{path}: {count} of {len(unknown)} samples ({100 * share:.2g} %) of the {channel} in "
-            f"the sweep are missing or stale, more than the {100 * MAX_FILLED_SHARE:g} % that are "
-            "interpolated; record the session again."
-        )
+    much = too_much_unknown(f"the {channel} in the sweep", int(unknown.sum()), len(unknown))
+    if much:
+        raise RecordError(f"{path}: {much}")
     run, start = longest_run(unknown)
     if run > MAX_GAP_S * rate_hz:
         raise RecordError(
@@ -135,6 +131,25 @@ def check_fillable(
             f"{first_tick + start} on ({1e3 * run / rate_hz:.0f} ms), longer than the "
             f"{1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
         )
+
+
+def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
+    """Say that more than `MAX_UNKNOWN_SHARE` of a channel is unknown; None if it is not.
+
+    Parameters
+    ----------
+    what : str
+        The channel, as the message calls it.
+    unknown, of : int
+        Samples without a value of their own, and all.
+    """
+    if unknown <= MAX_UNKNOWN_SHARE * of:
+        return None
+    return (
+        f"{unknown} of {of} samples ({100 * unknown / of:.2g} %) of {what} are missing or flagged, "
+        f"more than the {100 * MAX_UNKNOWN_SHARE:g} % that an analysis tolerates; record the "
+        "session again."
+    )
 
 
 def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 
     from rigd.spectral import Estimator
 
+RECORD_BAND_HZ: Final = (0.0, 50.0)
+"""Of the whole-record fits, where the record's rate holds it."""
+
+LARGEST_SHARE_OF_RATE: Final = 0.4
+"""Highest frequency that is fitted, over the sampling rate: filters need room up to half of it."""
+
 PAPER_BAND_HZ: Final = (0.5875, 50.0)
 PAPER_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
 PAPER_WEIGHTINGS: Final = ("const", "omega")
@@ -60,6 +66,12 @@ class WelchSettings:
     band_hz: tuple[float, float] = PAPER_BAND_HZ
     types: tuple[str, ...] = PAPER_TYPES
     weightings: tuple[str, ...] = PAPER_WEIGHTINGS
+
+    @property
+    def are_usual(self) -> bool:
+        """Whether estimator and segments are the paper's, not chosen for one record."""
+        chosen = self.segment_length or self.overlap or self.nfft
+        return self.estimator == "h1" and not chosen
 
     def segmentation(self, rate_hz: float) -> Segmentation:
         """Fill in what was left open: the paper's durations, in samples at this rate."""

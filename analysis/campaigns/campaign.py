@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.campaigns.common_structure import freest_estimate
 from analysis.campaigns.dask_workers import dask_cluster
 from analysis.campaigns.errors import CampaignError
-from analysis.campaigns.experiment import most_common, stated_specimens
+from analysis.campaigns.experiment import labelled, most_common, stated_specimens
 from analysis.campaigns.homogeneity import Homogeneity, homogeneity
 from analysis.campaigns.local_workers import process_pool
 from analysis.campaigns.nominal import NominalModel, nominal_models
@@ -27,7 +28,6 @@ from analysis.campaigns.verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns.workers import Lost, available_cores
 from analysis.settings import WelchSettings
 from analysis.structures import STRUCTURES
-from analysis.whole_record import BAND_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -46,12 +46,13 @@ class Campaign:
     ----------
     settings : WelchSettings
     record_band_hz : tuple of float
+        Of the whole-record fits of most sessions.
     sessions : tuple of SessionResult
         In the order of the paths.
     failures : tuple of SessionFailure
         Sessions of which nothing is used.
     statistics : tuple of ParameterStatistics
-        Table 3.
+        Table 3; empty where Welch's method does not suit some session, as the following.
     nominal : tuple of NominalModel
         By type, then by weighting: Table 4 and Figures 6 and 7.
     homogeneity : Homogeneity
@@ -84,6 +85,11 @@ class Campaign:
     lost_trials: tuple[LostTrial, ...]
 
     @property
+    def headline(self) -> PooledEstimate | None:
+        """Pooled estimate that the numbers are of, None without any: see `freest_estimate`."""
+        return freest_estimate(self.pooled)
+
+    @property
     def trials(self) -> int:
         """Sessions that were to be predicted from the others."""
         return len(self.sessions) if len(self.sessions) >= FEWEST else 0
@@ -95,15 +101,15 @@ def campaign(
     *,
     structures: Sequence[str] = tuple(STRUCTURES),
     fixed: Sequence[Setting] = (),
-    record_band_hz: tuple[float, float] = BAND_HZ,
+    band_hz: tuple[float, float] | None = None,
     jobs: int | None = None,
     dask: str | None = None,
     on_progress: Callable[[int, int, str], None] = lambda _done, _total, _what: None,
 ) -> Campaign:
     """Analyse a campaign of sessions of one specimen on one rig.
 
-    Every session goes by the paper's route (`analysis.welch_route`) and by the whole record
-    (`analysis.selection`); each is then predicted from the others.
+    Every session goes by Welch's method (`analysis.welch_route`), where that suits all of them, and
+    by the whole record (`analysis.selection`); each is then predicted from the others.
 
     Parameters
     ----------
@@ -116,8 +122,8 @@ def campaign(
         and the estimate's validation out.
     fixed : sequence of str
         Settings of rig and specimen that stay at the file's values in those fits.
-    record_band_hz : tuple of float
-        Band of those fits, and of the validation.
+    band_hz : tuple of float, optional
+        Of all fits and of the validation; by default what suits each record.
     jobs : int, optional
         Worker processes, by default one a core.
     dask : str, optional
@@ -141,7 +147,7 @@ def campaign(
     if dask is not None:
         paths = [path.absolute() for path in paths]
     settings = settings or WelchSettings()
-    task = SessionTask(settings, tuple(structures), tuple(fixed), record_band_hz)
+    task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz)
     done, total = 0, 2 * len(paths)
 
     def step(name: str) -> None:
@@ -175,15 +181,15 @@ def campaign(
         if len(sessions) >= FEWEST:
             total = len(paths) + len(sessions)
             names = [session.path.name for session in sessions]
-            validation, lost = validate(workers, sessions, record_band_hz, lambda i: step(names[i]))
+            validation, lost = validate(workers, sessions, band_hz, lambda i: step(names[i]))
     pooled = pooled_estimates(sessions)
     usable = [(each.path, each.experiment) for each in sessions]
     left_out = [(each.path, each.experiment) for each in failures]
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
     alike = homogeneity(sessions, pooled, specimens)
     return Campaign(
-        settings=settings,
-        record_band_hz=record_band_hz,
+        settings=sessions[0].settings,
+        record_band_hz=sessions[0].record_band_hz,
         sessions=tuple(sessions),
         failures=tuple(failures),
         statistics=parameter_statistics(sessions),
@@ -204,6 +210,8 @@ def _of_one_experiment(
     usable = [result for result in results if isinstance(result, SessionResult)]
     if not usable:
         return [], [result for result in results if isinstance(result, SessionFailure)]
+    results = _labelled(results)
+    usable = [result for result in results if isinstance(result, SessionResult)]
     common = usable[most_common([session.experiment for session in usable])]
     sessions: list[SessionResult] = []
     failures: list[SessionFailure] = []
@@ -217,7 +225,35 @@ def _of_one_experiment(
             failures.append(
                 SessionFailure(result.path, f"{result.path}: {reason}", result.experiment)
             )
-    return sessions, failures
+    return _alike_by_welch(sessions, failures)
+
+
+def _alike_by_welch(
+    sessions: list[SessionResult], failures: list[SessionFailure]
+) -> tuple[list[SessionResult], list[SessionFailure]]:
+    """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without."""
+    without = [each for each in sessions if not each.frequency_hz.size]
+    if not without:
+        return sessions, failures
+    if 2 * len(without) >= len(sessions):
+        return [each.without_welch() for each in sessions], failures
+    odd = [
+        SessionFailure(
+            each.path,
+            f"{each.path}: {each.warnings[-1]} Most others have them: analyse this one by itself.",
+            each.experiment,
+        )
+        for each in without
+    ]
+    return [each for each in sessions if each.frequency_hz.size], [*failures, *odd]
+
+
+def _labelled(
+    results: Sequence[SessionResult | SessionFailure],
+) -> list[SessionResult | SessionFailure]:
+    """Take the specimens' labels for what they say: see `labelled`."""
+    stated = iter(labelled([each.experiment for each in results if each.experiment]))
+    return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
 
 
 def _reason_against(
@@ -238,7 +274,8 @@ def _reason_against(
             return "the file is given more than once, and counts once."
         if result.experiment.identity == other.experiment.identity:
             return f"it is the same session as {other.path}, which would count twice."
-    if not np.array_equal(common.frequency_hz, result.frequency_hz):
+    both = common.frequency_hz.size and result.frequency_hz.size
+    if both and not np.array_equal(common.frequency_hz, result.frequency_hz):
         return (
             f"its estimate has {len(result.frequency_hz)} bins from {result.frequency_hz[0]:g} Hz, "
             f"but that of {common.path} {len(common.frequency_hz)} from "

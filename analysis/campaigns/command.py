@@ -25,6 +25,7 @@ def campaign_command(
     *,
     structures: Sequence[str],
     fixed: Sequence[Setting] = (),
+    band_hz: tuple[float, float] | None = None,
     report: Path | None = None,
     json: Path | None = None,
     jobs: int | None = None,
@@ -42,6 +43,8 @@ def campaign_command(
         Types fitted to the whole records.
     fixed : sequence of str
         Settings that those fits take from the files.
+    band_hz : tuple of float, optional
+        Of all fits; by default what suits each record.
     report : Path, optional
         Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
         exists ``campaign.report-2`` and so on.
@@ -79,8 +82,9 @@ def campaign_command(
     first = files[0] if report is not None else files[0].with_name(_NAME)
     (folder,) = report_folders([first], report)
     run = partial(
-        campaign, files, settings, structures=structures, fixed=fixed, jobs=jobs, dask=dask
-    )
+        campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
+        dask=dask,
+    )  # fmt: skip
     found = _analysed(run, len(files), folder, with_paper=with_paper)
     to_stdout = json is not None and str(json) == "-"
     console = Console(stderr=to_stdout, highlight=False)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
+from analysis.campaigns.headlines import headlines
 from analysis.campaigns.rows import all_tables
 from analysis.structures import STRUCTURES
 
@@ -28,11 +29,11 @@ def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[s
     Returns
     -------
     dict
-        ``verdict`` on all sessions (null without whole-record estimates), ``files`` with each
-        one's own, ``errors`` (files left out, and why), ``one_specimen`` and the ``groups`` in
-        which sessions lie if they are not, ``trials`` of the validation asked, done and lost,
-        ``fits`` and ``modes`` as of single sessions, and the tables by the names of their CSV
-        files. Finite numbers only.
+        ``headlines`` of each session and, with ``file`` null, of all together; ``verdict`` on all
+        sessions (null without whole-record estimates), ``files`` with each one's own, ``errors``
+        (files left out, and why), ``one_specimen`` and the ``groups`` in which sessions lie if they
+        are not, ``trials`` of the validation asked, done and lost, ``fits`` and ``modes`` as of
+        single sessions, and the tables by the names of their CSV files. Finite numbers only.
     """
     leading = campaign.homogeneity.leading
     content: dict[str, Any] = _plain(
@@ -42,6 +43,7 @@ def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[s
                 "python": platform.python_version(),
                 "numpy": np.__version__,
             },
+            "headlines": headlines(campaign),
             "verdict": None if campaign.verdict is None else asdict(campaign.verdict),
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
             "files": [

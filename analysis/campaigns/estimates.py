@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     from rigd.beam import Damping
 
 
-def structure_name(structure: str, uniform: bool) -> str:
-    """Name a structure on a uniform beam, or on one whose modes each have a stiffness of theirs."""
-    return structure if uniform else f"{structure}, modes free"
-
-
 @dataclass(frozen=True, slots=True)
 class WelchFit:
     """One structure fitted to one session by the paper's route, with one weighting.
@@ -79,6 +74,8 @@ class RecordEstimate:
         Its name.
     uniform : bool
         Whether all modes follow from one stiffness.
+    beam : str
+        What follows the structure in its name: nothing on a uniform beam without more.
     plant : Plant
     parameters : dict of str to float
         See `analysis.whole_record.RecordFit`, as for the following.
@@ -102,6 +99,7 @@ class RecordEstimate:
 
     structure: str
     uniform: bool
+    beam: str
     plant: Plant
     parameters: Mapping[str, float]
     std: Mapping[str, float | None]
@@ -119,7 +117,7 @@ class RecordEstimate:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return structure_name(self.structure, self.uniform)
+        return f"{self.structure}{self.beam}"
 
     @property
     def free(self) -> frozenset[str]:
@@ -133,6 +131,7 @@ class RecordEstimate:
         return cls(
             structure=fit.structure.name,
             uniform=candidate.uniform,
+            beam=candidate.name.removeprefix(fit.structure.name),
             plant=fit.plant,
             parameters=dict(fit.parameters),
             std=dict(fit.std),

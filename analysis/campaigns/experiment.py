@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -13,8 +14,11 @@ if TYPE_CHECKING:
     from analysis.record import Record
 
 _STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s")
-_OF_SPECIMEN: Final = ("beam_length_m", "beam_density_kg_per_m", "beam_bending_stiffness_n_m2",
-                       "tool_inertia_kg_m2")  # fmt: skip
+LABEL: Final = "specimen"
+"""Key of what the operator calls the specimen."""
+
+_OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
+                       "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
 _UNITS: Final = {"beam_length_m": "m", "beam_density_kg_per_m": "kg/m",
                  "beam_bending_stiffness_n_m2": "N·m²", "tool_inertia_kg_m2": "kg·m²",
                  "amplitude_rad": "rad", "start_hz": "Hz", "stop_hz": "Hz", "duration_s": "s",
@@ -35,19 +39,28 @@ class Experiment:
         How long the sweep in the file is.
     identity : tuple of str
         By which a copy of the file is recognised: the session's, or without one the file's path.
+    start_utc : str
+        When it was recorded, to the second; empty if the file does not say.
+    operator, note : str
+        What the file says of either, or nothing.
     """
 
     facts: Mapping[str, str | float]
     sweep_s: float
     identity: tuple[str, ...]
+    start_utc: str = ""
+    operator: str = ""
+    note: str = ""
 
     @classmethod
     def of(cls, record: Record) -> Experiment:
         """Collect what a record states."""
         beam, metadata = record.beam, record.metadata
         stated = {key: _number(metadata[key]) for key in _STATED if key in metadata}
+        label = metadata.get(LABEL, "").strip()
         return cls(
             facts={
+                **({LABEL: label} if label else {}),
                 "beam_length_m": beam.length_m,
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
@@ -60,7 +73,15 @@ class Experiment:
                 if {"id", "start_utc_ns"} <= metadata.keys()
                 else (str(record.path.resolve()),)
             ),
+            start_utc=_time(metadata.get("start_utc_ns", "")),
+            operator=metadata.get("operator", "").strip(),
+            note=metadata.get("note", "").strip(),
         )
+
+    @property
+    def label(self) -> str:
+        """What the file calls the specimen; empty if nothing."""
+        return str(self.facts.get(LABEL, ""))
 
     def unfinished(self, outcome: str) -> str:
         """Say that the sweep ended early, as the end of a sentence; empty if it did not."""
@@ -135,6 +156,21 @@ def stated_specimens(
     )
 
 
+def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Tell the unlabelled from the labelled where there are several labels.
+
+    With one label alone, a session without it is taken for the same specimen. With several nobody
+    knows which of them it is.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    """
+    if len({each.label for each in experiments if each.label}) < 2:
+        return list(experiments)
+    return [replace(each, facts={LABEL: each.label, **each.facts}) for each in experiments]
+
+
 def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
     """Keys in which specimens differ."""
     first = specimens[0].facts
@@ -160,8 +196,16 @@ def _same(one: str | float, two: str | float) -> bool:
 def told(key: str, value: str | float) -> str:
     """Write a fact with its unit."""
     if isinstance(value, str):
-        return value
+        return (f"“{value}”" if value else "not stated") if key == LABEL else value
     return f"{value:g} {_UNITS.get(key, '')}".rstrip()
+
+
+def _time(utc_ns: str) -> str:
+    """Write the wall clock's time as in ISO 8601, to the second; nothing where there is none."""
+    try:
+        return f"{datetime.fromtimestamp(int(utc_ns) // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"
+    except (ValueError, OverflowError, OSError):
+        return ""
 
 
 def _number(text: str) -> str | float:

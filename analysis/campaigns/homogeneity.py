@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.campaigns.common_structure import common_structure, freest_estimate
 from analysis.campaigns.random_effects import chance_of, random_effects
 from analysis.whole_record.plant import LOGARITHMIC
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.campaigns.estimates import RecordEstimate
     from analysis.campaigns.experiment import StatedSpecimen
     from analysis.campaigns.pooled import PooledEstimate
     from analysis.campaigns.session import SessionResult
@@ -105,11 +107,14 @@ class Homogeneity:
     specimens : tuple of StatedSpecimen
         That the files state, the one of this campaign first.
     quantities : tuple of Heterogeneity
-        Modes, of each session's own structure, then parameters of the structure selected.
+        Modes, then parameters, all by the structure by which sessions are compared.
+    structure : str or None
+        Its name, as tables call it; None without whole-record fits.
     """
 
     specimens: tuple[StatedSpecimen, ...]
     quantities: tuple[Heterogeneity, ...]
+    structure: str | None = None
 
     @property
     def leading(self) -> Heterogeneity | None:
@@ -143,7 +148,7 @@ def homogeneity(
     pooled: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
-    """Judge whether sessions are of one specimen.
+    """Judge whether sessions are of one specimen, all by one structure (`common_structure`).
 
     Parameters
     ----------
@@ -152,45 +157,48 @@ def homogeneity(
         The lowest BIC first.
     specimens : sequence of StatedSpecimen
     """
-    every = dict(_of_modes(sessions))
-    if pooled:
-        every |= dict(_of_parameters(sessions, pooled[0]))
-    every = {name: values for name, values in every.items() if len(values) >= _FEWEST}
+    name = common_structure(sessions, pooled)
+    by_name = [
+        (session.path.name, each)
+        for session in sessions
+        for each in session.record_estimates
+        if each.name == name
+    ]
+    every = dict(_of_modes(by_name))
+    shared = freest_estimate(pooled)
+    if shared is not None:
+        every |= dict(_of_parameters(sessions, shared))
+    every = {quantity: values for quantity, values in every.items() if len(values) >= _FEWEST}
     level = SIGNIFICANT / max(len(every), 1)
     return Homogeneity(
-        tuple(specimens), tuple(_judged(name, values, level) for name, values in every.items())
+        tuple(specimens),
+        tuple(_judged(quantity, values, level) for quantity, values in every.items()),
+        name,
     )
 
 
-def _of_modes(sessions: Sequence[SessionResult]) -> Iterator[tuple[str, Values]]:
-    """Yield frequencies and damping ratios by the structure that each session selects itself.
-
-    So none is left out for not determining the one that all together select.
-    """
-    own = [
-        (session.path.name, min(session.record_estimates, key=lambda each: each.bic).modes)
-        for session in sessions
-        if session.record_estimates
-    ]
+def _of_modes(estimates: Sequence[tuple[str, RecordEstimate]]) -> Iterator[tuple[str, Values]]:
+    """Yield frequencies and damping ratios of the modes that all sessions have."""
+    count = min((len(each.modes) for _, each in estimates), default=0)
     for quantity, std in _OF_MODES.items():
-        for place in range(min((len(modes) for _, modes in own), default=0)):
+        for place in range(count):
             values = (
-                (name, getattr(modes[place], quantity), getattr(modes[place], std))
-                for name, modes in own
+                (file, getattr(each.modes[place], quantity), getattr(each.modes[place], std))
+                for file, each in estimates
             )
             yield f"{quantity}_{place + 1}", _known(values)
 
 
 def _of_parameters(
-    sessions: Sequence[SessionResult], best: PooledEstimate
+    sessions: Sequence[SessionResult], shared: PooledEstimate
 ) -> Iterator[tuple[str, Values]]:
-    for parameter in best.parameters:
+    for parameter in shared.parameters:
         name = parameter.name
         values = (
             (session.path.name, each.parameters[name], each.std[name] or 0.0)
             for session in sessions
             for each in session.record_estimates
-            if each.name == best.name and name in each.determined
+            if each.name == shared.name and name in each.determined
         )
         yield name, _known(values)
 

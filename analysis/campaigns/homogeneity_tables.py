@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from analysis.campaigns.homogeneity import Heterogeneity, Homogeneity
 
 _SPECIMENS: Final = "Specimens, as the files state them"
-_SCATTER: Final = (
-    "Sessions compared: modes by each one's own structure, parameters by that selected"
-)
 _SCATTER_NOTE: Final = (
     "Between sessions: scatter beyond their own uncertainties. I²: share of the variance that is "
     "such scatter. p: probability of so much by the uncertainties alone."
@@ -68,7 +65,7 @@ def _specimen_cells(found: Homogeneity) -> list[tuple[str, ...]]:
 
 def scatter_text_table(found: Homogeneity) -> rich.table.Table:
     """Scatter of each mode and parameter between sessions."""
-    table = text_table(_SCATTER)
+    table = text_table(_scatter(found))
     table.add_column("quantity")
     for heading in ("sessions", "mean", "between sessions", "in own std", "Q", "I²", "p"):
         table.add_column(heading, justify="right")
@@ -87,7 +84,7 @@ def scatter_table(found: Homogeneity) -> Table:
     """Make the same for the page."""
     return Table(
         name="homogeneity",
-        caption=_SCATTER,
+        caption=_scatter(found),
         columns=(
             Column("quantity", "quantity", numeric=False), Column("sessions", "sessions"),
             Column("mean", "mean"), Column("between sessions", "between_std"),
@@ -107,6 +104,11 @@ def scatter_table(found: Homogeneity) -> Table:
         ),
         notes=(_SCATTER_NOTE, *([MIXTURE_NOTE] if found.mixed else [])),
     )  # fmt: skip
+
+
+def _scatter(found: Homogeneity) -> str:
+    by = f", all by type {found.structure}" if found.structure else ""
+    return f"Sessions compared{by}"
 
 
 def _name(each: Heterogeneity) -> str:

@@ -95,6 +95,8 @@ def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
 def nominal_models(sessions: Sequence[SessionResult]) -> tuple[NominalModel, ...]:
     """Nominal model of every type and weighting, compared with every session."""
     first = sessions[0]
+    if not first.frequency_hz.size:
+        return ()
     frequency_hz, beam = first.frequency_hz, first.beam
     model = FrequencyResponseModel(frequency_hz, beam, first.tool_inertia_kg_m2)
     return tuple(

@@ -11,6 +11,7 @@ import numpy as np
 import rigd
 from analysis.campaigns import homogeneity_tables, page_tables
 from analysis.campaigns.page_paper_tables import paper_tables
+from analysis.campaigns.session_list import session_list_table
 from analysis.campaigns.tables import likely_estimates, without_verdict
 from analysis.report.html.markup import Markup, element, section, table, void
 from analysis.report.html.page import STYLE
@@ -60,6 +61,7 @@ def campaign_page(
         for name, title in _CONTENTS
         if (name != "verdict" or campaign.verdict or without_verdict(campaign))
         and (name != "figures" or shown)
+        and (name != "paper" or campaign.nominal)
     }
     links = [element("li", element("a", title, href=f"#{name}")) for name, title in titles.items()]
     title = f"Campaign of {len(campaign.sessions)} sessions"
@@ -88,7 +90,9 @@ def campaign_page(
             section(
                 "paper", titles["paper"], *of_paper,
                 *map(table, paper_tables(campaign, with_paper=with_paper)),
-            ),
+            )
+            if "paper" in titles
+            else "",
             section("how", titles["how"], *_how(campaign, made_at)),
         ),
     )  # fmt: skip
@@ -125,13 +129,13 @@ def _warnings(campaign: Campaign) -> Markup:
 def _tables(campaign: Campaign) -> list[Markup]:
     withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     found = campaign.homogeneity
-    made = []
+    made = [session_list_table(campaign)]
     if len(found.specimens) > 1:
         made.append(homogeneity_tables.specimens_table(found))
     if found.mixed:
         made.append(homogeneity_tables.scatter_table(found))
     for place, each in enumerate(likely_estimates(campaign)):
-        made.append(page_tables.parameters_table(each, campaign, withheld, first=place == 0))
+        made.append(page_tables.parameters_table(each, campaign, withheld))
         if place == 0 and each.modes:
             made.append(page_tables.modes_table(each, found))
     if campaign.structures:
@@ -169,7 +173,11 @@ def _how(campaign: Campaign, made_at: datetime) -> list[Markup]:
                     "random effects: sessions with their own covariances, and a scatter of each "
                     "parameter between them (DerSimonian and Laird); Student's t",
                 ),
-                ("selection", "lowest Bayesian information criterion of all sessions together"),
+                (
+                    "structure",
+                    "the freest on the beam of the lowest Bayesian information criterion of all "
+                    "sessions together, the same for all sessions",
+                ),
             ],
         ),
         (
@@ -192,6 +200,8 @@ def _how(campaign: Campaign, made_at: datetime) -> list[Markup]:
             ],
         ),
     ]
+    if not campaign.nominal:
+        del parts[2]
     if not campaign.sessions[0].record_estimates:
         del parts[1]
     return [_facts(title, facts) for title, facts in parts]

@@ -19,7 +19,9 @@ _STATISTICS: Final = ("mean", "median", "std", "min", "max")
 
 
 def paper_tables(campaign: Campaign, *, with_paper: bool) -> tuple[Table, ...]:
-    """Tables 3 to 5; on request with the paper's own numbers in columns of their own."""
+    """Tables 3 to 5, if there are Welch fits; on request with the paper's own numbers beside."""
+    if not campaign.nominal:
+        return ()
     return (
         _table_3(campaign, with_paper=with_paper),
         _table_4(campaign, with_paper=with_paper),

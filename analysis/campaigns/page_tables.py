@@ -10,7 +10,7 @@ import numpy as np
 from analysis.campaigns import sentences
 from analysis.campaigns.labels import label, probability, with_unit
 from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
-from analysis.campaigns.tables import NOT_POOLED, used
+from analysis.campaigns.tables import NOT_POOLED, role, used
 from analysis.campaigns.validation import by_model
 from analysis.report.html.reported import footnotes, greyed, marked, unreported
 from analysis.report.html.table import Column, Table, count, estimate, number
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 
 def parameters_table(
-    pooled: PooledEstimate, campaign: Campaign, withheld: Collection[str], *, first: bool
+    pooled: PooledEstimate, campaign: Campaign, withheld: Collection[str]
 ) -> Table:
-    """Pooled estimate of one structure; the first one is the selected."""
+    """Pooled estimate of one structure."""
     rows: list[tuple[Cell, ...]] = []
     found = campaign.homogeneity
     doubtful = unreported(STRUCTURES[pooled.structure], withheld)
@@ -58,11 +58,11 @@ def parameters_table(
         notes += footnotes(withheld)
     if any(found.is_mixed(each.name) for each in pooled.parameters):
         notes.append(MIXTURE_NOTE)
-    what = "selected" if first else "cannot be told from it"
     return Table(
         name=f"pooled_{pooled.name.replace(', ', '_').replace(' ', '_')}",
         caption=title(
-            f"Pooled over {used(pooled, campaign)}: type {pooled.name} ({what})", found
+            f"Pooled over {used(pooled, campaign)}: type {pooled.name} ({role(pooled, campaign)})",
+            found,
         ),
         columns=(
             Column("parameter", "parameter", numeric=False),
@@ -88,7 +88,7 @@ def _marked(text: str, quantity: str, found: Homogeneity) -> str:
 
 
 def modes_table(pooled: PooledEstimate, found: Homogeneity) -> Table:
-    """Modes of the selected structure."""
+    """Modes of the structure that the numbers are of."""
     rows = []
     mixed = False
     for mode in pooled.modes:

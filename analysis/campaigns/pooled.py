@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns.estimates import structure_name
 from analysis.campaigns.pooled_modes import PooledMode, pooled_modes
-from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile_95
+from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile
 from analysis.structures import STRUCTURES
 from analysis.whole_record import SETTINGS, Plant
 from analysis.whole_record.plant import LOGARITHMIC
+from analysis.whole_record.uncertainty import damping_size
 from rigd.beam import Beam
 
 if TYPE_CHECKING:
@@ -23,8 +23,13 @@ if TYPE_CHECKING:
 
     from analysis.campaigns.estimates import RecordEstimate
     from analysis.campaigns.session import SessionResult
+    from analysis.selection.profile import Order
 
 _FEWEST: Final = 2
+_DAMPINGS: Final[tuple[tuple[str, str, Order], ...]] = (
+    ("internal", "zeta", "alpha"),
+    ("external", "gamma", "lambda"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +68,32 @@ class PooledParameter:
 
 
 @dataclass(frozen=True, slots=True)
+class PooledSize:
+    """Size of one damping over all sessions, where it does not depend on its order.
+
+    Attributes
+    ----------
+    damping : str
+        "internal" or "external".
+    order : str
+        "alpha" or "lambda".
+    omega_rad_s : float or None
+        That frequency; None if the order is fixed: then the size is the coefficient.
+    value, std : float
+        ``zeta omega^alpha`` (no unit) or ``gamma omega^lambda`` (1/m⁴).
+    interval : (float, float)
+        95 %.
+    """
+
+    damping: str
+    order: Order
+    omega_rad_s: float | None
+    value: float
+    std: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
 class PooledEstimate:
     """One structure over all sessions.
 
@@ -72,10 +103,14 @@ class PooledEstimate:
         Name.
     uniform : bool
         Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
+    beam : str
+        As of `RecordEstimate`.
     plant : Plant
         Of the pooled parameters.
     parameters : tuple of PooledParameter
         Those that every session used determines.
+    covariance : ndarray, shape (k, k)
+        Of these, positive ones as logarithms.
     modes : tuple of PooledMode
     sessions : int
         Used: those that determine the structure's damping.
@@ -89,8 +124,10 @@ class PooledEstimate:
 
     structure: str
     uniform: bool
+    beam: str
     plant: Plant
     parameters: tuple[PooledParameter, ...]
+    covariance: NDArray[np.float64]
     modes: tuple[PooledMode, ...]
     sessions: int
     misfit: float
@@ -99,7 +136,21 @@ class PooledEstimate:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return structure_name(self.structure, self.uniform)
+        return f"{self.structure}{self.beam}"
+
+    @property
+    def sizes(self) -> tuple[PooledSize, ...]:
+        """Sizes of the dampings that all sessions together determine."""
+        names = tuple(each.name for each in self.parameters)
+        t, found = t_quantile(0.95, self.sessions - 1), []
+        for damping, coefficient, order in _DAMPINGS:
+            size = damping_size(coefficient, order, self.plant.parameters, names, self.covariance)
+            if size is not None:
+                factor = math.exp(t * size.std / size.value)
+                ends = size.value / factor, size.value * factor
+                at = PooledSize(damping, order, size.omega_rad_s, size.value, size.std, ends)
+                found.append(at)
+        return tuple(found)
 
     @property
     def by_name(self) -> dict[str, PooledParameter]:
@@ -143,7 +194,7 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
     within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
-    t = t_quantile_95(len(used) - 1)
+    t = t_quantile(0.95, len(used) - 1)
     chances = chance_of(effects.cochran_q, len(used))
     columns = (effects.mean, std, within, effects.between_std, chances)
     parameters = tuple(
@@ -154,8 +205,10 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     return PooledEstimate(
         structure=used[0].structure,
         uniform=used[0].uniform,
+        beam=used[0].beam,
         plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
         parameters=parameters,
+        covariance=effects.covariance,
         modes=pooled_modes(used),
         sessions=len(used),
         misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used])),
@@ -242,4 +295,5 @@ def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
         stiffness_offsets=tuple(
             values[name] for name in like.parameters if name.startswith("stiffness_offset")
         ),
+        **{name: values.get(name, own) for name, own in like.plant.extras.items()},
     )

@@ -26,11 +26,12 @@ _POOLED: Final = "#C3DCED"
 
 
 def pooled_figure(campaign: Campaign) -> Figure:
-    """Draw each session's estimate with its 95 % interval over the pooled one, best structure."""
+    """Draw each session's estimate with its 95 % interval over the pooled one, freest structure."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    estimate = campaign.pooled[0]
+    estimate = campaign.headline
+    assert estimate is not None
     withheld = campaign.verdict.withheld if campaign.verdict else ()
     doubtful = unreported(STRUCTURES[estimate.structure], withheld)
     note = f"  ·  {MARK} not reported: the data do not support it" if doubtful else ""
@@ -44,7 +45,7 @@ def pooled_figure(campaign: Campaign) -> Figure:
             f"{used(estimate, campaign)} — pooled whole-record estimate, type {estimate.name}",
             campaign.homogeneity,
         ),
-        f"type of the lowest BIC; its residual is {estimate.misfit:.3g} times the noise  ·  "
+        f"freest type that the sessions support, residual {estimate.misfit:.3g} times the noise ·  "
         "p: probability of so much scatter if sessions differed by their own uncertainty alone"
         f"{note}",
     )  # fmt: skip

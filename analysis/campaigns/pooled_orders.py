@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.selection.orders import EVEN, STRONG
+from analysis.campaigns.common_structure import freest_estimate
+from analysis.campaigns.random_effects import t_quantile
+from analysis.selection.orders import STRONG
 from analysis.selection.profile import WIDEST_SHARE
 from analysis.structures import STRUCTURES
 from analysis.unknowns import ORDER_RANGE
@@ -17,43 +19,53 @@ if TYPE_CHECKING:
     from analysis.campaigns.homogeneity import Homogeneity
     from analysis.campaigns.pooled import PooledEstimate, PooledParameter
     from analysis.selection import Verdict
-    from analysis.selection.orders import Status
     from analysis.selection.profile import Order
 
+PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
+
 _ADEQUATE: Final = 0.9
-"""Share of the sessions that must leave nothing but noise before a fractional order is reported."""
+"""Share of the sessions that must leave nothing but noise before an order is reported."""
+
+_SURE: Final = 0.999
+"""Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
+
+_ONE: Final = ("compatible", "integer")
+"""What a session says of an order that may be 1."""
+
+_FEW_MODES: Final = "one mode alone shows how much damping there is, not of which order"
 
 
 @dataclass(frozen=True, slots=True)
 class PooledOrder:
-    """One order of the damping over all sessions.
+    """One order of the damping over all sessions, in the freest structure.
 
     Attributes
     ----------
     order : str
         "alpha" or "lambda".
     status : str
-        As of one record: see `analysis.selection.OrderVerdict`.
+        "compatible": the 95 % interval holds 1; "fractional": 1 is excluded; "open": 1 is doubtful
+        but not excluded, or something else explains as much; "not identifiable": it could be almost
+        anything; "absent": such damping does not show.
     value : float or None
-        To be used further: 1, the pooled estimate, or none.
+        Pooled estimate, where the order is identifiable.
     interval : tuple of float or None
-        95 % of the pooled estimate with the order free, scatter between sessions included; None if
-        no structure that the sessions determine has it free, or they say next to nothing.
-    estimate : float or None
-        In the middle of that interval, whether it may be used or not.
+        Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
+    reason : str or None
+        Why the number must not be taken for a property of the specimen; None: it may.
     alone : mapping of str to int
         How many sessions say what by themselves.
     mixture : bool
-        Whether it is withheld because sessions differ in it in kind, or are of different specimens
-        and do not all determine it (or, with nothing pooled to go by, say the same).
+        Whether the reason is that sessions differ in it in kind, or are of different specimens and
+        do not all determine it.
     """
 
     order: Order
-    status: Status
+    status: PooledStatus
     value: float | None
     interval: tuple[float, float] | None
-    estimate: float | None
-    alone: Mapping[Status, int]
+    reason: str | None
+    alone: Mapping[str, int]
     mixture: bool = False
 
 
@@ -69,59 +81,69 @@ def pooled_order(
     ----------
     order : str
     ranked : sequence of PooledEstimate
-        The lowest BIC first.
+        The lowest BIC first; not empty.
     verdicts : sequence of Verdict
         Of the sessions.
     alike : Homogeneity
         Whether they are of one specimen.
     """
     each = [verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts]
-    alone = dict(Counter(one.status for one in each).most_common())
-    shared = _where_free(order, ranked)
-    free = shared.by_name.get(order) if shared else None
-    known = free is not None and _wide(free.interval) <= WIDEST_SHARE
-    status = _status(order, ranked, free if known else None, verdicts, alone)
-    estimate, interval = (free.value, free.interval) if free and known else (None, None)
-    if status in ("not identifiable", "absent"):
-        estimate = interval = None
-    some = len(alone) > 1 if shared is None else shared.sessions < len(verdicts)
-    mixture = status in ("compatible", "fractional", "open") and (
-        alike.is_mixed(order) or (alike.mixed and some)
-    )
+    alone: dict[str, int] = dict(Counter(str(one.status) for one in each).most_common())
+    freest = freest_estimate(ranked)
+    assert freest is not None
+    free = freest.by_name.get(order)
+    status, reason = _judged(order, ranked, freest, verdicts, alone)
+    known = free is not None and status not in ("not identifiable", "absent")
+    mixture = known and (alike.is_mixed(order) or (alike.mixed and freest.sessions < len(verdicts)))
     if mixture:
         status = "open"
-    value = {"compatible": 1.0, "fractional": estimate}.get(status)
-    return PooledOrder(order, status, value, interval, estimate, alone, mixture)
+        reason = "the sessions are not of one specimen and do not all share it"
+    return PooledOrder(
+        order=order,
+        status=status,
+        value=free.value if free and known else 1.0 if status == "compatible" else None,
+        interval=free.interval if free and known else None,
+        reason=reason,
+        alone=alone,
+        mixture=mixture,
+    )
 
 
-def _status(
+def _judged(
     order: Order,
     ranked: Sequence[PooledEstimate],
-    free: PooledParameter | None,
+    freest: PooledEstimate,
     verdicts: Sequence[Verdict],
-    alone: Mapping[Status, int],
-) -> Status:
-    best = ranked[0]
-    structure = STRUCTURES[best.structure]
+    alone: Mapping[str, int],
+) -> tuple[PooledStatus, str | None]:
+    structure = STRUCTURES[freest.structure]
+    modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
+    if not several_modes:
+        return "not identifiable", _FEW_MODES
     if ("zeta" if order == "alpha" else "gamma") not in structure.free:
-        return "absent" if several_modes else "not identifiable"
-    # One mode shows how much damping there is, and nothing of how that goes with frequency.
-    if order == "alpha" and not several_modes:
-        return "not identifiable"
-    if free is None:
-        # Nothing pooled to go by: with a stiffness for each mode no structure has alpha free.
-        fixed = structure.fixed.get(order) == 1.0
-        return "compatible" if fixed and next(iter(alone)) == "compatible" else "not identifiable"
+        return "absent", "no such damping shows"
+    free = freest.by_name.get(order)
+    if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) in _ONE:
+        # None of those fitted has it free: the sessions' own verdicts are all that there is.
+        return "compatible", None
+    if free is None or _wide(free.interval) > WIDEST_SHARE:
+        return "not identifiable", "the sessions do not tell the order"
+    if not freest.uniform and len(structure.free) > modes:
+        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
+        return "not identifiable", (
+            f"on a beam that is not uniform it rests on {modes} loss factors alone"
+        )
+    if sum(v.adequate for v in verdicts) < _ADEQUATE * len(verdicts):
+        return "open", "part of the records is unexplained"
+    integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]
+    if any(each.beam != freest.beam for each in integer):
+        return "open", "order 1 on another kind of beam explains the records about as well"
     low, high = free.interval
     if low <= 1 <= high:
-        return "compatible"
-    if order not in structure.free:
-        undecided = any(order in STRUCTURES[r.structure].free for r in rivals(ranked, EVEN))
-        return "open" if undecided else "compatible"
-    adequate = sum(v.adequate for v in verdicts) >= _ADEQUATE * len(verdicts)
-    integer = any(STRUCTURES[r.structure].fixed.get(order) == 1.0 for r in rivals(ranked, STRONG))
-    return "fractional" if adequate and not integer else "open"
+        return "compatible", None
+    excluded = not integer and _excludes_one(free, freest.sessions)
+    return ("fractional" if excluded else "open"), None
 
 
 def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
@@ -129,14 +151,14 @@ def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstim
     return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
 
 
-def _where_free(order: Order, ranked: Sequence[PooledEstimate]) -> PooledEstimate | None:
-    """Find where the order is estimated: in the best structure, or the simplest beyond it."""
-    best = ranked[0]
-    wanted = {*STRUCTURES[best.structure].free, order}
-    for each in sorted(ranked, key=lambda each: len(STRUCTURES[each.structure].free)):
-        if each.uniform == best.uniform and wanted <= set(STRUCTURES[each.structure].free):
-            return each
-    return None
+def _integer(estimate: PooledEstimate, order: Order) -> bool:
+    """Whether a structure has this damping with an order of 1."""
+    return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
+
+
+def _excludes_one(order: PooledParameter, sessions: int) -> bool:
+    """Whether 1 lies outside the interval of the level at which it is called excluded."""
+    return abs(order.value - 1) > t_quantile(_SURE, sessions - 1) * order.std
 
 
 def _wide(interval: tuple[float, float]) -> float:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.campaigns.estimates import structure_name
 from analysis.campaigns.pooled import by_structure, determines_damping, pooled_bic
 
 if TYPE_CHECKING:
@@ -26,6 +25,8 @@ class RankedStructure:
     ----------
     structure : str
     uniform : bool
+    beam : str
+        As of `RecordEstimate`.
     fitted : int
         Sessions to which it was fitted.
     determined : int
@@ -43,6 +44,7 @@ class RankedStructure:
 
     structure: str
     uniform: bool
+    beam: str
     fitted: int
     determined: int
     selected_alone: int
@@ -53,7 +55,7 @@ class RankedStructure:
     @property
     def name(self) -> str:
         """As tables call it."""
-        return structure_name(self.structure, self.uniform)
+        return f"{self.structure}{self.beam}"
 
 
 def ranked_structures(
@@ -77,6 +79,7 @@ def ranked_structures(
         RankedStructure(
             structure=each[0].structure,
             uniform=each[0].uniform,
+            beam=each[0].beam,
             fitted=len(each),
             determined=sum(map(determines_damping, each)),
             selected_alone=alone[name],

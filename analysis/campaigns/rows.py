@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.campaigns import paper
 from analysis.campaigns.nominal import best_models
+from analysis.campaigns.session_list import session_list_rows
 from analysis.report.html.reported import unreported
 from analysis.structures import STRUCTURES
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from analysis.campaigns.campaign import Campaign
+    from analysis.campaigns.pooled import PooledEstimate
 
 Row = dict[str, Any]
 
@@ -134,7 +136,7 @@ def candidate_rows(campaign: Campaign) -> list[Row]:
 
 
 def mode_rows(campaign: Campaign) -> list[Row]:
-    """Modes over all sessions, of the structure selected."""
+    """Modes over all sessions, of the structure that the numbers are of."""
     mixed = campaign.homogeneity.is_mixed
     return [
         asdict(mode)
@@ -142,8 +144,7 @@ def mode_rows(campaign: Campaign) -> list[Row]:
             "frequency_mixture": mixed(f"frequency_hz_{mode.number}"),
             "damping_ratio_mixture": mixed(f"damping_ratio_{mode.number}"),
         }
-        for estimate in campaign.pooled[:1]
-        for mode in estimate.modes
+        for mode in (campaign.headline.modes if campaign.headline else ())
     ]
 
 
@@ -182,11 +183,13 @@ def specimen_rows(campaign: Campaign) -> list[Row]:
 
 
 def pooled_rows(campaign: Campaign) -> list[Row]:
-    """Pooled whole-record estimates, the lowest BIC first; empty values of what is not pooled."""
+    """Pooled whole-record estimates, the headline's first; empty values of what is not pooled."""
     return _pooled_rows(campaign) + [
         {
             "type": each.structure,
             "uniform": each.uniform,
+            "name": each.name,
+            "headline": False,
             "sessions": each.determined,
             "misfit": each.misfit,
             "parameter": parameter,
@@ -198,6 +201,11 @@ def pooled_rows(campaign: Campaign) -> list[Row]:
     ]
 
 
+def headline_first(campaign: Campaign) -> list[PooledEstimate]:
+    """Pooled estimates: the one that the numbers are of, then the lowest BIC first."""
+    return sorted(campaign.pooled, key=lambda each: each is not campaign.headline)
+
+
 def _pooled_rows(campaign: Campaign) -> list[Row]:
     withheld = campaign.verdict.withheld if campaign.verdict else ()
     mixed = campaign.homogeneity.is_mixed
@@ -205,6 +213,8 @@ def _pooled_rows(campaign: Campaign) -> list[Row]:
         {
             "type": estimate.structure,
             "uniform": estimate.uniform,
+            "name": estimate.name,
+            "headline": estimate is campaign.headline,
             "sessions": estimate.sessions,
             "bic": estimate.bic,
             "misfit": estimate.misfit,
@@ -221,7 +231,7 @@ def _pooled_rows(campaign: Campaign) -> list[Row]:
             "reported": each.name not in unreported(STRUCTURES[estimate.structure], withheld),
             "mixture": mixed(each.name),
         }
-        for estimate in campaign.pooled
+        for estimate in headline_first(campaign)
         for each in estimate.parameters
     ]
 
@@ -255,6 +265,7 @@ def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, lis
         for name, make in with_numbers.items()
     }
     found |= {
+        "session_list": session_list_rows(campaign),
         "sessions_welch": session_rows(campaign),
         "sessions_record": record_rows(campaign),
         "structures": candidate_rows(campaign),

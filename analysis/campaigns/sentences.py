@@ -10,14 +10,17 @@ from analysis.campaigns.labels import label
 from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from analysis.campaigns.pooled import PooledEstimate
     from analysis.campaigns.pooled_modes import PooledMode
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.validation import LeftOutError, LostTrial
+    from analysis.selection.profile import Order
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
+_SIZES: Final = {"internal": ("ζω^α", ""), "external": ("γω^λ", " m⁻⁴")}
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
@@ -27,20 +30,60 @@ _MANY: Final = 5
 _AS_GOOD: Final = 1.01
 
 
+def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
+    """Say of which structure the numbers are, and which simpler one would do.
+
+    Parameters
+    ----------
+    freest : PooledEstimate
+        On the beam that all sessions support.
+    best : PooledEstimate
+        Of the lowest BIC.
+    """
+    given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
+    are = "is" if len(given) == 1 else "are"
+    so = (
+        f", and takes for granted that {' and '.join(given)} {are} 1."
+        if given
+        else ", so its intervals hold whichever simpler one is true."
+    )
+    said = (
+        f"The numbers are those of type {freest.name}: damping {_damping(freest.structure)}"
+        f"{_on_beam(freest)}. It is the freest structure that the sessions determine{so}"
+    )
+    if best.name != freest.name:
+        said += (
+            f" Of all together type {best.name} has the lowest BIC (damping "
+            f"{_damping(best.structure)}{_on_beam(best)}); what it gives is narrower and holds on "
+            "that condition only."
+        )
+    return said
+
+
+def sizes(freest: PooledEstimate) -> list[str]:
+    """Say how large each damping is where it does not depend on its order."""
+    said = []
+    for each in freest.sizes:
+        if each.omega_rad_s is None:
+            continue
+        low, high = each.interval
+        symbol, unit = _SIZES[each.damping]
+        said.append(
+            f"{symbol} = {each.value:.4g}{unit} (95 %: {low:.4g} to {high:.4g}) at "
+            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
+        )
+    return [f"Damping at the pivot frequency: {'; '.join(said)}."] if said else []
+
+
 def selected(
     ranked: Sequence[PooledEstimate],
     close: Sequence[PooledEstimate],
     alone: Mapping[str, int],
     sessions: int,
-    withheld: Collection[str],
 ) -> str:
-    """Say what all sessions together select, what it cannot be told from, and who agrees.
-
-    Orders withheld are called open.
-    """
+    """Say what all sessions together would select, what it cannot be told from, and who agrees."""
     best = ranked[0]
-    beam = "" if best.uniform else ", on a beam whose modes each have a stiffness of their own"
-    said = f"Type {best.name}: damping {_damping(best.structure, withheld)}{beam}."
+    said = f"Lowest BIC: type {best.name}."
     if close:
         names = " or ".join(f"type {each.name}" for each in close)
         said += (
@@ -49,8 +92,14 @@ def selected(
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
-        said += f" The next, type {ranked[1].name}, is worse by {margin:.3g} in BIC."
+        said += f" The next, type {ranked[1].name}, is worse by {margin:.3g}."
     return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
+
+
+def _on_beam(estimate: PooledEstimate) -> str:
+    modes = "" if estimate.uniform else ", on a beam whose modes each have a stiffness of their own"
+    more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
+    return f"{modes}, with {more}" if more else modes
 
 
 def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
@@ -61,17 +110,11 @@ def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
     return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
 
 
-def _damping(structure: str, withheld: Collection[str]) -> str:
+def _damping(structure: str) -> str:
     """Say which kinds of damping a structure has, and of which orders."""
     shape = STRUCTURES[structure]
-
-    def of_order(order: str) -> str:
-        if order in withheld:
-            return "an order that stays open"
-        return "an order of its own" if order in shape.free else "order 1"
-
     kinds = [
-        f"by the {what} (of {of_order(order)})"
+        f"by the {what} ({'order free' if order in shape.free else 'of order 1'})"
         for what, order, present in (
             ("material", "alpha", shape.internal),
             ("surroundings", "lambda", shape.external),
@@ -121,28 +164,24 @@ def order(found: PooledOrder) -> str:
     alone = " " + _alone(counts, sum(counts.values()), "say")
     if found.status == "absent":
         return f"No {of} shows, so its order {name} means nothing here.{alone}"
-    if found.status == "not identifiable":
-        return f"The order {name} of the {of} is not identifiable.{alone}"
-    low, high = found.interval or (1.0, 1.0)
-    ends = f"95 %: {low:.4f} to {high:.4f}, scatter between sessions included"
-    if found.status == "compatible":
-        free = f" ({ends}, if it is left free)" if found.interval else ""
-        chance = "" if low <= 1 <= high else ", and differs from 1 by no more than chance may"
-        said = f"is 1 as far as all sessions together tell{free}{chance}"
-    elif found.mixture:
-        pooled = f" ({found.estimate:.4f} over all that determine it)" if found.estimate else ""
-        said = (
-            f"stays open: the sessions are not of one specimen and do not all share it{pooled}; "
-            "it is not reported"
-        )
-    elif found.status == "fractional":
-        said = f"is {found.estimate:.4f} ({ends}); 1 is excluded"
-    else:
-        said = (
-            f"stays open: {found.estimate:.4f} would fit ({ends}), but so would an explanation of "
-            "order 1, or part of the records is unexplained; it is not reported"
-        )
-    return f"The order {name} of the {of} {said}.{alone}"
+    if found.status == "compatible" and found.interval is None:
+        return f"The order {name} of the {of} is taken to be 1, as it may be.{alone}"
+    if found.value is None or found.interval is None:
+        return f"The order {name} of the {of} is not identifiable: {found.reason}.{alone}"
+    low, high = found.interval
+    is_ = (
+        f"The order {name} of the {of} is {found.value:.4f} "
+        f"(95 %: {low:.4f} to {high:.4f}, scatter between sessions included)"
+    )
+    if found.reason is not None:
+        would = is_.replace(" is ", " would be ", 1)
+        return f"{would}, but {found.reason}; it is not reported.{alone}"
+    said = {
+        "compatible": "1 would do",
+        "fractional": "1 is excluded",
+        "open": "1 is doubtful, but not excluded",
+    }
+    return f"{is_}: {said[found.status]}.{alone}"
 
 
 def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:

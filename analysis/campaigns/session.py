@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from analysis.campaigns.errors import task_errors
-from analysis.campaigns.estimates import RecordEstimate, WelchFit, structure_name
+from analysis.campaigns.estimates import RecordEstimate, WelchFit
 from analysis.campaigns.experiment import Experiment
-from analysis.indices import fit_indices
+from analysis.indices import Indices, fit_indices
+from analysis.settings import RECORD_BAND_HZ, WelchSettings
+from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -20,10 +24,15 @@ if TYPE_CHECKING:
     from analysis.indices import Peak
     from analysis.record import Record
     from analysis.selection import Candidate, Verdict
-    from analysis.settings import WelchSettings
     from analysis.whole_record import Setting
     from rigd.beam import Beam
-    from rigd.spectral import FrequencyResponse
+
+
+_NO_RESPONSE: Final = FrequencyResponse(
+    np.zeros(0), np.zeros(0, dtype=np.complex128), coherence=None, segments=0, estimator="h1"
+)
+_USUAL: Final = WelchSettings()
+_NOT_COMPARED: Final = Indices(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,19 +57,25 @@ class SessionResult:
     tool_inertia_kg_m2, delay_s : float
         As the file states them; the delay is by how much the torque is older than the angle.
     frequency_hz : ndarray, shape (n,)
-        Bins in the band.
+        Bins in the band; none if Welch's method does not suit the session.
     response : ndarray of complex, shape (n,)
         Measured torque per angle in N·m/rad, without the channels' delays.
     peaks : tuple of Peak or None
         Measured resonant peaks, mode by mode.
     welch_fits : tuple of WelchFit
-        By type, then by weighting.
+        By type, then by weighting; none if Welch's method does not suit the session.
     record_estimates : tuple of RecordEstimate
         By type, those of a uniform beam first; empty if none was asked for, or the record could
         not be used.
     verdict : Verdict or None
         What the whole record says by itself, None without estimates.
     warnings : tuple of str
+    headline : mapping or None
+        What the session says first, as of a single file's document; None without a verdict.
+    settings : WelchSettings
+        As used.
+    record_band_hz : tuple of float
+        Of the whole-record fits.
     """
 
     path: Path
@@ -75,13 +90,26 @@ class SessionResult:
     record_estimates: tuple[RecordEstimate, ...]
     verdict: Verdict | None
     warnings: tuple[str, ...]
+    headline: Mapping[str, Any] | None = None
+    settings: WelchSettings = _USUAL
+    record_band_hz: tuple[float, float] = RECORD_BAND_HZ
+
+    def without_welch(self) -> SessionResult:
+        """Leave out what is there by Welch's method."""
+        return replace(
+            self,
+            frequency_hz=_NO_RESPONSE.frequency_hz,
+            response=_NO_RESPONSE.response,
+            peaks=(),
+            welch_fits=(),
+        )
 
     @property
     def selected(self) -> str | None:
         """Name of the structure that the session selects by itself, None without a verdict."""
         if self.verdict is None:
             return None
-        return structure_name(self.verdict.structure, self.verdict.uniform)
+        return min(self.record_estimates, key=lambda each: each.bic).name
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,23 +123,23 @@ class SessionTask:
         Names of those that are kept of the whole-record fits; without any there are none.
     fixed : tuple of str
         Settings that stay at the file's values in those fits.
-    record_band_hz : tuple of float
-        Band of those fits.
+    band_hz : tuple of float or None
+        Of all fits; None takes what suits each record.
     """
 
     settings: WelchSettings
     structures: tuple[str, ...]
     fixed: tuple[Setting, ...]
-    record_band_hz: tuple[float, float]
+    band_hz: tuple[float, float] | None
 
 
 def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFailure:
-    """Read a session, analyse it by both routes.
+    """Read a session, analyse it by both routes, or by the whole record where that suits alone.
 
     A session that cannot be analysed is told, not raised: it is one of many.
     """
     from analysis.record import load_record
-    from analysis.welch_route import analyse
+    from analysis.suited import record_band_hz, remarks, welch_analysis, welch_settings
 
     failures = task_errors()
     experiment = None
@@ -121,20 +149,26 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
         unfinished = experiment.unfinished(record.outcome)
         if unfinished:
             return SessionFailure(path, f"{path}: {unfinished}", experiment)
-        welch = analyse(record, task.settings)
+        welch, left_out = welch_analysis(
+            record, task.settings, task.band_hz, optional=bool(task.structures)
+        )
     except failures as error:
         return SessionFailure(path, str(error), experiment)
     except MemoryError:
         return SessionFailure(
             path, f"{path}: there is not memory enough to analyse it; use fewer --jobs."
         )
-    warnings = welch.warnings
+    measured = _NO_RESPONSE if welch is None else welch.response
+    warnings = record.warnings if welch is None else welch.warnings
+    warnings = (*warnings, *remarks(record, task.band_hz), *((left_out,) if left_out else ()))
     estimates: tuple[RecordEstimate, ...] = ()
-    verdict = None
+    verdict = headline = None
     if task.structures:
         try:
-            estimates, verdict = _whole_record(record, task, welch.response)
+            estimates, verdict, headline = _whole_record(record, task, measured)
         except failures as error:
+            if welch is None:
+                return SessionFailure(path, str(error), experiment)
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
         except (MemoryError, np.linalg.LinAlgError) as error:
             why = "there is not memory enough" if isinstance(error, MemoryError) else error
@@ -145,27 +179,32 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
         beam=record.beam,
         tool_inertia_kg_m2=record.tool_inertia_kg_m2,
         delay_s=record.torque_delay_s - record.angle_delay_s,
-        frequency_hz=welch.response.frequency_hz,
-        response=welch.response.response,
-        peaks=welch.peaks,
-        welch_fits=tuple(map(WelchFit.of, welch.models)),
+        frequency_hz=measured.frequency_hz,
+        response=measured.response,
+        peaks=() if welch is None else welch.peaks,
+        welch_fits=() if welch is None else tuple(map(WelchFit.of, welch.models)),
         record_estimates=estimates,
         verdict=verdict,
         warnings=warnings,
+        headline=headline,
+        settings=welch_settings(record, task.settings, task.band_hz),
+        record_band_hz=record_band_hz(record, task.band_hz),
     )
 
 
 def _whole_record(
     record: Record, task: SessionTask, measured: FrequencyResponse
-) -> tuple[tuple[RecordEstimate, ...], Verdict]:
+) -> tuple[tuple[RecordEstimate, ...], Verdict, dict[str, Any]]:
     """Select a structure on the whole record; of all fits, keep it and those asked for."""
-    from analysis.selection import select
+    from analysis.selection import headline_json, select
     from analysis.structures import STRUCTURES
+    from analysis.suited import record_band_hz
     from analysis.whole_record import Measurement
     from analysis.whole_record.response import ResponseGrid
 
     measurement = Measurement.of_record(record)
-    selection = select(measurement, fixed=task.fixed, band_hz=task.record_band_hz)
+    band_hz = record_band_hz(record, task.band_hz)
+    selection = select(measurement, fixed=task.fixed, band_hz=band_hz)
     omega = 2 * np.pi * measured.frequency_hz
     grid = ResponseGrid(1j * omega)
 
@@ -173,6 +212,8 @@ def _whole_record(
         # The measured response is free of the delay that the file states.
         plant = candidate.fit.plant
         plant = replace(plant, delay_s=plant.delay_s - measurement.delay_s)
+        if not omega.size:
+            return RecordEstimate.of(candidate, _NOT_COMPARED)
         response = grid.evaluate(plant)[0]
         return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
 
@@ -183,4 +224,7 @@ def _whole_record(
         if each.fit.structure.name in task.structures or each.fit is selection.fit
     ]
     asked.sort(key=lambda each: (not each.uniform, order.index(each.structure)))
-    return tuple(asked), selection.verdict
+    said = selection.verdict
+    orders = (said.alpha, said.lambda_)
+    told = headline_json(str(record.path), selection.headline, orders, said.findings)
+    return tuple(asked), said, told

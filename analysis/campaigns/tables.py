@@ -12,6 +12,7 @@ from rich.text import Text
 from analysis.campaigns import homogeneity_tables, paper, sentences, specimen_sentences
 from analysis.campaigns.labels import label, probability, with_unit
 from analysis.campaigns.nominal import best_models
+from analysis.campaigns.session_list import session_list_text
 from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
 from analysis.campaigns.text_table import text_table
 from analysis.campaigns.validation import by_model
@@ -50,6 +51,7 @@ def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> Renderab
     else:
         for sentence in without_verdict(campaign):
             parts.extend((Text(sentence, style="bold"), ""))
+    parts.extend((session_list_text(campaign), ""))
     found = campaign.homogeneity
     if len(found.specimens) > 1:
         parts.extend((homogeneity_tables.specimens_text_table(found), ""))
@@ -62,13 +64,14 @@ def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> Renderab
         parts.extend((candidates_table(campaign), ""))
     if campaign.validation:
         parts.extend((validation_table(campaign), ""))
-    parts.extend(
-        (
-            statistics_table(campaign, with_paper=with_paper), "",
-            peaks_table(campaign, with_paper=with_paper), "",
-            best_table(campaign, with_paper=with_paper), "",
-        )
-    )  # fmt: skip
+    if campaign.nominal:
+        parts.extend(
+            (
+                statistics_table(campaign, with_paper=with_paper), "",
+                peaks_table(campaign, with_paper=with_paper), "",
+                best_table(campaign, with_paper=with_paper), "",
+            )
+        )  # fmt: skip
     parts.extend(
         Text(f"Warning: {session.path.name}: {warning}", style="yellow")
         for session in campaign.sessions
@@ -212,9 +215,16 @@ def candidates_table(campaign: Campaign) -> Table:
 
 
 def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
-    """Return the estimate selected, and those that all data together cannot tell from it."""
-    close = campaign.verdict.rivals if campaign.verdict else ()
-    return [*campaign.pooled[:1], *(each for each in campaign.pooled if each.name in close)]
+    """Return the headline's estimate, and the one of the lowest BIC, which is conditional."""
+    found = {each.name: each for each in (campaign.headline, *campaign.pooled[:1]) if each}
+    return list(found.values())
+
+
+def role(estimate: PooledEstimate, campaign: Campaign) -> str:
+    """Say what an estimate shown is for."""
+    if estimate is campaign.headline:
+        return "freest structure"
+    return "lowest BIC, conditional on its being the true one"
 
 
 def used(estimate: PooledEstimate, campaign: Campaign) -> str:
@@ -230,8 +240,8 @@ def pooled_table(
     found = campaign.homogeneity
     table = text_table(
         title(
-            f"Pooled whole-record estimate, type {estimate.name}, {used(estimate, campaign)}; "
-            f"residual {estimate.misfit:.4g} times the noise",
+            f"Pooled whole-record estimate, type {estimate.name}, {used(estimate, campaign)} "
+            f"({role(estimate, campaign)}); residual {estimate.misfit:.4g} times the noise",
             found,
         )
     )

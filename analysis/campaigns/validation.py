@@ -94,7 +94,7 @@ def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecas
 def validate(
     workers: Workers,
     sessions: Sequence[SessionResult],
-    band_hz: tuple[float, float],
+    band_hz: tuple[float, float] | None,
     on_done: Callable[[int], None],
 ) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
     """Try every session once, and account for each trial: done, or lost and why.
@@ -119,17 +119,20 @@ def validate(
 
 
 def left_out_errors(
-    path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float]
+    path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float] | None
 ) -> tuple[LeftOutError, ...] | LostTrial:
     """Read a session and compare its torque with what each model predicts from its angle.
 
     A session that the whole-record estimator cannot use is told, not raised: it is one of many.
     """
     from analysis.record import load_record
+    from analysis.suited import record_band_hz
     from analysis.whole_record.comparison import Comparison
 
     try:
-        comparison = Comparison.of(Measurement.of_record(load_record(path)), band_hz)
+        record = load_record(path)
+        band_hz = record_band_hz(record, band_hz)
+        comparison = Comparison.of(Measurement.of_record(record), band_hz)
     except task_errors() as why:
         return LostTrial(path, str(why))
     except MemoryError:

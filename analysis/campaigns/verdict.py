@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from analysis.campaigns import sentences, specimen_sentences
 from analysis.campaigns.common_findings import CommonFinding, common_findings
+from analysis.campaigns.common_structure import freest_estimate
 from analysis.campaigns.pooled_orders import PooledOrder, pooled_order, rivals
 from analysis.selection.orders import EVEN, STRONG
 
@@ -45,8 +46,10 @@ class CampaignVerdict:
 
     Attributes
     ----------
+    headline : str
+        Structure that the numbers are of, as tables call it: the freest on the beam selected.
     structure : str
-        Selected: "I" to "VII".
+        Of the lowest BIC: "I" to "VII".
     uniform : bool
         Whether the beam selected is uniform.
     rivals : tuple of str
@@ -67,6 +70,7 @@ class CampaignVerdict:
         What would tell more.
     """
 
+    headline: str
     structure: str
     uniform: bool
     rivals: tuple[str, ...]
@@ -108,7 +112,8 @@ def campaign_verdict(
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:
         return None
-    best = pooled[0]
+    best, freest = pooled[0], freest_estimate(pooled)
+    assert freest is not None
     alpha, lambda_ = (pooled_order(order, pooled, verdicts, alike) for order in ("alpha", "lambda"))
     found = common_findings(sessions)
     close = rivals(pooled, EVEN)
@@ -117,6 +122,7 @@ def campaign_verdict(
     dissent = _dissent(sessions, best)
     advice = Counter(advice for verdict in verdicts for advice in verdict.experiments)
     return CampaignVerdict(
+        headline=freest.name,
         structure=best.structure,
         uniform=best.uniform,
         rivals=tuple(each.name for each in close),
@@ -129,15 +135,17 @@ def campaign_verdict(
         dissent=dissent,
         sentences=(
             *specimen_sentences.specimens(alike),
-            sentences.selected(pooled, close, alone, len(verdicts), _withheld(alpha, lambda_)),
-            sentences.left_over(best, adequate, len(verdicts)),
-            *sentences.modes(best, mixed=alike.mixed),
+            sentences.headline(freest, best),
+            sentences.left_over(freest, adequate, len(verdicts)),
+            *sentences.sizes(freest),
+            *sentences.modes(freest, mixed=alike.mixed),
             sentences.order(alpha),
             sentences.order(lambda_),
+            sentences.selected(pooled, close, alone, len(verdicts)),
             *(finding.sentence for finding in found),
             *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
-            *([] if alike.mixed else [sentences.scatter(best)]),
-            *sentences.foresight(best, validation, len(sessions)),
+            *([] if alike.mixed else [sentences.scatter(freest)]),
+            *sentences.foresight(freest, validation, len(sessions)),
             *sentences.lost_trials(lost, len(sessions)),
         ),
         experiments=tuple(
@@ -147,7 +155,7 @@ def campaign_verdict(
 
 
 def _withheld(*orders: PooledOrder) -> frozenset[str]:
-    return frozenset(each.order for each in orders if each.value is None)
+    return frozenset(each.order for each in orders if each.reason is not None)
 
 
 def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[Dissent, ...]:

@@ -88,7 +88,7 @@ def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
     from analysis.campaigns.validation_figure import validation_figure
 
     found: dict[str, tuple[Callable[[], Figure], str]] = {}
-    if campaign.pooled:
+    if campaign.headline is not None:
         found["pooled"] = (
             partial(pooled_figure, campaign),
             "Whole-record estimate of each session with its 95 % interval, and the pooled one.",
@@ -98,6 +98,8 @@ def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
             partial(validation_figure, campaign),
             "Each session's torque predicted from the other sessions: error by model.",
         )
+    if not campaign.nominal:
+        return found
     return found | {
         "figure5_signals": (
             partial(_signals, campaign),

@@ -15,6 +15,7 @@ from analysis.commands.welch_options import (
     Nfft,
     Overlap,
     Segment,
+    band_hz,
     welch_settings,
 )
 
@@ -60,7 +61,7 @@ def import_command(
         typer.Argument(
             metavar="SOURCE",
             readable=False,
-            help="File of measurements: .csv, .txt, .mat, .tdms, .uff, .unv, .uf58.",
+            help="File of measurements: .csv, .txt, .dat, .mat, .tdms, .uff, .unv, .uf58.",
         ),
     ],
     session: Annotated[
@@ -201,7 +202,7 @@ def export_frf_command(
     target: _Target,
     binary: _Binary = False,
     frf: Estimator = "h1",
-    band: Band = "0.5875,50",
+    band: Band = None,
     segment: Segment = None,
     overlap: Overlap = None,
     nfft: Nfft = None,
@@ -209,10 +210,11 @@ def export_frf_command(
     """Write the frequency response from angle to coupling torque, as an analysis estimates it."""
     from analysis.exchange.export import export_frf
 
-    settings = welch_settings("I", "const", band, frf, segment, overlap, nfft)
+    settings = welch_settings("I", "const", frf, segment, overlap, nfft)
+    asked_hz = band_hz(band)
 
     def run() -> None:
-        table = export_frf(session, target, settings, binary=binary)
+        table = export_frf(session, target, settings, asked_hz, binary=binary)
         typer.echo(f"{len(table.axis.values)} frequencies of {session}: {target}")
 
     raise typer.Exit(_explained(run))

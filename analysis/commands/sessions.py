@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -28,12 +28,24 @@ _FIGURE_STEPS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Routes:
-    """What is done with a record: the paper's route, by these settings, and the whole record's."""
+    """What is done with a record: Welch's fits, by these settings, and those of the whole record.
+
+    Attributes
+    ----------
+    settings : WelchSettings
+    paper, whole_record : bool
+        Which of the two.
+    fixed : tuple of str
+        Settings of rig and specimen that stay at the file's values.
+    band_hz : tuple of float or None
+        Of both; None takes what suits the record.
+    """
 
     settings: WelchSettings
     paper: bool
     whole_record: bool
     fixed: tuple[Setting, ...]
+    band_hz: tuple[float, float] | None = None
 
 
 def session_command(
@@ -201,12 +213,23 @@ def _analyse_file(
     from analysis.record import load_record
     from analysis.report.folder import new_folder
     from analysis.report.write import write_report
-    from analysis.welch_route import analyse
+    from analysis.suited import check_record_band, remarks, welch_analysis
     from analysis.whole_record import MeasurementError
 
     record = load_record(file)
+    record = _with_warnings(record, remarks(record, routes.band_hz))
     on_step("read")
-    analysis = analyse(record, routes.settings, on_step) if routes.paper else None
+    if not routes.paper:
+        check_record_band(record, routes.band_hz)
+    analysis, left_out = None, None
+    if routes.paper:
+        analysis, left_out = welch_analysis(
+            record, routes.settings, routes.band_hz,
+            optional=routes.whole_record and rerun is None, on_step=on_step,
+        )  # fmt: skip
+    if left_out:
+        warn(f"Warning: {file}: {left_out}")
+        record = _with_warnings(record, (left_out,))
     subject = None
     if routes.whole_record:
         on_step("whole record")
@@ -215,7 +238,7 @@ def _analyse_file(
         except MeasurementError as error:
             if analysis is None:
                 raise
-            warn(f"Warning: {error} Only the paper's route was gone.")
+            warn(f"Warning: {error} Only the Welch fits were run.")
     with new_folder(folder) as part:
         write_report(analysis, part, on_step, subject)
     if rerun is not None and analysis is not None:
@@ -226,13 +249,19 @@ def _analyse_file(
     return analysis, subject
 
 
+def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
+    return replace(record, warnings=(*record.warnings, *more)) if more else record
+
+
 def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis | None) -> Subject:
     from analysis.report.html import Subject
     from analysis.selection import select
-    from analysis.whole_record import BAND_HZ, Measurement
+    from analysis.suited import record_band_hz
+    from analysis.whole_record import Measurement
 
-    selection = select(Measurement.of_record(record), fixed=routes.fixed)
-    return Subject.of(record, selection, BAND_HZ, routes.fixed, welch)
+    band_hz = record_band_hz(record, routes.band_hz)
+    selection = select(Measurement.of_record(record), fixed=routes.fixed, band_hz=band_hz)
+    return Subject.of(record, selection, band_hz, routes.fixed, welch)
 
 
 def _standard_error() -> Console:

@@ -19,7 +19,12 @@ _MAX_NFFT: Final = 2**22
 _Choice = TypeVar("_Choice", bound=str)
 
 Band = Annotated[
-    str, typer.Option(metavar="F0,F1", help="Band that is fitted, in Hz, ends included.")
+    str | None,
+    typer.Option(
+        metavar="F0,F1",
+        help="Band that is fitted, in Hz, ends included.  [default: 0.5875,50 of a Welch "
+        "estimate, 0,50 of whole records, up to 0.4 of the record's rate]",
+    ),
 ]
 Estimator = Annotated[
     str,
@@ -46,13 +51,15 @@ Nfft = Annotated[
 def welch_settings(
     types: str,
     weights: str,
-    band: str,
     frf: str,
     segment: int | None,
     overlap: int | None,
     nfft: int | None,
 ) -> WelchSettings:
-    """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2)."""
+    """Check the options' texts; wrong ones end in typer.BadParameter (exit code 2).
+
+    The band is the default: what suits a record, `analysis.suited` knows.
+    """
     from analysis.settings import WelchSettings
     from rigd.spectral import Estimator as FrfEstimator
 
@@ -71,7 +78,6 @@ def welch_settings(
         segment_length=segment,
         overlap=overlap,
         nfft=nfft,
-        band_hz=_band(band),
         types=_types(types),
         weightings=_weightings(weights),
     )
@@ -87,14 +93,17 @@ def choice(text: str, choices: Sequence[_Choice], option: str) -> _Choice:
     )
 
 
-def _band(text: str) -> tuple[float, float]:
+def band_hz(text: str | None) -> tuple[float, float] | None:
+    """Check the text of --band, None if it was not given."""
+    if text is None:
+        return None
     try:
         first_hz, last_hz = (float(part) for part in text.split(","))
     except ValueError:
         first_hz = last_hz = math.nan
-    if not 0.0 < first_hz < last_hz < math.inf:
+    if not 0.0 <= first_hz < last_hz < math.inf:
         raise typer.BadParameter(
-            f"'{text}' is not two frequencies in Hz with 0 < F0 < F1, such as 0.5875,50.",
+            f"'{text}' is not two frequencies in Hz with 0 <= F0 < F1, such as 0.5875,50.",
             param_hint="--band",
         )
     return first_hz, last_hz

@@ -1,9 +1,10 @@
-"""Channels of a CSV file: columns with names in the first line, or by number."""
+"""Channels of a text file: columns with names in the first line, or by number."""
 
 from __future__ import annotations
 
 import csv
 from array import array
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from analysis.exchange.source import (
 from rigd.printable import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import TextIO
 
@@ -26,13 +27,18 @@ _MAX_LINE: Final = 65_536
 """Longest line, characters: hundreds of columns. A longer one is not split into its cells."""
 
 _SEPARATORS: Final = ("\t", ";", ",")
+_BLANKS: Final = " "
+_COMMENT: Final = ("#", "%")
+"""What numpy and MATLAB put in front of a line of titles."""
 
 
 def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
-    """Read columns of a CSV file in UTF-8, as `analysis.exchange.source.read_source` asks for.
+    """Read columns of a text file in UTF-8, as `analysis.exchange.source.read_source` asks for.
 
-    The separator is a tab, a semicolon or a comma: the first of them that the first line has. A
-    column is named as the first line names it, or ``#3`` for the third. An empty cell reads as NaN.
+    The separator is a tab, a semicolon or a comma, the first of them that the first line has, or
+    blanks if neither that line nor the next has any of them. A column is named as the first line
+    names it, or ``#3`` for the third; a first line of numbers is the first sample. An empty cell
+    reads as NaN.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
@@ -46,21 +52,27 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 
 def _read(path: Path, lines: Iterator[str], names: Sequence[str]) -> Mapping[str, SourceChannel]:
-    first = next((line for line in lines if line.strip()), None)
+    written = (line for line in lines if line.strip())
+    first, second = next(written, None), next(written, "")
     if first is None:
         raise ExchangeError(f"{path}: is empty.")
-    separator = next((mark for mark in _SEPARATORS if mark in first), ",")
-    cells = [cell.strip() for cell in next(csv.reader([first], delimiter=separator))]
-    headless = all(_is_number(cell) for cell in cells)
-    header = [f"#{number}" for number in range(1, len(cells) + 1)] if headless else cells
+    separator = _separator(first, second)
+    rows = _rows(chain([first, second], written), separator)
+    cells = [cell.strip() for cell in next(rows)]
+    if _is_sample(cells):
+        rows = chain([cells], rows)
+        header = _numbers(len(cells))
+    elif separator == _BLANKS:
+        # Titles of several words each say no more which column is which.
+        titles = cells[1:] if cells[0] in _COMMENT else cells
+        count = len(second.split())
+        header = titles if len(titles) == count else _numbers(count)
+    else:
+        header = cells
     columns = {name: _column(path, name, header) for name in names}
     values = {name: array("d") for name in columns}
     wanted = [(column, values[name].append, name) for name, column in columns.items()]
-    if headless:
-        for column, append, _ in wanted:
-            append(float(cells[column]))
-    reader = csv.reader(lines, delimiter=separator)
-    for row in reader:
+    for row in rows:
         if not row:
             continue
         for column, append, name in wanted:
@@ -71,6 +83,33 @@ def _read(path: Path, lines: Iterator[str], names: Sequence[str]) -> Mapping[str
         if len(values[name]) > MAX_SAMPLES:
             check_samples(path, "The file", len(values[name]))
     return {name: SourceChannel(np.frombuffer(column)) for name, column in values.items()}
+
+
+def _separator(first: str, second: str) -> str:
+    """Find what stands between the cells of the first two lines that are not empty."""
+    found = next((mark for mark in _SEPARATORS if mark in first), None)
+    if found is not None:
+        return found
+    in_second = any(mark in second for mark in _SEPARATORS)
+    cells = (second or first).split()
+    blanks = not in_second and len(cells) > 1 and _is_sample(cells)
+    return _BLANKS if blanks else ","
+
+
+def _rows(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
+    if separator == _BLANKS:
+        return map(str.split, lines)
+    return csv.reader(lines, delimiter=separator)
+
+
+def _numbers(count: int) -> list[str]:
+    return [f"#{number}" for number in range(1, count + 1)]
+
+
+def _is_sample(cells: Sequence[str]) -> bool:
+    """Whether a line is one of numbers, some of which may be missing."""
+    known = [cell for cell in cells if cell]
+    return bool(known) and all(map(_is_number, known))
 
 
 def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:

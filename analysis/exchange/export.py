@@ -57,14 +57,19 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Table
 
 
 def export_frf(
-    session: Path, target: Path, settings: WelchSettings, *, binary: bool = False
+    session: Path,
+    target: Path,
+    settings: WelchSettings,
+    band_hz: tuple[float, float] | None = None,
+    *,
+    binary: bool = False,
 ) -> Table:
-    """Write the frequency response that an analysis with these settings would fit.
+    """Write the frequency response that an analysis with these settings and band would fit.
 
     Otherwise as `export_record`; the analysis' own errors come on top.
     """
     check_target(target, binary=binary)
-    table = frf_table(session, settings)
+    table = frf_table(session, settings, band_hz)
     _write(table, target, binary=binary)
     return table
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.exchange.errors import ExchangeError
+from analysis.record_checks import too_much_unknown
 from rigd.session import Status
 
 if TYPE_CHECKING:
@@ -14,10 +15,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-MAX_HELD: Final = 0.1
-"""Largest share of a channel that may be not finite. No analysis bears so much of it in its sweep,
-but rest and ring-down may lack more."""
 
 _FLAGS: Final = {
     "angle_rad": Status.ANGLE_STALE,
@@ -62,11 +59,10 @@ def hold(
                 f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
                 "analysis needs it."
             )
-        if count > MAX_HELD * len(mask):
+        much = too_much_unknown(f"'{names[name]}'", count, len(mask))
+        if much:
             raise ExchangeError(
-                f"{path}: '{names[name]}' is not finite in {count} of {len(mask)} samples, more "
-                f"than the {100 * MAX_HELD:g} % that are held and flagged; choose another channel "
-                "or cut the session out of the file."
+                f"{path}: {much} Or choose another channel, or cut the session out of the file."
             )
     first = max(int(np.argmin(mask)) for mask in bad.values())
     held = {name: _held(values, bad[name])[first:] for name, values in columns.items()}

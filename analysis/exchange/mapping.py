@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from analysis.exchange.errors import ExchangeError
-from analysis.exchange.units import UNITS, canonical_unit, factor
+from analysis.exchange.units import UNITS, factor, stated_unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,7 +38,7 @@ class ChannelChoice:
     channel : str
         Its name in the file.
     unit : str
-        As `analysis.exchange.units.UNITS` spells it.
+        As `analysis.exchange.units.UNITS` spells it, after a number if one was stated.
     factor : float
         Size of that unit in rad, N·m, N or s.
     """
@@ -72,4 +72,4 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
             f"{', '.join(UNITS[quantity])}. A unit is never guessed."
         )
     size = factor(quantity, unit)
-    return ChannelChoice(channel.strip(), canonical_unit(unit) or unit, size)
+    return ChannelChoice(channel.strip(), stated_unit(unit), size)

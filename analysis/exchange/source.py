@@ -65,6 +65,7 @@ _MB: Final = 1_000_000
 _FORMATS: Final = {
     ".csv": _Format("CSV", "csv_source", 512 * _MB),
     ".txt": _Format("CSV", "csv_source", 512 * _MB),
+    ".dat": _Format("CSV", "csv_source", 512 * _MB),
     ".mat": _Format("MATLAB", "mat_source", 512 * _MB),
     ".tdms": _Format("TDMS", "tdms_source", 512 * _MB),
     ".uff": _Format("UFF58", "uff_source", 128 * _MB),
@@ -79,7 +80,7 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
     Parameters
     ----------
     path : Path
-        Its ending says what it is: .csv, .txt, .mat, .tdms, .uff, .unv or .uf58.
+        Its ending says what it is: .csv, .txt, .dat, .mat, .tdms, .uff, .unv or .uf58.
     names : sequence of str
         The channels, as the format has them (docs/exchange.md).
 
@@ -167,12 +168,23 @@ def no_such_channel(path: Path, name: str, available: Iterable[str]) -> Exchange
 
 def as_column(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
     """Return real numbers (n,) as floats; anything else is refused."""
+    if values.dtype.kind == "c":
+        raise not_in_time(path, name)
     if values.dtype.kind not in "iuf":
         raise ExchangeError(
             f"{path}: the channel '{name}' does not hold real numbers but {values.dtype.name}; "
             "choose a channel of measured values."
         )
     return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def not_in_time(path: Path, name: str) -> ExchangeError:
+    """Make the error for a complex channel."""
+    return ExchangeError(
+        f"{path}: '{name}' is complex, so it is a frequency response or a spectrum. A session is "
+        "made of measured samples: give angle and torque over time; from a frequency response "
+        "alone no record can be had back."
+    )
 
 
 def missing_library(path: Path, library: str) -> ExchangeError:

@@ -11,6 +11,7 @@ import rigd
 from analysis.estimate import estimate
 from analysis.exchange.errors import ExchangeError
 from analysis.record import load_record
+from analysis.suited import welch_settings
 from rigd.session import read_session
 from rigd.session.format import SAMPLE_FIELDS
 
@@ -111,10 +112,13 @@ def record_table(path: Path) -> Table:
     )
 
 
-def frf_table(path: Path, settings: WelchSettings) -> Table:
+def frf_table(
+    path: Path, settings: WelchSettings, band_hz: tuple[float, float] | None = None
+) -> Table:
     """Estimate the response from angle to coupling torque, as the analysis does that fits it.
 
-    The channels' delays are taken out of it; the tool's inertia is not.
+    The channels' delays are taken out of it; the tool's inertia is not. Without a band it is what
+    the record's rate holds of that of the settings.
 
     Raises
     ------
@@ -122,6 +126,7 @@ def frf_table(path: Path, settings: WelchSettings) -> Table:
         As the analysis raises them.
     """
     record = load_record(path)
+    settings = welch_settings(record, settings, band_hz)
     response, _ = estimate(record, settings)
     columns = [
         Column("response_nm_per_rad", "Coupling torque / Angle", "N.m/rad", response.response)

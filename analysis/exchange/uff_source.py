@@ -14,6 +14,7 @@ from analysis.exchange.source import (
     check_samples,
     missing_library,
     no_such_channel,
+    not_in_time,
 )
 
 if TYPE_CHECKING:
@@ -98,10 +99,7 @@ def _number(path: Path, name: str, titles: Sequence[str]) -> int:
 def _channel(path: Path, name: str, function: Mapping[str, Any]) -> SourceChannel:
     values = np.asarray(function["data"])
     if values.dtype.kind == "c":
-        raise ExchangeError(
-            f"{path}: '{name}' is a complex function such as a frequency response; import needs "
-            "the functions of time."
-        )
+        raise not_in_time(path, name)
     if len(values) != function["num_pts"]:
         raise ExchangeError(
             f"{path}: '{name}' has {len(values)} values and states {function['num_pts']}; the file "

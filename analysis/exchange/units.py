@@ -55,6 +55,7 @@ _NAME_SUFFIXES: Final = {
 }
 """Last word of a channel's name → the unit it means."""
 
+_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=\s*[^\s\d.])")
 _IN_BRACKETS: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 
 
@@ -73,20 +74,37 @@ def factor(quantity: str, unit: str) -> float:
     ----------
     quantity : {"angle", "torque", "force", "time"}
     unit : str
-        In any spelling that `canonical_unit` knows.
+        In any spelling that `canonical_unit` knows, with a number before it or not: ``0.02 N.m``
+        is what one volt of a sensor's signal stands for.
 
     Raises
     ------
     ExchangeError
-        If it is no unit of that quantity.
+        If it is no unit of that quantity, or the number is not finite or 0.
     """
-    name = canonical_unit(unit)
-    if name is None or name not in UNITS[quantity]:
+    size, name = _scaled(unit)
+    known = canonical_unit(name)
+    if known is None or known not in UNITS[quantity] or not math.isfinite(size) or size == 0.0:
+        base = next(iter(UNITS[quantity]))
         raise ExchangeError(
             f"'{unit}' is not a unit of {quantity} that is known here; choose from "
-            f"{', '.join(UNITS[quantity])}."
+            f"{', '.join(UNITS[quantity])}. Of a signal in volts, counts or the like, state what "
+            f"one of them stands for, as a number and a unit: CHANNEL:0.02 {base}."
         )
-    return UNITS[quantity][name]
+    return size * UNITS[quantity][known]
+
+
+def stated_unit(unit: str) -> str:
+    """Spell a unit as the table does, with its number if it has one other than 1."""
+    size, name = _scaled(unit)
+    known = canonical_unit(name) or name
+    return known if size == 1.0 else f"{size!r} {known}"
+
+
+def _scaled(unit: str) -> tuple[float, str]:
+    """Take a number and a unit apart, ``0.02 N.m``; 1 where there is no number."""
+    found = _NUMBER.match(unit.strip())
+    return (float(found[0]), unit.strip()[found.end() :]) if found else (1.0, unit)
 
 
 def unit_in_brackets(name: str) -> str | None:

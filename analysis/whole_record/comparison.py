@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.settings import LARGEST_SHARE_OF_RATE
 from analysis.whole_record.decimation import Decimation, fast_length_below
 from analysis.whole_record.feedback import following
 from analysis.whole_record.free_decay import DecaySpectra
@@ -82,11 +83,12 @@ class Comparison:
             The record cannot be used, or is too short for the band.
         """
         lowest_hz, highest_hz = band_hz
-        if not 0 <= lowest_hz < highest_hz <= 0.4 * measurement.rate_hz:
+        limit_hz = LARGEST_SHARE_OF_RATE * measurement.rate_hz
+        if not 0 <= lowest_hz < highest_hz <= limit_hz:
             raise MeasurementError(
                 f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
-                f"or beyond 0.4 of the sampling rate ({0.4 * measurement.rate_hz:g} Hz); "
-                "choose another."
+                f"or beyond {LARGEST_SHARE_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
+                "choose another --band."
             )
         measurement.check(highest_hz)
         decimation = Decimation.to_band(measurement.rate_hz, highest_hz)

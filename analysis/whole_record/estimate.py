@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from analysis.settings import RECORD_BAND_HZ
 from analysis.structures import STRUCTURES
 from analysis.whole_record.comparison import Comparison
 from analysis.whole_record.objective import Objective
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from analysis.whole_record.measurement import Measurement
     from analysis.whole_record.plant import Setting
 
-BAND_HZ: Final = (0.0, 50.0)
+BAND_HZ: Final = RECORD_BAND_HZ
 _TOLERANCE: Final = 1e-9
 """Of the sum of squares: less than a hundredth of a standard deviation."""
 

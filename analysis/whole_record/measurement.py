@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.record_checks import too_much_unknown
 from analysis.whole_record.bridging import bridged, longest_run
 from analysis.whole_record.plant import Plant
 from rigd.beam import Damping
@@ -22,9 +23,6 @@ MAX_ANGLE_GAP_PERIODS: Final = 0.4
 
 MAX_TORQUE_GAP_S: Final = 1.0
 """Longest gap of the torque: a longer one may swallow a resonance."""
-
-MAX_UNKNOWN_SHARE: Final = 0.05
-"""Largest share of either channel that may be unknown."""
 
 
 class MeasurementError(ValueError):
@@ -132,13 +130,9 @@ class Measurement:
                     f"not finite at {bad.size} of {n} ticks; mask them as unknown or record the "
                     "session again."
                 )
-            share = 1 - np.count_nonzero(known) / max(n, 1)
-            if share > MAX_UNKNOWN_SHARE:
-                raise MeasurementError(
-                    f"{self.name}: {100 * share:.2g} % of the {channel} are missing or flagged, "
-                    f"more than the {100 * MAX_UNKNOWN_SHARE:g} % that the estimator tolerates; "
-                    "record the session again."
-                )
+            much = too_much_unknown(f"the {channel}", int(np.count_nonzero(~known)), n)
+            if much:
+                raise MeasurementError(f"{self.name}: {much}")
         bridged_s = MAX_ANGLE_GAP_PERIODS / highest_hz
         for channel, known, allowed_s in (
             ("angle", self.angle_known, bridged_s),

@@ -113,7 +113,8 @@ def record_estimate(
         tuple(value for name, value in every.items() if name.startswith("stiffness_offset")),
     )
     return RecordEstimate(
-        structure=structure, uniform=uniform, plant=plant, parameters=every,
+        structure=structure, uniform=uniform, beam="" if uniform else ", modes free", plant=plant,
+        parameters=every,
         std=dict.fromkeys(every, 0.0), determined=tuple(determined),
         covariance=np.asarray(covariance), at_bounds=at_bounds,
         modes=(ModeEstimate(1, 2.5, 1e-4, 0.01, 1e-5),), cost=cost, degrees_of_freedom=100,

@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 from analysis.campaigns.campaign import _of_one_experiment
-from analysis.campaigns.experiment import most_common
+from analysis.campaigns.experiment import most_common, stated_specimens
 from analysis.campaigns.session import SessionFailure, SessionTask, analyse_session
-from analysis.whole_record import BAND_HZ
 
 
 @pytest.fixture
@@ -73,6 +72,27 @@ def test_a_sweep_that_ended_early_is_left_out_and_one_stopped_after_it_is_not(ma
 def test_a_stopped_session_says_so_and_not_that_it_is_short(make_file, settings, tmp_path):
     """30 s of sweep where the file says that 120 s were planned."""
     path = make_file(tmp_path / "stopped.mcap", 0, duration_s="120.0", excitation="chirp")
-    failure = analyse_session(path, SessionTask(settings, (), (), BAND_HZ))
+    failure = analyse_session(path, SessionTask(settings, (), (), None))
     assert "stopped.mcap: its sweep ended after 30 s of 120 s" in failure.message
     assert failure.experiment.facts["excitation"] == "chirp"
+
+
+def test_specimens_are_told_apart_by_their_labels_before_anything_else(chirps):
+    sessions = [chirps(f"{number}.mcap", specimen=label) for number, label in enumerate("AABBB")]
+    kept, left_out = _of_one_experiment(sessions)
+    assert [each.path.name for each in kept] == ["2.mcap", "3.mcap", "4.mcap"]
+    assert "specimen is “A”, but “B” in 2.mcap" in left_out[0].message
+    stated = [(each.path, each.experiment) for each in (*kept, *left_out)]
+    first, second = stated_specimens(stated, kept[0].experiment)
+    assert (first.facts["specimen"], second.facts["specimen"]) == ("B", "A")
+
+
+def test_a_session_without_a_label_is_of_the_only_labelled_specimen_or_of_none(chirps):
+    one, two, bare = chirps("1.mcap", specimen="A"), chirps("2.mcap", specimen="A"), "3.mcap"
+    kept, left_out = _of_one_experiment([one, two, chirps(bare)])
+    assert (len(kept), left_out) == (3, [])
+    # With two labels nobody knows of which it is, and it must not bring the two together.
+    other = chirps("4.mcap", specimen="B")
+    kept, left_out = _of_one_experiment([chirps(bare), one, two, other])
+    assert [each.path.name for each in kept] == ["1.mcap", "2.mcap"]
+    assert any("specimen is not stated, but “A”" in each.message for each in left_out)

@@ -145,7 +145,8 @@ def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     assert differing.startswith("The sessions are not of one specimen in one state: frequency of")
     assert "in 2 files (0.mcap, 1.mcap)" in where
     assert "in 2 files (stiff20.mcap, stiff21.mcap)" in where
-    assert structure.startswith("Type III")
+    assert structure.startswith("The numbers are those of type III")
+    assert "takes for granted that alpha and lambda are 1" in structure
     assert not any("they repeat" in each for each in mixture.verdict.sentences)
     assert tables_text(mixture).startswith("The files are not of one specimen")
 
@@ -185,7 +186,7 @@ def test_page_and_json_tell_it_too(mixture):
     assert [row["files"] for row in content["specimens"]] == [4, 1]
     assert {row["mixture"] for row in content["table3"]} == {True}
     page = campaign_page(mixture, {}, datetime.now(UTC), with_paper=False)
-    assert page.index("The files are not of one specimen") < page.index("Type III: damping")
+    assert page.index("The files are not of one specimen") < page.index("type III: damping")
     for name in ("specimens", "homogeneity"):
         assert f'id="{name}"' in page
         assert content[name]

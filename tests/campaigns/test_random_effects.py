@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile_95
+from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile
 
 
 def one_dimension(values, variances):
@@ -86,4 +86,5 @@ def test_chance_is_that_of_chi_square(sessions):
 
 @pytest.mark.parametrize("freedom", [1, 2, 4, 19, 200])
 def test_student_s_t(freedom):
-    assert t_quantile_95(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-5)
+    assert t_quantile(0.95, freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-5)
+    assert t_quantile(0.999, freedom) == pytest.approx(stats.t.ppf(0.9995, freedom), rel=1e-2)

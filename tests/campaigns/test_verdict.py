@@ -8,6 +8,7 @@ import pytest
 
 from analysis.campaigns import sentences
 from analysis.campaigns.common_findings import common_findings
+from analysis.campaigns.common_structure import freest_estimate
 from analysis.campaigns.homogeneity import Heterogeneity, Homogeneity
 from analysis.campaigns.pooled import pooled
 from analysis.campaigns.pooled_orders import pooled_order
@@ -60,19 +61,32 @@ def test_an_order_that_all_share_and_no_integer_explains_is_reported(estimates_o
 
 
 @pytest.mark.parametrize(
-    ("rival", "verdict", "status"),
+    ("rival", "verdict", "status", "reason"),
     [
-        (101.5, said(), "not supported"),  # an integer explains as much: 6 in BIC, less one ln 400
-        (150.0, said(adequate=False), "not supported"),  # something is unexplained
-        (150.0, said(modes=(1,)), "not identifiable"),  # one mode shows no order
+        (101.5, said(), "open", None),  # an integer explains as much: 6 in BIC, less one ln 400
+        (150.0, said(adequate=False), "open", "unexplained"),
+        (150.0, said(modes=(1,)), "not identifiable", "one mode alone"),
     ],
 )
-def test_an_order_is_withheld(estimates_of, rival, verdict, status):
+def test_an_order_is_not_called_fractional(estimates_of, rival, verdict, status, reason):
     order = pooled_order(
         "alpha", ranked(estimates_of("VI", 100.0), estimates_of("VII", rival)), [verdict] * 4, ALIKE
     )
     assert order.status == status
-    assert order.value is None
+    assert reason in order.reason if reason else order.reason is None
+    assert "1 is excluded" not in sentences.order(order)
+
+
+@pytest.mark.parametrize("order", ["alpha", "lambda"])
+def test_an_order_on_a_beam_with_free_modes_is_withheld(make_estimate, order):
+    """Four parameters of damping from three loss factors."""
+    values = {"zeta": 1e-4, "alpha": 0.8, "gamma": 0.1, "lambda": 0.6}
+    free = make_estimate(
+        "VI", values, np.diag([1e-4] * 4), tuple(values), uniform=False, cost=100.0, bic=100.0
+    )
+    found = pooled_order(order, ranked([free] * 4), [said()] * 4, ALIKE)
+    assert (found.status, found.value) == ("not identifiable", None)
+    assert "3 loss factors" in sentences.order(found)
 
 
 def mixed_in(quantity):
@@ -84,7 +98,7 @@ def mixed_in(quantity):
 def test_an_order_in_which_sessions_differ_in_kind_is_withheld(estimates_of, alpha):
     groups = ranked(estimates_of("VI", 100.0, alpha), estimates_of("VII", 150.0))
     order = pooled_order("alpha", groups, [said()] * 4, mixed_in("alpha"))
-    assert (order.status, order.value, order.mixture) == ("not supported", None, True)
+    assert (order.status, order.mixture) == ("open", True)
     assert "not of one specimen and do not all share it" in sentences.order(order)
 
 
@@ -93,7 +107,7 @@ def test_an_order_that_all_beams_of_a_mixture_share_is_reported(estimates_of):
     groups = ranked(estimates_of("VI", 100.0), estimates_of("VII", 150.0))
     mixed = mixed_in("frequency_hz_1")
     assert pooled_order("alpha", groups, [said()] * 4, mixed).status == "fractional"
-    assert pooled_order("alpha", groups, [said()] * 5, mixed).value is None
+    assert pooled_order("alpha", groups, [said()] * 5, mixed).reason is not None
 
 
 def test_one_session_in_ten_may_hold_something_else(estimates_of):
@@ -109,16 +123,35 @@ def test_an_order_that_could_be_anything_is_not_identifiable(estimates_of):
     assert "not identifiable" in sentences.order(order)
 
 
-@pytest.mark.parametrize(("alpha", "rival", "status"), [(1.005, 99.0, "integer"),
-                                                        (0.97, 101.0, "integer"),
-                                                        (0.97, 97.5, "not supported")])  # fmt: skip
-def test_an_order_of_one_is_told_with_what_it_would_be_if_free(estimates_of, alpha, rival, status):
-    """1 inside the interval; outside, but dismissed by BIC; outside, and not dismissed."""
+@pytest.mark.parametrize(
+    ("alpha", "rival", "status"),
+    [(1.005, 99.0, "compatible"), (0.97, 101.0, "open"), (0.97, 97.5, "open")],
+)
+def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
+    """1 inside the interval; outside, though VII has the lower BIC; outside, and VI has it."""
     groups = ranked(estimates_of("VI", rival, alpha), estimates_of("VII", 100.0))
-    assert groups[0].structure == "VII" or status == "not supported"
     order = pooled_order("alpha", groups, [said("VII", "integer")] * 4, ALIKE)
     assert order.status == status
+    assert order.value == pytest.approx(alpha)
     assert order.interval[0] < alpha < order.interval[1]
+    assert ("1 would do" in sentences.order(order)) == (status == "compatible")
+
+
+def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(estimates_of, make_session):
+    six, seven = estimates_of("VI", 100.0, 0.996), estimates_of("VII", 95.0)
+    sessions = [
+        make_session(f"{n}.mcap", estimates=pair, verdict=said("VII", "integer"))
+        for n, pair in enumerate(zip(six, seven, strict=True))
+    ]
+    both = ranked(six, seven)
+    found = campaign_verdict(sessions, both, ALIKE, (), ())
+    assert (found.headline, found.structure) == ("VI", "VII")
+    assert found.sentences[0].startswith("The numbers are those of type VI: damping by the mat")
+    assert "type VII has the lowest BIC" in found.sentences[0]
+    assert found.alpha.value == pytest.approx(0.996)
+    # Not if it is of two sessions where the other is of all.
+    few = replace(pooled(six), sessions=2)
+    assert freest_estimate([pooled(seven), few]).structure == "VII"
 
 
 def test_damping_that_no_session_needs_is_absent(estimates_of):

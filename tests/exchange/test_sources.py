@@ -65,6 +65,31 @@ def test_a_csv_without_names_has_numbers(text):
     assert "'#1', '#2'" in refused(text("0,1\n1,2\n"), "angle")
 
 
+@pytest.mark.parametrize(
+    ("content", "names"),
+    [
+        ("  1.0e+00  2.5\n -3.0e-01  4\n", ("#1", "#2")),  # as DaISy has them
+        ("1 2.5\n-0.3 4\n\n", ("#1", "#2")),
+        ("u y\n1 2.5\n-0.3 4\n", ("u", "y")),
+        ("# u y\n1 2.5\n-0.3 4\n", ("u", "y")),  # as numpy.savetxt has it
+        ("drive of motor\n1 2.5\n-0.3 4\n", ("#1", "#2")),
+    ],
+)
+@pytest.mark.parametrize("ending", ["dat", "txt"])
+def test_columns_between_blanks_are_read_from_the_first_line_of_numbers_on(
+    text, content, names, ending
+):
+    first, second = values(text(content, f"a.{ending}"), *names)
+    assert first.tolist() == [1.0, -0.3]
+    assert second.tolist() == [2.5, 4.0]
+
+
+def test_a_first_line_of_numbers_is_data_though_a_cell_of_it_is_empty(text):
+    first, third = values(text("1,,3\n4,5,6\n"), "#1", "#3")
+    assert (first.tolist(), third.tolist()) == ([1, 4], [3, 6])
+    np.testing.assert_array_equal(values(text("1,,3\n4,5,6\n"), "#2"), [np.nan, 5])
+
+
 def test_an_empty_cell_is_not_a_number(text):
     np.testing.assert_array_equal(values(text("a,b\n1,2\n,3\nnan,4\n"), "a"), [1, np.nan, np.nan])
 
@@ -81,7 +106,8 @@ def test_an_empty_cell_is_not_a_number(text):
         ("a,b\n1,2\n3,x\n", "b", ("sample 2 of the column 'b'", "'x'", "not a number")),
         ("a,b\ns,deg\n1,2\n", "b", ("sample 1", "'deg'", "below the line with the names")),
         ("a;b\n1;2,5\n3;4,5\n", "b", ("'2,5'", "decimal comma")),
-        ("a b\n1 2\n3 4\n", "b", ("no channel 'b'", "'a b'")),
+        ("a b\n1 2\n3\n", "b", ("sample 2 of the column 'b'", "1 columns")),
+        ("my a b\n1 2\n3 4\n", "b", ("no channel 'b'", "'#1', '#2'")),
         ('a,b\n1,"2\n' + "3,4\n" * 40_000, "b", ("not a CSV file",)),
         ("a" * 70_000 + ",b\n1,2\n", "b", ("a line of more than 65536",)),
     ],
@@ -134,7 +160,7 @@ def test_matlab_integers_are_numbers(tmp_path):
         ("m.b", ("no single struct",)),
         ("text", ("real numbers",)),
         ("cell", ("real numbers",)),
-        ("imaginary", ("real numbers", "complex128")),
+        ("imaginary", ("is complex", "frequency response")),
         ("sparse", ("full array",)),
         ("empty", ("0 samples",)),
     ],

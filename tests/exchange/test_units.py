@@ -29,6 +29,9 @@ from analysis.exchange.units import UNITS, canonical_unit, factor, unit_in_brack
         ("force", "lbf", 4.4482216152605),
         ("time", "ms", 1e-3),
         ("time", " s ", 1.0),
+        ("angle", "0.02 rad", 0.02),  # what one volt stands for
+        ("angle", "2.5e-1deg", math.radians(0.25)),
+        ("torque", "-1.5 mN.m", -1.5e-3),
     ],
 )
 def test_a_unit_has_its_size(quantity, unit, size):
@@ -37,13 +40,25 @@ def test_a_unit_has_its_size(quantity, unit, size):
 
 @pytest.mark.parametrize(
     ("quantity", "unit"),
-    [("torque", "nm"), ("torque", "N"), ("angle", "Deg"), ("angle", ""), ("time", "min")],
+    [
+        ("torque", "nm"),
+        ("torque", "N"),
+        ("angle", "Deg"),
+        ("angle", ""),
+        ("time", "min"),
+        ("angle", "V"),
+        ("angle", "0.02"),
+        ("angle", "0 rad"),
+        ("angle", "0.02 N.m"),
+    ],
 )
 def test_what_is_no_unit_of_the_quantity_is_refused_with_those_that_are(quantity, unit):
     with pytest.raises(ExchangeError, match="choose from") as refusal:
         factor(quantity, unit)
     for name in UNITS[quantity]:
         assert name in str(refusal.value)
+    # The way on for a signal in volts.
+    assert "CHANNEL:0.02" in str(refusal.value)
 
 
 def test_capitals_tell_milli_from_mega():
@@ -54,6 +69,11 @@ def test_capitals_tell_milli_from_mega():
 def test_no_two_units_share_a_spelling():
     names = [name for units in UNITS.values() for name in units]
     assert [canonical_unit(name) for name in names] == names
+
+
+def test_a_signal_s_unit_is_told_as_it_was_stated():
+    choice = parse_choice("lame:0.5 Nm", "torque")
+    assert (str(choice), choice.factor) == ("lame:0.5 N.m", 0.5)
 
 
 def test_a_choice_is_taken_apart_at_its_last_colon():

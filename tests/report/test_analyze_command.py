@@ -157,7 +157,10 @@ def test_a_session_too_short_for_the_segments_says_what_fits(
     write_session, short_signals, tmp_path, analyze_here
 ):
     write_session(tmp_path / "a.mcap", short_signals)
-    refused(analyze_here("a.mcap"), 1, "4000 samples", "17266", "--segment 575 --overlap 86")
+    asked = analyze_here("a.mcap", "--method", "welch")
+    refused(asked, 1, "4000 samples", "17266", "--segment 575 --overlap 86")
+    # Segments that were chosen are not dropped in silence.
+    refused(analyze_here("a.mcap", "--segment", "5000"), 1, "4000 samples", "5000")
 
 
 @pytest.mark.parametrize("field", ["angle_rad", "torque_nm"])
@@ -181,12 +184,13 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
         (("--method", "record", "--rerun", "a.rrd"), ("--rerun", "take --method all")),
         (("--frf", "h3"), ("there is no 'h3'; choose from h1, h2, hv, iv, fft.",)),
         (("--band", "nan,50"), ("--band", "nan,50")),
-        (("--band", "50,1"), ("--band", "0 < F0 < F1")),
+        (("--band", "50,1"), ("--band", "0 <= F0 < F1")),
         (("--band", "-1,50"), ("--band",)),
         (("--band", "1,inf"), ("--band",)),
         (("--band", "1"), ("--band",)),
         (("--band", "1,2,3"), ("--band",)),
         (("--band", "1,5000"), ("500 Hz",)),
+        (("--band", "1,450", "--method", "record"), ("400 Hz", "lower --band")),
         (("--band", "1.0001,1.0002"), ("1.0001",)),
         (("--segment", "0"), ("--segment",)),
         (("--segment", "1e3"), ("--segment",)),

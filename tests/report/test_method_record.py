@@ -45,4 +45,4 @@ def test_the_report_has_no_figure_of_the_paper(done):
 
 
 def test_options_without_effect_are_told(done):
-    assert done[0].stderr.startswith("Warning: --band concern")
+    assert done[0].stderr.startswith("Warning: --segment, --weights")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from analysis.record import MAX_FILLED_SHARE, RecordError, load_record
+from analysis.record import MAX_UNKNOWN_SHARE, RecordError, load_record
 from rigd.session import SessionError
 from rigd.session.format import Status
 
@@ -108,11 +108,16 @@ def test_a_session_stopped_before_its_sweep_is_refused(tmp_path, write_session, 
 
 def test_too_many_missing_ticks_are_refused(tmp_path, write_session, short_signals):
     present = np.ones(5000, bool)
-    present[1000:3000:40] = False  # 50 of 4000, 1.25 %
+    present[1000:3000:10] = False  # 200 of 4000, 5 %: as much as there may be
+    path = write_session(
+        tmp_path / "most.mcap", short_signals.decimated(present), ticks=np.flatnonzero(present)
+    )
+    assert load_record(path).gaps.sweep_missing_ticks == 200
+    present[3001] = False
     path = write_session(
         tmp_path / "a.mcap", short_signals.decimated(present), ticks=np.flatnonzero(present)
     )
-    with pytest.raises(RecordError, match=r"50 of 4000 .* angle .* 1 %"):
+    with pytest.raises(RecordError, match=r"201 of 4000 .* angle .* 5 %"):
         load_record(path)
 
 
@@ -123,7 +128,7 @@ def test_a_long_gap_is_refused_even_if_few_ticks_are_missing(tmp_path, write_ses
     present[10_000:10_101] = False
     signals = signals_of(wave, wave, wave, {}).decimated(present)
     path = write_session(tmp_path / "a.mcap", signals, ticks=np.flatnonzero(present))
-    assert 101 / n < MAX_FILLED_SHARE
+    assert 101 / n < MAX_UNKNOWN_SHARE
     with pytest.raises(RecordError, match=r"101 ticks .* from tick 10000 .*100 ms"):
         load_record(path)
 

@@ -1,0 +1,171 @@
+"""What a campaign says first, for programs: each session's headline, then that of all together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+from analysis.campaigns.random_effects import t_quantile
+from analysis.selection import Quantity
+from analysis.selection.orders import STRONG
+from analysis.structures import PARAMETERS, STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.campaigns.campaign import Campaign
+    from analysis.campaigns.pooled import PooledEstimate
+    from analysis.campaigns.pooled_orders import PooledOrder
+    from analysis.campaigns.ranking import RankedStructure
+    from analysis.campaigns.verdict import CampaignVerdict
+
+_COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
+_UNEXPLAINED: Final = "part of the records is unexplained"
+_MIXTURE: Final = "the mean of a mixture: sessions differ in it in kind"
+_ON_BOUND: Final = "the plain mean: it rests on its bound in some session"
+_ADEQUATE: Final = 0.9
+
+
+def headlines(campaign: Campaign) -> list[dict[str, Any]]:
+    """Collect the headlines of a campaign.
+
+    Parameters
+    ----------
+    campaign : Campaign
+
+    Returns
+    -------
+    list of dict
+        As of single files; the last one, with ``file`` null, is of all sessions together. Without
+        whole-record fits there are none.
+    """
+    found = [dict(each.headline) for each in campaign.sessions if each.headline]
+    pooled, verdict = campaign.headline, campaign.verdict
+    if pooled is not None and verdict is not None:
+        found.append(_shared(campaign, pooled, verdict))
+    return found
+
+
+def _shared(campaign: Campaign, pooled: PooledEstimate, verdict: CampaignVerdict) -> dict[str, Any]:
+    orders = (verdict.alpha, verdict.lambda_)
+    explained = verdict.adequate >= _ADEQUATE * verdict.sessions
+    every = None if explained else _UNEXPLAINED
+    parameters = _parameters(campaign, pooled, orders, every)
+    conditional = campaign.pooled[0]
+    return {
+        "file": None,
+        "type": pooled.name,
+        "parameters": {name: each.as_json() for name, each in parameters.items()},
+        "sizes": _sizes(pooled, orders, every),
+        "modes": _modes(campaign, pooled, every),
+        "structures": [
+            {"type": each.name, "status": _status(each, pooled)} for each in campaign.structures
+        ],
+        "orders": {
+            each.order: {
+                "status": each.status,
+                "interval_95": None if each.interval is None else list(each.interval),
+            }
+            for each in orders
+        },
+        "conditional": None
+        if conditional is pooled
+        else {
+            "type": conditional.name,
+            "on": {
+                name: value
+                for name, value in STRUCTURES[conditional.structure].fixed.items()
+                if name in ("alpha", "lambda")
+            },
+            "parameters": {
+                each.name: Quantity(each.value, each.std, each.interval).as_json()
+                for each in conditional.parameters
+            },
+        },
+        "named": [
+            {
+                "what": each.example.kind,
+                "value": each.example.value,
+                "interval_95": None,
+                "sentence": each.sentence,
+            }
+            for each in verdict.findings
+        ],
+    }
+
+
+def _parameters(
+    campaign: Campaign,
+    pooled: PooledEstimate,
+    orders: tuple[PooledOrder, ...],
+    every: str | None,
+) -> dict[str, Quantity]:
+    mixed = campaign.homogeneity.is_mixed
+    flags = _flags(orders)
+    found = {
+        each.name: Quantity(
+            each.value,
+            each.std,
+            each.interval,
+            every or (_MIXTURE if mixed(each.name) else flags.get(each.name)),
+        )
+        for each in pooled.parameters
+    }
+    free = STRUCTURES[pooled.structure].free
+    for name, value in pooled.plant.parameters.items():
+        if name not in found and (name not in PARAMETERS or name in free):
+            found[name] = Quantity(value, None, None, every or _ON_BOUND)
+    return found
+
+
+def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
+    """Reasons against an order, which its coefficient shares."""
+    return {
+        name: each.reason
+        for each in orders
+        if each.reason is not None
+        for name in (each.order, _COEFFICIENTS[each.order])
+    }
+
+
+def _sizes(
+    pooled: PooledEstimate, orders: tuple[PooledOrder, ...], every: str | None
+) -> list[dict[str, Any]]:
+    flags = _flags(orders)
+    return [
+        {
+            "damping": each.damping,
+            "omega_rad_s": each.omega_rad_s,
+            **Quantity(
+                each.value, each.std, each.interval, every or flags.get(each.order)
+            ).as_json(),
+        }
+        for each in pooled.sizes
+    ]
+
+
+def _modes(campaign: Campaign, pooled: PooledEstimate, every: str | None) -> list[dict[str, Any]]:
+    t, mixed = t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
+
+    def told(value: float, std: float, quantity: str) -> dict[str, Any]:
+        flag = every or (_MIXTURE if mixed(quantity) else None)
+        return Quantity(value, std, (value - t * std, value + t * std), flag).as_json()
+
+    return [
+        {
+            "mode": mode.number,
+            "frequency_hz": told(
+                mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"
+            ),
+            "damping_ratio": told(
+                mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"
+            ),
+        }
+        for mode in pooled.modes
+    ]
+
+
+def _status(each: RankedStructure, pooled: PooledEstimate) -> str:
+    if each.name == pooled.name:
+        return "selected"
+    above = each.bic_above_lowest
+    return "compatible" if above is not None and above < STRONG else "excluded"

@@ -1,0 +1,201 @@
+"""What of an analysis suits a record: the band of the fits, and whether Welch's fits do at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from analysis.settings import LARGEST_SHARE_OF_RATE, PAPER_BAND_HZ, RECORD_BAND_HZ
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from analysis.record import Record
+    from analysis.settings import WelchSettings
+    from analysis.welch_route import WelchAnalysis
+
+Band = tuple[float, float]
+
+_NO_SWEEP: Final = {
+    "step": "a step excites every frequency at one moment, which no average over segments shows",
+    "multisine": "a multisine excites single lines, and segments spread noise between them",
+    "modes": "narrow sweeps excite the modes alone, and the response between them is noise",
+}
+"""Excitation → why Welch's method does not suit it."""
+
+_WHOLE: Final = 0.99
+"""Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
+
+
+def record_band_hz(record: Record, asked_hz: Band | None = None) -> Band:
+    """Band of the whole-record fits: the one asked for, or as much of the usual one as there is.
+
+    Parameters
+    ----------
+    record : Record
+    asked_hz : tuple of float, optional
+        In Hz; used as it is.
+    """
+    return asked_hz or _within(RECORD_BAND_HZ, record.rate_hz)
+
+
+def check_record_band(record: Record, asked_hz: Band | None) -> None:
+    """Refuse a band that the record's rate does not hold.
+
+    Parameters
+    ----------
+    record : Record
+    asked_hz : tuple of float or None
+        In Hz.
+
+    Raises
+    ------
+    SettingsError
+        It ends too high.
+    """
+    from analysis.estimate import SettingsError
+
+    limit_hz = LARGEST_SHARE_OF_RATE * record.rate_hz
+    if asked_hz is not None and asked_hz[1] > limit_hz:
+        raise SettingsError(
+            f"{record.path}: the band reaches {asked_hz[1]:g} Hz, but whole-record fits end at "
+            f"{limit_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the rate of {record.rate_hz:g} Hz; "
+            "lower --band."
+        )
+
+
+def welch_settings(
+    record: Record, settings: WelchSettings, asked_hz: Band | None = None
+) -> WelchSettings:
+    """Choose the band of the Welch fits: the one asked for, or what there is of the paper's.
+
+    A band in the settings that is not the paper's was asked for, too. A band from 0 Hz begins at
+    the first frequency above it, since a constant tells nothing.
+
+    Parameters
+    ----------
+    record : Record
+    settings : WelchSettings
+    asked_hz : tuple of float, optional
+        In Hz.
+    """
+    if asked_hz is None and settings.band_hz != PAPER_BAND_HZ:
+        asked_hz = settings.band_hz
+    first_hz, last_hz = asked_hz or _within(PAPER_BAND_HZ, record.rate_hz)
+    if first_hz == 0.0:
+        first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
+    return replace(settings, band_hz=(first_hz, last_hz))
+
+
+def remarks(record: Record, asked_hz: Band | None = None) -> tuple[str, ...]:
+    """Sentences on what was made to suit the record.
+
+    Parameters
+    ----------
+    record : Record
+    asked_hz : tuple of float, optional
+        Band that was asked for, in Hz.
+    """
+    _, last_hz = record_band_hz(record, asked_hz)
+    if asked_hz is not None or last_hz == RECORD_BAND_HZ[1]:
+        return ()
+    return (
+        f"Fits end at {last_hz:g} Hz, {LARGEST_SHARE_OF_RATE:g} of the record's rate of "
+        f"{record.rate_hz:g} Hz, instead of {RECORD_BAND_HZ[1]:g} Hz.",
+    )
+
+
+def welch_analysis(
+    record: Record,
+    settings: WelchSettings,
+    asked_hz: Band | None = None,
+    *,
+    optional: bool,
+    on_step: Callable[[str], None] = lambda _done: None,
+) -> tuple[WelchAnalysis | None, str | None]:
+    """Run Welch's fits where they suit a record.
+
+    Parameters
+    ----------
+    record : Record
+    settings : WelchSettings
+    asked_hz : tuple of float, optional
+        Band that was asked for, in Hz.
+    optional : bool
+        Whether the record is analysed without them, too. Even so, segments or an estimator that
+        were chosen for it are not dropped in silence.
+    on_step : callable, optional
+        As of `analysis.welch_route.analyse`.
+
+    Returns
+    -------
+    analysis : WelchAnalysis or None
+    left_out : str or None
+        Sentence that says why there is none.
+
+    Raises
+    ------
+    EstimateError
+        They were to be run, and cannot be.
+    """
+    from analysis.estimate import EstimateError, SettingsError
+    from analysis.welch_route import analyse
+
+    optional = optional and settings.are_usual
+    reason = against_welch(record, asked_hz) if optional else None
+    if reason is None:
+        try:
+            return analyse(record, welch_settings(record, settings, asked_hz), on_step), None
+        except EstimateError as error:
+            if not optional or isinstance(error, SettingsError):
+                raise
+            reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")
+    return None, f"Welch fits left out: {reason}."
+
+
+def against_welch(record: Record, asked_hz: Band | None = None) -> str | None:
+    """Say why Welch's method does not suit a record, as the end of a sentence; None if it may.
+
+    Parameters
+    ----------
+    record : Record
+    asked_hz : tuple of float, optional
+        Band that was asked for, in Hz.
+    """
+    kind = record.metadata.get("excitation", "")
+    if kind in _NO_SWEEP:
+        return f"{_NO_SWEEP[kind]} (--method welch makes them all the same)"
+    planned_s = _number(record, "duration_s")
+    swept_s = record.sweep_samples / record.rate_hz
+    if asked_hz is not None or planned_s is None or swept_s >= _WHOLE * planned_s:
+        return None
+    reached_hz = _reached_hz(record, swept_s / planned_s)
+    first_hz, last_hz = _within(PAPER_BAND_HZ, record.rate_hz)
+    if reached_hz is None or not first_hz < reached_hz < last_hz:
+        return None
+    return (
+        f"the sweep ended after {swept_s:.4g} of {planned_s:g} s, at {reached_hz:.3g} Hz, and they "
+        f"would be over noise beyond; --band {first_hz:g},{reached_hz:.3g} makes them"
+    )
+
+
+def _reached_hz(record: Record, share: float) -> float | None:
+    """Frequency that an upward sweep had reached after a share of its duration."""
+    start_hz, stop_hz = _number(record, "start_hz"), _number(record, "stop_hz")
+    if start_hz is None or stop_hz is None or stop_hz <= start_hz:
+        return None
+    return start_hz + share * (stop_hz - start_hz)
+
+
+def _number(record: Record, key: str) -> float | None:
+    try:
+        return float(record.metadata[key])
+    except (KeyError, ValueError):
+        return None
+
+
+def _within(band_hz: Band, rate_hz: float) -> Band:
+    """As much of a band as a rate holds; all of it where nothing would be left."""
+    first_hz, last_hz = band_hz
+    limit_hz = min(last_hz, LARGEST_SHARE_OF_RATE * rate_hz)
+    return (first_hz, limit_hz) if first_hz < limit_hz else band_hz

@@ -1,0 +1,79 @@
+"""One structure for all sessions: what noise makes each of them select does not part them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.campaigns.common_structure import common_structure
+from analysis.campaigns.homogeneity import homogeneity
+from analysis.campaigns.pooled import pooled_estimates
+
+FREE = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 0.055, "lambda": 0.594}
+FREQUENCY_HZ = 44.8132
+STD_HZ = 3e-4
+SHIFT_HZ = 26e-4
+"""What type VII makes of mode 3 where alpha is 0.996: nine standard deviations of type VI."""
+
+
+@pytest.fixture
+def sessions(make_estimate, make_session):
+    """Forty of one beam: seven select type VI, the others type VII, whose mode 3 is elsewhere."""
+    rng = np.random.default_rng(7)
+
+    def estimate(structure, names, frequency_hz, bic):
+        values = {name: FREE[name] for name in names}
+        std = np.diag([(0.01 * FREE[name]) ** 2 for name in names])
+        found = make_estimate(structure, values, std, names, cost=bic, bic=bic)
+        (mode,) = found.modes
+        mode = replace(mode, frequency_hz=frequency_hz, frequency_std_hz=STD_HZ)
+        return replace(found, modes=(mode,))
+
+    def make(number):
+        noise_hz = rng.normal(scale=STD_HZ)
+        six = estimate("VI", list(FREE), FREQUENCY_HZ + noise_hz, 100.0)
+        of_seven = [name for name in FREE if name != "alpha"]
+        lower = 103.0 if number % 6 == 0 else 94.0
+        seven = estimate("VII", of_seven, FREQUENCY_HZ - SHIFT_HZ + noise_hz, lower)
+        return make_session(f"{number}.mcap", estimates=(six, seven))
+
+    return [make(number) for number in range(40)]
+
+
+def test_forty_sessions_that_differ_in_noise_alone_are_of_one_specimen(sessions):
+    selected = {min(each.record_estimates, key=lambda one: one.bic).name for each in sessions}
+    assert selected == {"VI", "VII"}
+    pooled = pooled_estimates(sessions)
+    found = homogeneity(sessions, pooled, ())
+    assert (found.structure, found.mixed) == ("VI", False)
+    assert found.of("frequency_hz_1").chance > 0.01
+
+
+def test_another_beam_among_them_is_still_told_apart(sessions):
+    moved = []
+    for number, session in enumerate(sessions):
+        by = 5e-4 * FREQUENCY_HZ if number >= 20 else 0.0
+        estimates = tuple(
+            replace(
+                each,
+                modes=(replace(each.modes[0], frequency_hz=each.modes[0].frequency_hz + by),),
+            )
+            for each in session.record_estimates
+        )
+        moved.append(replace(session, record_estimates=estimates))
+    found = homogeneity(moved, pooled_estimates(moved), ())
+    assert found.mixed
+    assert sorted(map(len, found.leading.groups)) == [20, 20]
+
+
+def test_the_beam_is_that_which_all_sessions_support(sessions, make_estimate):
+    """A structure that some sessions lack compares none; the beam is that of the pooled."""
+    names = list(FREE)
+    free = replace(
+        make_estimate("VII", FREE, np.diag([1e-6] * 4), names, cost=50.0, uniform=False, bic=50.0),
+        modes=sessions[0].record_estimates[0].modes,
+    )
+    other = [replace(each, record_estimates=(*each.record_estimates, free)) for each in sessions]
+    assert common_structure(other, pooled_estimates(other)) == "VII, modes free"
+    assert common_structure([*other[:39], sessions[39]], ()) == "VI"
+    assert common_structure([], ()) is None

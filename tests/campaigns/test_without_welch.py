@@ -1,0 +1,70 @@
+"""A campaign of sessions that Welch's method does not suit: the whole records alone."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from analysis.campaigns import campaign
+from analysis.campaigns.campaign import _of_one_experiment
+from analysis.campaigns.tables import tables_text
+from analysis.campaigns.write import write_campaign
+from analysis.settings import WelchSettings
+
+
+@pytest.fixture(scope="module")
+def found(make_file, tmp_path_factory):
+    """Two sessions whose files say that their excitation is a multisine."""
+    folder = tmp_path_factory.mktemp("multisine")
+    paths = [
+        make_file(
+            folder / f"{seed}.mcap", seed, excitation="multisine", specimen="A", operator="Eve",
+            note="[clamp] new",
+        )
+        for seed in range(2)
+    ]  # fmt: skip
+    return campaign(paths, WelchSettings(types=("I",)), structures=("III",), jobs=2)
+
+
+def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
+    assert found.failures == ()
+    assert (found.nominal, found.statistics) == ((), ())
+    assert found.headline.name == "III"
+    _, damping = truth
+    zeta = found.headline.by_name["zeta"]
+    assert zeta.interval[0] < damping.zeta < zeta.interval[1]
+    for session in found.sessions:
+        assert session.warnings[-1].startswith("Welch fits left out: a multisine")
+
+
+def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
+    write_campaign(found, tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"pooled.png", "pooled.csv", "session_list.csv", "tables.txt"} <= names
+    assert not [name for name in names if name.startswith(("figure", "table3", "table4"))]
+    assert "Table 3" not in (tmp_path / "tables.txt").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert 'id="paper"' not in page
+    assert "Welch fits left out" in page
+    json.loads((tmp_path / "campaign.json").read_text())
+
+
+def test_sessions_are_listed_with_what_their_files_say(found):
+    line = next(each for each in tables_text(found).splitlines() if each.startswith("0.mcap "))
+    for said in ("A", "Eve", "[clamp] new", "yes"):
+        assert said in line
+
+
+def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_session):
+    sessions = [make_session(f"{number}.mcap") for number in range(3)]
+    odd = replace(
+        sessions[0].without_welch(), path=Path("odd.mcap"), warnings=("Welch fits left out: x.",),
+        experiment=replace(sessions[0].experiment, identity=("odd",)),
+    )  # fmt: skip
+    kept, (failure,) = _of_one_experiment([*sessions, odd])
+    assert kept == sessions
+    assert "odd.mcap: Welch fits left out: x. Most others have them" in failure.message
+    both, none = _of_one_experiment([sessions[0], odd])
+    assert none == []
+    assert [each.frequency_hz.size for each in both] == [0, 0]

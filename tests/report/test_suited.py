@@ -1,0 +1,144 @@
+"""What suits a record is done with it: its band, and Welch's fits only where they say something."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.estimate import EstimateError, SettingsError
+from analysis.record import load_record
+from analysis.settings import WelchSettings
+from analysis.suited import (
+    against_welch,
+    record_band_hz,
+    remarks,
+    welch_analysis,
+    welch_settings,
+)
+from analysis.whole_record import Measurement
+from analysis.whole_record.comparison import Comparison
+
+
+@pytest.fixture
+def record_of(write_session, short_signals, tmp_path):
+    """Read a session of 4 s of sweep, with metadata as wanted and every so-manyth sample."""
+
+    def make(every=1, **metadata):
+        signals = short_signals.decimated(slice(None, None, every))
+        segments = {
+            name: (first // every, end // every)
+            for name, (first, end) in short_signals.segments.items()
+        }
+        stated = {"rate_hz": repr(1000.0 / every), **metadata}
+        ticks = np.arange(len(signals.angle_rad))
+        path = write_session(
+            tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap", signals, metadata=stated,
+            segments=segments, ticks=ticks, t_ns=ticks * every * 1_000_000,
+        )  # fmt: skip
+        return load_record(path)
+
+    return make
+
+
+@pytest.mark.parametrize(("every", "last_hz"), [(1, 50.0), (8, 50.0), (10, 40.0), (25, 16.0)])
+def test_the_band_ends_at_four_tenths_of_the_rate(record_of, every, last_hz):
+    record = record_of(every)
+    assert record_band_hz(record) == (0.0, last_hz)
+    assert welch_settings(record, WelchSettings()).band_hz == (0.5875, last_hz)
+    assert [f"{last_hz:g} Hz" in each for each in remarks(record)] == [True] * (last_hz < 50)
+    # And that is what the estimator takes: 0.4 of the rate, and nothing beyond.
+    measurement = Measurement.of_record(record)
+    assert Comparison.of(measurement, record_band_hz(record)).frequency_hz[-1] <= last_hz
+
+
+def test_a_band_asked_for_is_of_all_fits(record_of):
+    record = record_of()
+    assert record_band_hz(record, (2.0, 30.0)) == (2.0, 30.0)
+    assert welch_settings(record, WelchSettings(), (2.0, 30.0)).band_hz == (2.0, 30.0)
+    assert remarks(record, (2.0, 30.0)) == ()
+    # A frequency response has nothing to say of 0 Hz: its next bin is the first.
+    assert welch_settings(record, WelchSettings(), (0.0, 30.0)).band_hz == (1 / 160, 30.0)
+    own = WelchSettings(band_hz=(1.0, 60.0))
+    assert welch_settings(record_of(10), own).band_hz == (1.0, 60.0)
+
+
+@pytest.mark.parametrize("kind", ["step", "multisine", "modes"])
+def test_welch_s_method_is_for_sweeps(record_of, kind):
+    record = record_of(excitation=kind, duration_s="4.0")
+    assert kind in f"{against_welch(record)} modes"
+    found, left_out = welch_analysis(record, WelchSettings(), optional=True)
+    assert found is None
+    assert left_out.startswith("Welch fits left out: ")
+    chosen = WelchSettings(segment_length=1000, types=("I",), weightings=("const",))
+    assert welch_analysis(record, chosen, optional=True)[0] is not None
+
+
+def test_a_stopped_sweep_is_not_fitted_beyond_where_it_went(record_of):
+    stated = {"start_hz": "0.05", "stop_hz": "50.0", "duration_s": "8.0"}
+    reason = against_welch(record_of(**stated))
+    assert "after 4 of 8 s, at 25 Hz" in reason
+    assert "--band 0.5875,25" in reason
+    # With the band narrowed so far, or nothing missing, there is nothing against it.
+    assert against_welch(record_of(**stated), (0.5875, 25.0)) is None
+    assert against_welch(record_of(**{**stated, "duration_s": "4.0"})) is None
+    # Downwards the low frequencies are missing, which the sentence could not tell.
+    assert against_welch(record_of(**{**stated, "start_hz": "50", "stop_hz": "0.05"})) is None
+
+
+def test_a_short_sweep_is_told_with_what_would_fit(record_of):
+    found, left_out = welch_analysis(record_of(), WelchSettings(), optional=True)
+    assert found is None
+    assert "--segment 575 --overlap 86" in left_out
+    with pytest.raises(EstimateError):
+        welch_analysis(record_of(), WelchSettings(), optional=False)
+    wrong = WelchSettings(types=("I",), band_hz=(1.0, 900.0))
+    with pytest.raises(SettingsError):
+        welch_analysis(record_of(), wrong, optional=True)
+
+
+@pytest.fixture(scope="module")
+def slow_signals(make_signals):
+    """A sweep of 20 s past two modes, as a data logger of 100 Hz has it."""
+    signals = make_signals(rest_s=1.0, sweep_s=20.0, ring_down_s=2.0, noise_nm=1e-3)
+    segments = {name: (a // 10, b // 10) for name, (a, b) in signals.segments.items()}
+    return replace(signals.decimated(slice(None, None, 10)), segments=segments)
+
+
+def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_here, tmp_path):
+    ticks = np.arange(len(slow_signals.angle_rad))
+    write_session(
+        tmp_path / "slow.mcap", slow_signals, metadata={"rate_hz": "100.0", "duration_s": "20.0"},
+        t_ns=ticks * 10_000_000,
+    )  # fmt: skip
+    result = analyze_here("slow.mcap", "--json", "slow.json", "--report", "r")
+    assert result.returncode == 0, result.stderr
+    content = json.loads((tmp_path / "slow.json").read_text())
+    (record,) = content["records"]
+    assert record["band_hz"] == [0.0, 40.0]
+    (file,) = content["files"]
+    assert any("Fits end at 40 Hz" in warning for warning in file["warnings"])
+    modes = [mode for mode in content["modes"] if mode["estimator"] == "record"]
+    assert modes[1]["frequency_hz"] == pytest.approx(16.0, rel=5e-3)
+    # Warnings of the program, not of its libraries.
+    assert all(line.startswith("Warning: slow.mcap:") for line in result.stderr.splitlines())
+    band = analyze_here("slow.mcap", "--method", "record", "--band", "1,20", "--json", "b.json")
+    assert (band.returncode, band.stderr) == (0, "")
+    assert json.loads((tmp_path / "b.json").read_text())["records"][0]["band_hz"] == [1.0, 20.0]
+
+
+def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
+    write_session, make_signals, analyze_here, tmp_path
+):
+    """What is in the file decides, so a sweep that says that it is a step will do."""
+    signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
+    write_session(tmp_path / "step.mcap", signals, metadata={"excitation": "step"})
+    result = analyze_here("step.mcap", "--json", "a.json", "--report", "r")
+    assert result.returncode == 0
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("Warning: step.mcap: Welch fits left out: a step excites")
+    content = json.loads((tmp_path / "a.json").read_text())
+    assert {fit["estimator"] for fit in content["fits"]} == {"record"}
+    assert content["errors"] == []
+    assert any("left out" in warning for warning in content["files"][0]["warnings"])
+    assert "Welch fits left out" in (tmp_path / "r" / "report.html").read_text()
