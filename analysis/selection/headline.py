@@ -248,7 +248,12 @@ def of_fit(
             if _has(fit.structure, each)
         },
         sizes=tuple(
-            _size(each, size, unexplained or reasons.get(_NAMES[each][1]))
+            # A loss factor is known without its order; a coefficient alone belongs to it.
+            _size(
+                each,
+                size,
+                unexplained or (reasons.get(_NAMES[each][1]) if size.omega_rad_s is None else None),
+            )
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None
         ),

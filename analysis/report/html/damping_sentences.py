@@ -51,8 +51,8 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
     found.extend(
         f"The {each.damping} damping {_size(each)}{_order(told, each)}."
         for each in told.sizes
-        # A size that holds for one assumed order says nothing of the antenna.
-        if each.omega_rad_s is not None or not _flagged(told, each)
+        # A coefficient that holds for one assumed order says nothing of the antenna.
+        if each.size.flag is None and (each.omega_rad_s is not None or not _flagged(told, each))
     )
     return tuple(found)
 
