@@ -95,7 +95,7 @@ def _order(told: Headline, each: Size) -> str:
     if order.interval_95 is None or order.flag is not None:
         return f"; its order {symbol} is not known"
     value, low, high = estimate((order.value, *order.interval_95), order.std)
-    return f", of the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
+    return f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
 
 
 def _listed(parts: list[str]) -> str:
