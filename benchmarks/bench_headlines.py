@@ -1,0 +1,376 @@
+"""Headlines as printed, against truths that are known: coverage, widths and statements by cell.
+
+``bench_headlines.py [--cells TEXT ...] [--count N] [--first SEED]`` judges N records of each cell
+whose name holds one of the texts, and prints of every number of `headlines` in the analyzer's
+document: how many 95 % intervals without a flag hold the truth, with Wilson's interval (marked
+``<`` or ``>`` where 90 to 99 % is missed beyond chance); ``x``, the median width over that of the
+true structure's own fit; the mean error in standard deviations; and the same coverage of what has
+a flag. Then what is missed of all that is asked for.
+
+With ``--file FILE`` a line is appended for each record, and records that stand there already are
+not judged again; ``--seconds S`` stops in time, and the next call goes on. ``--print`` only counts.
+``--processes P`` judges on P cores. All cells with 50 records each take some hours.
+
+``--rig`` judges sessions of the simulated rig that is shipped, in its own closed loop and through
+the command line: ``rigd run chirp --fast`` and ``analyze --json``, seed by seed.
+
+The records are made apart from what is judged (`independent_records.py`). Cells: alpha and lambda
+of the damping, whose sizes at 20 Hz and 2.55 Hz are those of the paper's type VI, by the noise;
+"ringing", the beam swings when the record begins; "undeclared", rho/EI is off by 1 % and EI by 2 %
+in the file, and 0.3 ms of delay and a clamp of 1e-5 kg m² are not in it; "not uniform", modes 2
+and 3 are stiffer by 0.6 and -1.3 %; "one mode", the sweep ends at 10 Hz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from headline_scores import (
+    Scored,
+    Told,
+    complaints,
+    containing,
+    loss_frequencies_hz,
+    loss_told,
+    names_of,
+    share_held,
+    shown,
+    told,
+    typical_width,
+)
+from independent_records import (
+    DENSITY_KG_PER_M,
+    LENGTH_M,
+    RATE_HZ,
+    REST_S,
+    STIFFNESS_N_M2,
+    SWEEP_S,
+    Exact,
+    Truth,
+    exact,
+)
+
+from analysis.record import Gaps, Record, load_record
+from analysis.report.document import document
+from analysis.report.html import Subject
+from analysis.report.record_figure_bands import loss_factors
+from analysis.selection import select
+from analysis.structures import STRUCTURES
+from analysis.whole_record import BAND_HZ, Measurement, fit_record
+from rigd.beam import Beam
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+ALPHAS = (0.8, 0.98, 0.99, 0.995, 0.996, 1.0, 1.005)
+LAMBDAS = (0.5, 0.594, 1.0)
+NOISE_MNM = (3, 10, 30)
+SPECIAL = ((0.996, 0.594), (0.8, 0.594), (1.0, 1.0))
+"""Orders of the damping in the cells where something else is the matter."""
+
+_INTERNAL_RAD_S, _EXTERNAL_RAD_S = 2 * math.pi * 20.0, 2 * math.pi * 2.55
+_INTERNAL = 7.1e-5 * _INTERNAL_RAD_S**0.996
+_EXTERNAL = 5.5e-2 * _EXTERNAL_RAD_S**0.594
+_RATIO = DENSITY_KG_PER_M / STIFFNESS_N_M2
+_UNDECLARED = {
+    "density_over_stiffness": 1.01 * _RATIO,
+    "bending_stiffness_n_m2": 1.02 * STIFFNESS_N_M2,
+    "delay_s": 3e-4,
+    "tool_inertia_kg_m2": 1e-5,
+}
+_RIG = "shipped rig"
+_PROFILE = Path(__file__).parents[1] / "hw_profiles" / "sim.toml"
+_NORMAL_95 = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """What records of one kind have in common.
+
+    Attributes
+    ----------
+    truth : Truth
+    noise_nm : float
+    ringing : bool
+    last_hz : float
+        Where the sweep ends.
+    """
+
+    truth: Truth
+    noise_nm: float
+    ringing: bool = False
+    last_hz: float = 50.0
+
+    def record(self, seed: int) -> Record:
+        """Make one record, as if it had been read from a file."""
+        made = _exact(self.truth, self.last_hz, self.ringing)
+        angle_rad, torque_nm = made.noisy(self.noise_nm, seed)
+        everywhere = np.ones(angle_rad.size, dtype=bool)
+        first = round(REST_S * RATE_HZ)
+        return Record(
+            path=Path(f"seed-{seed}.mcap"),
+            time_s=np.arange(angle_rad.size) / RATE_HZ,
+            reference_rad=made.reference_rad,
+            angle_rad=angle_rad,
+            torque_nm=torque_nm,
+            angle_known=everywhere,
+            torque_known=everywhere,
+            rate_hz=RATE_HZ,
+            beam=Beam(LENGTH_M, DENSITY_KG_PER_M, STIFFNESS_N_M2),
+            angle_delay_s=0.0,
+            torque_delay_s=0.0,
+            tool_inertia_kg_m2=0.0,
+            sweep=slice(first, first + round(SWEEP_S * RATE_HZ)),
+            rest_angle_rad=0.0,
+            gaps=Gaps(0, 0, 0, 0, 0),
+            flags={},
+            warnings=(),
+            metadata={"excitation": "chirp"},
+            outcome="complete",
+        )
+
+
+@lru_cache(maxsize=1)
+def _exact(truth: Truth, last_hz: float, ringing: bool) -> Exact:
+    return exact(truth, last_hz=last_hz, ringing=ringing)
+
+
+def damped(alpha: float, lambda_: float, **other: Any) -> Truth:  # noqa: ANN401 - fields of Truth
+    """Truth of some orders, with the paper's damping at 20 Hz and 2.55 Hz."""
+    return Truth(
+        zeta=_INTERNAL / _INTERNAL_RAD_S**alpha,
+        alpha=alpha,
+        gamma=_EXTERNAL / _EXTERNAL_RAD_S**lambda_,
+        lambda_=lambda_,
+        **other,
+    )
+
+
+def cells() -> Iterator[tuple[str, Cell]]:
+    """Every cell with its name; those of one beam follow each other."""
+    for lambda_, alpha, noise in itertools.product(LAMBDAS, ALPHAS, NOISE_MNM):
+        name = f"alpha {alpha:g}, lambda {lambda_:g}, {noise} mN·m"
+        yield name, Cell(damped(alpha, lambda_), 1e-3 * noise)
+    for alpha, lambda_ in SPECIAL:
+        orders, plain = f"alpha {alpha:g}, lambda {lambda_:g}", damped(alpha, lambda_)
+        levels = NOISE_MNM if (alpha, lambda_) == SPECIAL[0] else (10,)
+        for noise in levels:
+            name, level = f"{orders}, {noise} mN·m", 1e-3 * noise
+            yield f"ringing, {name}", Cell(plain, level, ringing=True)
+        for noise in levels:
+            name, level = f"{orders}, {noise} mN·m", 1e-3 * noise
+            yield f"undeclared, {name}", Cell(damped(alpha, lambda_, **_UNDECLARED), level)
+        for noise in levels:
+            name, level = f"{orders}, {noise} mN·m", 1e-3 * noise
+            uneven = damped(alpha, lambda_, offsets=(0.006, -0.013))
+            yield f"not uniform, {name}", Cell(uneven, level)
+        yield f"one mode, {orders}, 10 mN·m", Cell(plain, 1e-2, last_hz=10.0)
+
+
+CELLS = dict(cells())
+
+
+def judged(name: str, seed: int) -> Scored:
+    """Make one record of a cell and judge it as ``analyze`` does, within this process."""
+    if name == _RIG:
+        return _judged_rig(seed)
+    cell = CELLS[name]
+    record = cell.record(seed)
+    start = time.process_time()
+    selection = select(Measurement.of_record(record))
+    spent_s = time.process_time() - start
+    results = document([], {}, [Subject.of(record, selection, BAND_HZ)])
+    return scored(name, seed, spent_s, results, record, cell.truth)
+
+
+def _judged_rig(seed: int) -> Scored:
+    """Run and analyse one session of the shipped rig through the command line."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = ("rigd", "run", "chirp", "--fast", "--seed", str(seed), "--output", folder, "--json")
+        (session,) = json.loads(_output(run))["sessions"]
+        options = ("--method", "record", "--report", f"{folder}/report", "--json", "-")
+        start = time.monotonic()
+        results = json.loads(_output(("analysis", session["path"], *options)))
+        spent_s = time.monotonic() - start
+        record = load_record(Path(session["path"]))
+        return scored(_RIG, seed, spent_s, results, record, rig_truth())
+
+
+def _output(command: tuple[str, ...]) -> str:
+    module, *arguments = command
+    done = subprocess.run(
+        [sys.executable, "-m", module, *arguments], check=True, capture_output=True, text=True
+    )
+    return done.stdout
+
+
+def rig_truth() -> Truth:
+    """Take the simulated beam from the profile that is shipped."""
+    profile = tomllib.loads(_PROFILE.read_text())
+    beam, sensor = profile["beam"], profile["sensor"]
+    damping = {name: entry["value"] for name, entry in beam["damping"].items()}
+    stiffness = beam["bending_stiffness_n_m2"]["value"]
+    if beam["length_m"]["value"] != LENGTH_M:
+        raise ValueError("the beam of the profile is not as long as that of the closed form")
+    return Truth(
+        zeta=damping["zeta"],
+        alpha=damping["alpha"],
+        gamma=damping["gamma"],
+        lambda_=damping["lambda"],
+        density_over_stiffness=beam["density_kg_per_m"]["value"] / stiffness,
+        bending_stiffness_n_m2=stiffness,
+        delay_s=0.0,
+        tool_inertia_kg_m2=sensor["tool_inertia_kg_m2"]["value"],
+    )
+
+
+def scored(
+    name: str, seed: int, spent_s: float, results: dict[str, Any], record: Record, truth: Truth
+) -> Scored:
+    """Set a document of one record beside the truth."""
+    (headline,), (entry,) = results["headlines"], results["records"]
+    contains = containing(truth)
+    curves = entry["curves"]
+    own = _own(record, truth, contains[0], loss_frequencies_hz(curves))
+    of_name = {name: [each for each in own if each.name == name] for name in names_of(own)}
+    return Scored(
+        cell=name,
+        seed=seed,
+        cpu_s=round(spent_s, 3),
+        type=headline["type"],
+        told=(*told(headline, truth), *loss_told(curves, truth)),
+        own={name: typical_width(its) for name, its in of_name.items()},
+        own_holds={name: share_held(its) for name, its in of_name.items()},
+        contains=contains,
+        structures={its["type"]: its["status"] for its in headline["structures"]},
+        orders={
+            order: [truth.parameters[order], its["status"], its["interval_95"]]
+            for order, its in headline["orders"].items()
+        },
+        named=[its["what"] for its in headline["named"]],
+    )
+
+
+def _own(record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]) -> list[Told]:
+    """Fit the true structure, and nothing else."""
+    uniform = not any(truth.offsets)
+    structure = STRUCTURES[name.partition(",")[0]]
+    (fit,) = fit_record(Measurement.of_record(record), [structure], uniform=uniform).fits
+    entries = [
+        Told(key, truth.parameters[key], fit.parameters[key], ends)
+        for key, ends in fit.interval.items()
+        if key in truth.parameters
+    ]
+    for damping, size, of, coefficient in (
+        ("internal", fit.internal, truth.internal_size, truth.zeta),
+        ("external", fit.external, truth.external_size, truth.gamma),
+    ):
+        if size is not None:
+            omega = size.omega_rad_s
+            true = coefficient if omega is None else of(omega)
+            entries.append(_symmetric(f"{damping} size", true, size.value, size.std))
+    for mode in fit.modes:
+        frequency, ratio = truth.frequency_hz(mode.number), truth.damping_ratio(mode.number)
+        entries += [
+            _symmetric(f"f{mode.number}", frequency, mode.frequency_hz, mode.frequency_std_hz),
+            _symmetric(f"xi{mode.number}", ratio, mode.damping_ratio, mode.damping_ratio_std),
+        ]
+    total = loss_factors(fit, loss_hz).total
+    true = truth.loss_factor(loss_hz)
+    low, high = total.limits()
+    return [
+        *entries,
+        *(
+            Told("loss factor", *map(float, (at, value)), (float(least), float(most)))
+            for at, value, least, most in zip(true, total.value, low, high, strict=True)
+        ),
+    ]
+
+
+def _symmetric(name: str, truth: float, value: float, std: float) -> Told:
+    half = _NORMAL_95 * std
+    return Told(name, truth, value, (value - half, value + half))
+
+
+def run(
+    tasks: list[tuple[str, int]], processes: int, until_s: float
+) -> Iterator[tuple[tuple[str, int], Scored | BaseException]]:
+    """Judge one after the other, on several cores, as long as there is time."""
+    if processes == 1:
+        for task in tasks:
+            if time.monotonic() > until_s:
+                return
+            try:
+                yield task, judged(*task)
+            except Exception as error:  # a record that cannot be judged is told, not fatal
+                yield task, error
+        return
+    waiting = iter(tasks)
+    with ProcessPoolExecutor(processes) as pool:
+        running: dict[Future[Scored], tuple[str, int]] = {}
+        while True:
+            for task in itertools.islice(waiting, processes + 1 - len(running)):
+                if time.monotonic() > until_s:
+                    break
+                running[pool.submit(judged, *task)] = task
+            if not running:
+                return
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield running.pop(future), future.exception() or future.result()
+
+
+def main() -> None:
+    """Judge the cells asked for, and print what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cells", nargs="+", default=[""], help="those whose name holds a text")
+    parser.add_argument("--count", type=int, default=2, help="records of each cell")
+    parser.add_argument("--first", type=int, default=1000, help="seed of the first")
+    parser.add_argument("--file", type=Path, help="one line a record; goes on where it ends")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after these")
+    parser.add_argument("--processes", type=int, default=1, help="cores")
+    parser.add_argument("--print", action="store_true", help="judge none, count those in the file")
+    parser.add_argument("--rig", action="store_true", help="sessions of the shipped rig instead")
+    given = parser.parse_args()
+    names = [_RIG] if given.rig else [n for n in CELLS if any(text in n for text in given.cells)]
+    done: list[Scored] = []
+    if given.file and given.file.exists():
+        done = [Scored.from_line(line) for line in given.file.read_text().splitlines()]
+    there = {(each.cell, each.seed) for each in done}
+    seeds = range(given.first, given.first + (0 if given.print else given.count))
+    tasks = [task for task in itertools.product(names, seeds) if task not in there]
+    for (name, seed), result in run(tasks, given.processes, time.monotonic() + given.seconds):
+        if isinstance(result, BaseException):
+            print(f"{name}, seed {seed}: {type(result).__name__}: {result}", file=sys.stderr)
+            continue
+        done.append(result)
+        if given.file:
+            with given.file.open("a") as file:
+                file.write(result.line() + "\n")
+    by_cell = {name: [each for each in done if each.cell == name] for name in names}
+    by_cell = {name: sessions for name, sessions in by_cell.items() if sessions}
+    for name, sessions in by_cell.items():
+        print(shown(name, sessions), flush=True)
+    missed = complaints(by_cell)
+    print(f"\nMissed of what is asked for: {len(missed) or 'nothing'}")
+    for line in missed:
+        print(f"    {line}")
+
+
+if __name__ == "__main__":
+    main()
