@@ -1,0 +1,119 @@
+"""The benchmark of headlines goes on where it ended, and judges what it says it judges."""
+
+import json
+import sys
+from pathlib import Path
+
+import bench_headlines
+import pytest
+from bench_headlines import CELLS, judged, main, rig_truth
+from headline_scores import Scored, Told
+from independent_records import Truth
+
+NAME = "alpha 0.996, lambda 0.594, 10 mN·m"
+
+
+def held(cell: str, seed: int) -> Scored:
+    return Scored(
+        cell=cell,
+        seed=seed,
+        cpu_s=0.0,
+        type="VI",
+        told=(Told("f1", 2.5, 2.5, (2.4, 2.6)),),
+        own={"f1": 0.2},
+        own_holds={"f1": 1.0},
+        contains=("VI",),
+        structures={"VI": "selected"},
+        orders={"alpha": [0.996, "compatible", [0.99, 1.01]]},
+        named=[],
+    )
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Judge nothing, but keep what was asked for."""
+    asked = []
+
+    def instead(cell: str, seed: int) -> Scored:
+        asked.append((cell, seed))
+        if seed == 13:
+            raise ValueError("a record that cannot be judged")
+        return held(cell, seed)
+
+    monkeypatch.setattr(bench_headlines, "judged", instead)
+    return asked
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["bench_headlines.py", *map(str, options)])
+    main()
+
+
+def test_every_cell_that_is_asked_for_is_there():
+    plain = [name for name in CELLS if name.startswith("alpha")]
+    assert len(plain) == 7 * 3 * 3
+    for kind in ("ringing", "undeclared", "not uniform", "one mode"):
+        assert sum(name.startswith(kind) for name in CELLS) >= 3
+    cell = CELLS[NAME]
+    assert (cell.truth.zeta, cell.truth.gamma) == pytest.approx((7.1e-5, 5.5e-2))
+    assert cell.noise_nm == 1e-2
+    undeclared = CELLS[f"undeclared, {NAME}"].truth
+    assert (undeclared.delay_s, undeclared.tool_inertia_kg_m2) == (3e-4, 1e-5)
+    # Other orders have as much damping where the paper's type VI is compared with them.
+    other = CELLS["alpha 0.8, lambda 1, 3 mN·m"].truth
+    assert other.internal_size(125.66) == pytest.approx(cell.truth.internal_size(125.66), rel=1e-4)
+    assert other.external_size(16.02) == pytest.approx(cell.truth.external_size(16.02), rel=1e-3)
+
+
+def test_it_goes_on_where_it_ended(
+    judge: list[tuple[str, int]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    file = tmp_path / "scores.jsonl"
+    options = ("--cells", f"ringing, {NAME}", "--file", file, "--first", 5)
+    run(monkeypatch, *options, "--count", 2)
+    assert judge == [(f"ringing, {NAME}", 5), (f"ringing, {NAME}", 6)]
+    run(monkeypatch, *options, "--count", 4)
+    assert [seed for _, seed in judge] == [5, 6, 7, 8]
+    assert [json.loads(line)["seed"] for line in file.read_text().splitlines()] == [5, 6, 7, 8]
+    capsys.readouterr()
+    run(monkeypatch, *options, "--count", 9, "--print")
+    assert len(judge) == 4
+    assert "4 sessions" in capsys.readouterr().out
+    run(monkeypatch, *options, "--count", 9, "--seconds", -1)
+    assert len(judge) == 4
+
+
+def test_a_record_that_cannot_be_judged_is_told_and_stops_nothing(
+    judge: list[tuple[str, int]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    file = tmp_path / "scores.jsonl"
+    run(monkeypatch, "--cells", f"one mode, {NAME}", "--file", file, "--first", 13, "--count", 2)
+    assert len(judge) == 2
+    assert len(file.read_text().splitlines()) == 1
+    told = capsys.readouterr()
+    assert "cannot be judged" in told.err
+    assert "orders told, one mode" in told.out  # what `held` says of an order
+
+
+def test_a_record_is_judged_from_the_document_alone():
+    name = f"undeclared, {NAME}"
+    its = judged(name, 1)
+    assert (its.cell, its.seed) == (name, 1)
+    told = {each.name: each for each in its.told}
+    assert {"zeta", "lambda", "delay_s", "internal size", "f3", "xi3", "loss factor"} <= told.keys()
+    assert told["delay_s"].truth == 3e-4
+    assert sum(each.holds for each in its.told) > 0.7 * len(its.told)
+    assert its.own.keys() >= told.keys() - {"tool_inertia_kg_m2"}
+    assert its.structures["VI"] == "selected"
+    assert Scored.from_line(its.line()) == its
+    assert judged(name, 2).told != its.told
+
+
+def test_truth_of_the_shipped_rig():
+    assert rig_truth() == Truth(7.1e-5, 0.996, 5.5e-2, 0.594)

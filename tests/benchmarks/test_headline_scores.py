@@ -1,0 +1,204 @@
+"""Scores of headlines: what counts as held, as wide, and as said falsely."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from headline_scores import (
+    Scored,
+    Told,
+    complaints,
+    containing,
+    loss_frequencies_hz,
+    loss_told,
+    score,
+    shown,
+    told,
+    wilson,
+)
+from independent_records import Truth
+
+PAPER = Truth(7.1e-5, 0.996, 5.5e-2, 0.594)
+PLAIN = Scored(
+    cell="a cell",
+    seed=1,
+    cpu_s=1.0,
+    type="VI",
+    told=(),
+    own={},
+    own_holds={},
+    contains=("VI",),
+    structures={"VI": "selected", "VII": "compatible", "III": "excluded"},
+    orders={"alpha": [0.996, "compatible", [0.99, 1.01]]},
+    named=[],
+)
+
+
+def quantity(value: float, half: float, flag: str | None = None) -> dict[str, object]:
+    return {
+        "value": value,
+        "std": half / 1.96,
+        "interval_95": [value - half, value + half],
+        "flag": flag,
+    }
+
+
+def session(*numbers: Told, own: dict[str, float | None] | None = None, **other: object) -> Scored:
+    return replace(PLAIN, told=numbers, own=own or {}, **other)  # type: ignore[arg-type]
+
+
+def test_wilson_against_values_of_the_literature():
+    # R. G. Newcombe, Statistics in Medicine 17 (1998) 857-872, table I, method 3.
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
+    assert wilson(29, 29) == pytest.approx((0.8830, 1.0), abs=5e-5)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_every_number_of_a_headline_has_its_truth():
+    omega = 120.0
+    headline = {
+        "parameters": {"zeta": quantity(7.0e-5, 2e-6), "lambda": quantity(0.7, 0.01, "why not")},
+        "sizes": [
+            {"damping": "internal", "omega_rad_s": omega, **quantity(8.36e-3, 1e-5)},
+            {"damping": "external", "omega_rad_s": None, **quantity(0.05, 0.01)},
+        ],
+        "modes": [
+            {
+                "mode": 2,
+                "frequency_hz": quantity(16.0, 1e-3),
+                "damping_ratio": {**quantity(4.2e-3, 1.0), "interval_95": None},
+            }
+        ],
+    }
+    found = {each.name: each for each in told(headline, PAPER)}
+    assert found.keys() == {"zeta", "lambda", "internal size", "external size", "f2", "xi2"}
+    assert found["zeta"].holds
+    assert (found["lambda"].truth, found["lambda"].holds, found["lambda"].flag) == (
+        0.594,
+        False,
+        "why not",
+    )
+    assert found["internal size"].truth == pytest.approx(7.1e-5 * math.exp(0.996 * math.log(omega)))
+    assert found["external size"].truth == 5.5e-2
+    assert found["f2"].truth == pytest.approx(16.0111, abs=1e-4)
+    assert not found["f2"].holds
+    assert found["xi2"].interval is None
+    assert not found["xi2"].holds
+
+
+def test_of_the_loss_factor_only_what_rests_on_data_counts():
+    frequency_hz = [0.3 * 1.1**i for i in range(60)]
+    true = PAPER.loss_factor(frequency_hz).tolist()
+    curves = {
+        "frequency_hz": frequency_hz,
+        "loss_factor": {
+            "value": true,
+            "low": [0.99 * each for each in true],
+            "high": [
+                (1.01 if hz < 20 else 0.995) * x for hz, x in zip(frequency_hz, true, strict=True)
+            ],
+        },
+        "loss_factor_supported_hz": [1.0, 45.0],
+    }
+    chosen = loss_frequencies_hz(curves)
+    assert chosen.size == 12
+    assert chosen.min() >= 1.0
+    assert chosen.max() <= 45.0
+    points = loss_told(curves, PAPER)
+    held = [hz < 20 for hz in chosen]
+    assert [each.holds for each in points] == held
+    its = score("loss factor", [session(*points)])
+    assert its.facts == 1
+    assert its.held == pytest.approx(sum(held) / 12)
+    assert loss_told({**curves, "loss_factor_supported_hz": None}, PAPER) == []
+
+
+def test_flags_and_missing_intervals_are_counted_apart():
+    sessions = [
+        session(Told("f1", 1.0, 1.01, (0.9, 1.1)), own={"f1": 0.1}),
+        session(Told("f1", 1.0, 1.11, (1.01, 1.21)), own={"f1": 0.2}),
+        session(Told("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"), own={"f1": 0.1}),
+        session(Told("f1", 1.0, 2.0, (1.9, 2.1), "doubtful"), own={"f1": 0.1}),
+        session(Told("f1", 1.0, 1.0, None)),
+        session(Told("f2", 1.0, 1.0, (0.9, 1.1))),
+    ]
+    its = score("f1", sessions)
+    assert (its.held, its.facts, its.held_flagged, its.flagged, its.without) == (1, 2, 1, 2, 1)
+    assert its.wider == pytest.approx(1.5)
+    assert its.bias == pytest.approx(1.96 * (0.1 + 1.1) / 2, rel=1e-3)
+    assert "1/2" in shown("a cell", sessions)
+
+
+def test_widths_of_sizes_compare_relative_to_their_values():
+    # At another frequency the size is another number.
+    its = score(
+        "internal size",
+        [session(Told("internal size", 2.0, 2.0, (1.8, 2.2)), own={"internal size": 0.1})],
+    )
+    assert its.wider == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("held", "mark"), [(30, "<"), (40, "<"), (44, ""), (48, ""), (50, "")])
+def test_coverage_is_missed_only_beyond_chance(held: int, mark: str):
+    sessions = [
+        session(Told("f1", 1.0 if i < held else 2.0, 1.0, (0.9, 1.1)), own={"f1": 0.2})
+        for i in range(50)
+    ]
+    assert score("f1", sessions).mark == mark
+    assert bool(complaints({"a cell": sessions})) == bool(mark)
+
+
+def test_intervals_that_always_hold_are_too_wide():
+    sessions = [session(Told("f1", 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.2})] * 500
+    assert score("f1", sessions).mark == ">"
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "missed"), [("f1", 0.18, True), ("f3", 0.1, False), ("f3", 0.07, True)]
+)
+def test_widths_have_limits_of_their_own(name: str, own: float, missed: bool):
+    sessions = [session(Told(name, 1.0, 1.0, (0.9, 1.1)), own={name: own})]
+    assert [line.startswith(f"width of {name}") for line in complaints({"a": sessions})] == [
+        True
+    ] * missed
+
+
+def test_what_a_truth_is_a_case_of():
+    integer, half = replace(PAPER, alpha=1.0, lambda_=1.0), replace(PAPER, alpha=1.0)
+    assert containing(PAPER) == ("VI", "VI, modes free")
+    assert containing(half)[:2] == ("VII", "VI")
+    assert containing(replace(integer, offsets=(0.006, -0.013))) == (
+        "III, modes free",
+        "VII, modes free",
+        "VI, modes free",
+    )
+
+
+def test_statements_that_are_false():
+    true = session(contains=("VII", "VI"), orders={"alpha": [1.0, "compatible", None]})
+    assert true.excluded_falsely == []
+    assert true.fractional_falsely == []
+    excluded = replace(true, structures={"VI": "selected", "VII": "excluded", "III": "excluded"})
+    assert excluded.excluded_falsely == ["VII"]
+    fractional = replace(
+        true, orders={"alpha": [1.0, "fractional", None], "lambda": [0.6, "fractional", None]}
+    )
+    assert fractional.fractional_falsely == ["alpha"]
+    assert complaints({"a": [true] * 50}) == []
+    assert len(complaints({"a": [true] * 45 + [excluded] * 5})) == 1
+    assert len(complaints({"a": [true] * 45 + [fractional] * 5})) == 1
+
+
+def test_of_one_mode_nothing_is_said_of_orders():
+    silent = session(orders={"alpha": [1.0, "not identifiable", None]})
+    assert silent.statements == []
+    assert complaints({"one mode, a": [silent]}) == []
+    assert len(complaints({"one mode, a": [silent, PLAIN]})) == 1
+
+
+def test_a_session_outlives_its_line():
+    one = session(
+        Told("f1", 1.0, 1.0, (0.9, 1.1)), Told("f2", 1.0, 1.0, None, "why"), own={"f1": None}
+    )
+    assert Scored.from_line(one.line()) == one
