@@ -1,7 +1,7 @@
 """Headlines as printed, against truths that are known: coverage, widths and statements by cell.
 
 ``bench_headlines.py [--cells TEXT ...] [--count N] [--first SEED]`` judges N records of each cell
-whose name holds one of the texts, and prints of every number of `headlines` in the analyzer's
+whose name is or holds one of the texts, and prints of every number of `headlines` in the analyzer's
 document: how many 95 % intervals without a flag hold the truth, with Wilson's interval (marked
 ``<`` or ``>`` where 90 to 99 % is missed beyond chance); ``x``, the median width over that of the
 true structure's own fit; the mean error in standard deviations; and the same coverage of what has
@@ -343,10 +343,27 @@ def run(
                 yield running.pop(future), future.exception() or future.result()
 
 
+def asked_for(texts: list[str]) -> list[str]:
+    """Find cells by their names, or by parts of them.
+
+    Parameters
+    ----------
+    texts : list of str
+        One that is a cell's name means that cell alone.
+    """
+    return [
+        name
+        for name in CELLS
+        if any(name == text if text in CELLS else text in name for text in texts)
+    ]
+
+
 def main() -> None:
     """Judge the cells asked for, and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", nargs="+", default=[""], help="those whose name holds a text")
+    parser.add_argument(
+        "--cells", nargs="+", default=[""], help="those whose name is or holds a text"
+    )
     parser.add_argument("--count", type=int, default=2, help="records of each cell")
     parser.add_argument("--first", type=int, default=1000, help="seed of the first")
     parser.add_argument("--file", type=Path, help="one line a record; goes on where it ends")
@@ -355,7 +372,7 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", help="judge none, count those in the file")
     parser.add_argument("--rig", action="store_true", help="sessions of the shipped rig instead")
     given = parser.parse_args()
-    names = [_RIG] if given.rig else [n for n in CELLS if any(text in n for text in given.cells)]
+    names = [_RIG] if given.rig else asked_for(given.cells)
     done: list[Scored] = []
     if given.file and given.file.exists():
         done = [Scored.from_line(line) for line in given.file.read_text().splitlines()]

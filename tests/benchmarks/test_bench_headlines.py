@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bench_headlines
 import pytest
-from bench_headlines import CELLS, judged, main, rig_truth
+from bench_headlines import CELLS, asked_for, judged, main, rig_truth
 from headline_scores import Scored, Told
 from independent_records import Truth
 
@@ -63,6 +63,13 @@ def test_every_cell_that_is_asked_for_is_there():
     other = CELLS["alpha 0.8, lambda 1, 3 mN·m"].truth
     assert other.internal_size(125.66) == pytest.approx(cell.truth.internal_size(125.66), rel=1e-4)
     assert other.external_size(16.02) == pytest.approx(cell.truth.external_size(16.02), rel=1e-3)
+
+
+def test_cells_by_name_or_part():
+    assert asked_for([NAME]) == [NAME]
+    assert asked_for(["ringing", NAME]) == [NAME, *(c for c in CELLS if c.startswith("ringing"))]
+    assert asked_for([""]) == list(CELLS)
+    assert asked_for(["no such cell"]) == []
 
 
 def test_it_goes_on_where_it_ended(
