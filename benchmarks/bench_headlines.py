@@ -9,7 +9,8 @@ a flag. Then what is missed of all that is asked for.
 
 With ``--file FILE`` a line is appended for each record, and records that stand there already are
 not judged again; ``--seconds S`` stops in time, and the next call goes on. ``--print`` only counts.
-``--processes P`` judges on P cores. All cells with 50 records each take some hours.
+``--processes P`` judges on P cores. ``--table`` adds a table in Markdown, by noise and by what is
+the matter. All cells with 50 records each take some hours.
 
 ``--rig`` judges sessions of the simulated rig that is shipped, in its own closed loop and through
 the command line: ``rigd run chirp --fast`` and ``analyze --json``, seed by seed.
@@ -51,6 +52,7 @@ from headline_scores import (
     names_of,
     share_held,
     shown,
+    table,
     told,
     typical_width,
 )
@@ -58,6 +60,7 @@ from independent_records import (
     DENSITY_KG_PER_M,
     LENGTH_M,
     RATE_HZ,
+    RECORD_S,
     REST_S,
     STIFFNESS_N_M2,
     SWEEP_S,
@@ -66,14 +69,14 @@ from independent_records import (
     exact,
 )
 
-from analysis.record import Gaps, Record, load_record
+from analysis.exchange.write_session import write_session
+from analysis.record import Record, load_record
 from analysis.report.document import document
 from analysis.report.html import Subject
 from analysis.report.record_figure_bands import loss_factors
 from analysis.selection import select
 from analysis.structures import STRUCTURES
 from analysis.whole_record import BAND_HZ, Measurement, fit_record
-from rigd.beam import Beam
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,7 +97,20 @@ _UNDECLARED = {
     "delay_s": 3e-4,
     "tool_inertia_kg_m2": 1e-5,
 }
+_BLOCK = 10
+"""Records of one cell in a row: a run that is stopped has some of every cell."""
+
 _RIG = "shipped rig"
+_STATED = {
+    "id": "independent",
+    "excitation": "chirp",
+    "rate_hz": f"{RATE_HZ:g}",
+    "beam_length_m": repr(LENGTH_M),
+    "beam_density_kg_per_m": repr(DENSITY_KG_PER_M),
+    "beam_bending_stiffness_n_m2": repr(STIFFNESS_N_M2),
+}
+"""What the file says of rig and specimen, whatever is true."""
+
 _PROFILE = Path(__file__).parents[1] / "hw_profiles" / "sim.toml"
 _NORMAL_95 = 1.959963984540054
 
@@ -117,42 +133,38 @@ class Cell:
     ringing: bool = False
     last_hz: float = 50.0
 
-    def record(self, seed: int) -> Record:
-        """Make one record, as if it had been read from a file.
+    def record(self, seed: int, folder: Path) -> Record:
+        """Make one record, write it as a session and read that as ``analyze`` does.
 
         Parameters
         ----------
         seed : int
             Of the noise.
+        folder : Path
+            Where the session stands meanwhile.
         """
         made = _exact(self.truth, self.last_hz, self.ringing)
         angle_rad, torque_nm = made.noisy(self.noise_nm, seed)
-        everywhere = np.ones(angle_rad.size, dtype=bool)
-        first = round(REST_S * RATE_HZ)
-        return Record(
-            path=Path(f"seed-{seed}.mcap"),
-            time_s=np.arange(angle_rad.size) / RATE_HZ,
-            reference_rad=made.reference_rad,
-            angle_rad=angle_rad,
-            torque_nm=torque_nm,
-            angle_known=everywhere,
-            torque_known=everywhere,
+        first, last, end = (round(t * RATE_HZ) for t in (REST_S, REST_S + SWEEP_S, RECORD_S))
+        path = folder / f"seed-{seed}.mcap"
+        write_session(
+            path,
+            {
+                "tick": np.arange(end),
+                "angle_reference_rad": made.reference_rad,
+                "angle_rad": angle_rad,
+                "coupling_torque_nm": torque_nm,
+            },
             rate_hz=RATE_HZ,
-            beam=Beam(LENGTH_M, DENSITY_KG_PER_M, STIFFNESS_N_M2),
-            angle_delay_s=0.0,
-            torque_delay_s=0.0,
-            tool_inertia_kg_m2=0.0,
-            sweep=slice(first, first + round(SWEEP_S * RATE_HZ)),
-            rest_angle_rad=0.0,
-            gaps=Gaps(0, 0, 0, 0, 0),
-            flags={},
+            start_utc_ns=0,
+            metadata=_STATED,
+            segments={"rest": (0, first), "sweep": (first, last), "ring_down": (last, end)},
             warnings=(),
-            metadata={"excitation": "chirp"},
-            outcome="complete",
         )
+        return load_record(path)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _exact(truth: Truth, last_hz: float, ringing: bool) -> Exact:
     return exact(truth, last_hz=last_hz, ringing=ringing)
 
@@ -198,7 +210,8 @@ def judged(name: str, seed: int) -> Scored:
         return _judged_rig(seed)
     cell = CELLS[name]
     # Other noise in every cell: what chance does to one says nothing of the next.
-    record = cell.record(crc32(f"{name} {seed}".encode()))
+    with tempfile.TemporaryDirectory() as folder:
+        record = cell.record(crc32(f"{name} {seed}".encode()), Path(folder))
     start = time.process_time()
     selection = select(Measurement.of_record(record))
     spent_s = time.process_time() - start
@@ -358,6 +371,22 @@ def asked_for(texts: list[str]) -> list[str]:
     ]
 
 
+def by_kind(by_cell: dict[str, list[Scored]]) -> dict[str, list[Scored]]:
+    """Put cells together that have the same the matter, or the same noise if nothing is.
+
+    Parameters
+    ----------
+    by_cell : dict
+        Sessions by cell.
+    """
+    kinds: dict[str, list[Scored]] = {}
+    for name, sessions in by_cell.items():
+        parts = name.split(", ")
+        kind = parts[-1] if name.startswith("alpha") else parts[0]
+        kinds.setdefault(kind, []).extend(sessions)
+    return kinds
+
+
 def main() -> None:
     """Judge the cells asked for, and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -370,6 +399,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after these")
     parser.add_argument("--processes", type=int, default=1, help="cores")
     parser.add_argument("--print", action="store_true", help="judge none, count those in the file")
+    parser.add_argument("--table", action="store_true", help="also a table of kinds of cells")
     parser.add_argument("--rig", action="store_true", help="sessions of the shipped rig instead")
     given = parser.parse_args()
     names = [_RIG] if given.rig else asked_for(given.cells)
@@ -378,7 +408,10 @@ def main() -> None:
         done = [Scored.from_line(line) for line in given.file.read_text().splitlines()]
     there = {(each.cell, each.seed) for each in done}
     seeds = range(given.first, given.first + (0 if given.print else given.count))
-    tasks = [task for task in itertools.product(names, seeds) if task not in there]
+    blocks = (seeds[first : first + _BLOCK] for first in range(0, len(seeds), _BLOCK))
+    tasks = [
+        task for block in blocks for task in itertools.product(names, block) if task not in there
+    ]
     for (name, seed), result in run(tasks, given.processes, time.monotonic() + given.seconds):
         if isinstance(result, BaseException):
             print(f"{name}, seed {seed}: {type(result).__name__}: {result}", file=sys.stderr)
@@ -391,6 +424,8 @@ def main() -> None:
     by_cell = {name: sessions for name, sessions in by_cell.items() if sessions}
     for name, sessions in by_cell.items():
         print(shown(name, sessions), flush=True)
+    if given.table:
+        print("\n" + table(by_kind(by_cell)))
     missed = complaints(by_cell)
     print(f"\nMissed of what is asked for: {len(missed) or 'nothing'}")
     for line in missed:

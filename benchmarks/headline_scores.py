@@ -306,6 +306,9 @@ class Score:
         Median of the width over that of the true structure's own fit, without a flag.
     bias : float or None
         Mean error in half widths over 1.96: in standard deviations, without a flag.
+    own : float or None
+        Share of the true structure's own intervals that hold the truth, on the same records: what
+        an estimator that knew it would have got.
     """
 
     held: float
@@ -315,6 +318,7 @@ class Score:
     without: int
     wider: float | None
     bias: float | None
+    own: float | None
 
     @property
     def mark(self) -> str:
@@ -328,6 +332,8 @@ class Score:
             text = f"{self.held:.3g}/{self.facts} [{100 * low:.0f}, {100 * high:.0f}]{self.mark}"
         else:
             text = "-"
+        if self.mark and self.own is not None:
+            text += f" own {100 * self.own:.0f} %"
         if self.wider is not None:
             text += f" x{self.wider:.2f}"
         if self.bias is not None:
@@ -354,6 +360,7 @@ def score(name: str, sessions: Iterable[Scored]) -> Score:
     facts = flagged = without = 0
     wider: list[float] = []
     errors: list[float] = []
+    owns: list[float] = []
     for session in sessions:
         its = [each for each in session.told if each.name == name]
         if not its:
@@ -370,9 +377,11 @@ def score(name: str, sessions: Iterable[Scored]) -> Score:
         facts += 1
         held += share
         errors.append(float(np.mean([each.error for each in known])))
-        own = session.own.get(name)
+        own, own_share = session.own.get(name), session.own_holds.get(name)
         if own:
             wider.append(width / own)
+        if own_share is not None:
+            owns.append(own_share)
     return Score(
         held,
         facts,
@@ -381,6 +390,7 @@ def score(name: str, sessions: Iterable[Scored]) -> Score:
         without,
         median(wider) if wider else None,
         float(np.mean(errors)) if errors else None,
+        float(np.mean(owns)) if owns else None,
     )
 
 
@@ -422,6 +432,40 @@ def shown(cell: str, sessions: Sequence[Scored]) -> str:
     cpu_s = sorted(session.cpu_s for session in sessions)
     lines.append(f"    named {dict(named)}; CPU s median {median(cpu_s):.2f}, most {cpu_s[-1]:.2f}")
     return "\n".join(lines)
+
+
+def table(groups: dict[str, list[Scored]]) -> str:
+    """Write a table in Markdown: a row a quantity, a column a group of sessions.
+
+    In each place: share of the 95 % intervals without a flag that hold the truth, with its 95 %
+    interval; share of the sessions that give the quantity a flag, if any; median width over that of
+    the true structure's own fit.
+
+    Parameters
+    ----------
+    groups : dict
+        Sessions by the name of their group.
+    """
+    names = names_of(_every(session for sessions in groups.values() for session in sessions))
+    heads = [f"{group} ({len(sessions)})" for group, sessions in groups.items()]
+    lines = ["| |" + "".join(f" {head} |" for head in heads), "|---" * (len(heads) + 1) + "|"]
+    for name in names:
+        places = (_place(score(name, sessions)) for sessions in groups.values())
+        lines.append(f"| {name} |" + "".join(f" {place} |" for place in places))
+    return "\n".join(lines)
+
+
+def _place(its: Score) -> str:
+    parts = []
+    if its.facts:
+        low, high = wilson(its.held, its.facts)
+        share = 100 * its.held / its.facts
+        parts.append(f"{share:.1f} % ({100 * low:.0f}–{100 * high:.0f})")
+        if its.wider is not None:
+            parts.append(f"× {its.wider:.2f}")
+    if its.flagged:
+        parts.append(f"flagged {100 * its.flagged / (its.flagged + its.facts + its.without):.0f} %")
+    return ", ".join(parts) or "–"
 
 
 def complaints(cells: dict[str, list[Scored]]) -> list[str]:

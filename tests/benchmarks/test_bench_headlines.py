@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bench_headlines
 import pytest
-from bench_headlines import CELLS, asked_for, judged, main, rig_truth
+from bench_headlines import CELLS, asked_for, by_kind, judged, main, rig_truth
 from headline_scores import Scored, Told
 from independent_records import Truth
 
@@ -70,6 +70,22 @@ def test_cells_by_name_or_part():
     assert asked_for(["ringing", NAME]) == [NAME, *(c for c in CELLS if c.startswith("ringing"))]
     assert asked_for([""]) == list(CELLS)
     assert asked_for(["no such cell"]) == []
+
+
+def test_kinds_of_cells():
+    found = by_kind({name: [held(name, 1)] for name in CELLS})
+    assert [*found] == [
+        "3 mN·m",
+        "10 mN·m",
+        "30 mN·m",
+        "ringing",
+        "undeclared",
+        "not uniform",
+        "one mode",
+    ]
+    assert {len(found[noise]) for noise in ("3 mN·m", "10 mN·m", "30 mN·m")} == {21}
+    assert sum(map(len, found.values())) == len(CELLS)
+    assert [*by_kind({"shipped rig": []})] == ["shipped rig"]
 
 
 def test_it_goes_on_where_it_ended(

@@ -13,6 +13,7 @@ from headline_scores import (
     loss_told,
     score,
     shown,
+    table,
     told,
     wilson,
 )
@@ -128,6 +129,29 @@ def test_flags_and_missing_intervals_are_counted_apart():
     assert its.wider == pytest.approx(1.5)
     assert its.bias == pytest.approx(1.96 * (0.1 + 1.1) / 2, rel=1e-3)
     assert "1/2" in shown("a cell", sessions)
+
+
+def test_the_table_has_a_place_for_each_quantity_and_group():
+    facts = [
+        session(Told("f1", 2.0 if i == 0 else 1.0, 1.0, (0.9, 1.1)), own={"f1": 0.1})
+        for i in range(10)
+    ]
+    doubtful = [session(Told("xi1", 1.0, 1.0, (0.9, 1.1), "why"))]
+    lines = table({"some": facts, "others": doubtful}).splitlines()
+    assert lines[0] == "| | some (10) | others (1) |"
+    assert lines[1] == "|---|---|---|"
+    assert lines[2] == "| f1 | 90.0 % (60–98), × 2.00 | – |"
+    assert lines[3] == "| xi1 | – | flagged 100 % |"
+    assert len(lines) == 4
+
+
+def test_what_the_true_structure_would_have_said_stands_beside_a_miss():
+    sessions = [
+        replace(session(Told("f1", 2.0, 1.0, (0.9, 1.1))), own_holds={"f1": float(i % 2)})
+        for i in range(20)
+    ]
+    assert score("f1", sessions).own == 0.5
+    assert "own 50 %" in str(score("f1", sessions))
 
 
 def test_widths_of_sizes_compare_relative_to_their_values():
