@@ -298,8 +298,8 @@ def _own(record: Record, truth: Truth, name: str, loss_hz: NDArray[np.float64]) 
         if key in truth.parameters
     ]
     for damping, size, of, coefficient in (
-        ("internal", fit.internal, truth.internal_size, truth.zeta),
-        ("external", fit.external, truth.external_size, truth.gamma),
+        ("internal", fit.internal, truth.internal_loss, truth.zeta),
+        ("external", fit.external, truth.external_loss, truth.gamma),
     ):
         if size is not None:
             omega = size.omega_rad_s

@@ -100,7 +100,7 @@ def told(headline: dict[str, Any], truth: Truth) -> list[Told]:
     ]
     for size in headline["sizes"]:
         omega_rad_s = size["omega_rad_s"]
-        of = truth.internal_size if size["damping"] == "internal" else truth.external_size
+        of = truth.internal_loss if size["damping"] == "internal" else truth.external_loss
         coefficient = truth.zeta if size["damping"] == "internal" else truth.gamma
         true = coefficient if omega_rad_s is None else of(omega_rad_s)
         numbers.append(_told(f"{size['damping']} size", true, size))
@@ -323,8 +323,15 @@ class Score:
     @property
     def mark(self) -> str:
         """``<`` or ``>`` where the coverage is below or above what is asked for, beyond chance."""
-        low, high = wilson(self.held, self.facts)
-        return "<" if high < LEAST else ">" if low > MOST else ""
+        return _mark(self.held, self.facts)
+
+    @property
+    def mark_of_all(self) -> str:
+        """The same of all intervals, with and without a flag.
+
+        A flag that depends on the estimate leaves a selection behind, whose coverage is another.
+        """
+        return _mark(self.held + self.held_flagged, self.facts + self.flagged)
 
     def __str__(self) -> str:
         if self.facts:
@@ -339,10 +346,15 @@ class Score:
         if self.bias is not None:
             text += f" {self.bias:+.2f}"
         if self.flagged:
-            text += f" (flagged {self.held_flagged:.3g}/{self.flagged})"
+            text += f" (flagged {self.held_flagged:.3g}/{self.flagged}){self.mark_of_all}"
         if self.without:
             text += f" (none {self.without})"
         return text
+
+
+def _mark(held: float, count: int) -> str:
+    low, high = wilson(held, count)
+    return "<" if high < LEAST else ">" if low > MOST else ""
 
 
 def score(name: str, sessions: Iterable[Scored]) -> Score:

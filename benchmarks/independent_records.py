@@ -81,13 +81,14 @@ class Truth:
             "tool_inertia_kg_m2": self.tool_inertia_kg_m2,
         }
 
-    def internal_size(self, omega_rad_s: float) -> float:
-        """``zeta omega^alpha``."""
-        return self.zeta * omega_rad_s**self.alpha
+    def internal_loss(self, omega_rad_s: float) -> float:
+        """Loss factor that the internal damping causes, but for its square."""
+        return float((self.zeta * (1j * omega_rad_s) ** self.alpha).imag)
 
-    def external_size(self, omega_rad_s: float) -> float:
-        """``gamma omega^lambda``."""
-        return self.gamma * omega_rad_s**self.lambda_
+    def external_loss(self, omega_rad_s: float) -> float:
+        """Loss factor that the external damping causes, over the inertia without it."""
+        lost = (self.gamma * (1j * omega_rad_s) ** self.lambda_).imag
+        return float(lost / (self.density_over_stiffness * omega_rad_s**2))
 
     def inertial(self, s: Complex) -> Complex:
         """``rho/EI s² + gamma s^lambda``."""

@@ -80,7 +80,8 @@ def test_every_number_of_a_headline_has_its_truth():
         False,
         "why not",
     )
-    assert found["internal size"].truth == pytest.approx(7.1e-5 * math.exp(0.996 * math.log(omega)))
+    loss = 7.1e-5 * math.exp(0.996 * math.log(omega)) * math.sin(0.498 * math.pi)
+    assert found["internal size"].truth == pytest.approx(loss)
     assert found["external size"].truth == 5.5e-2
     assert found["f2"].truth == pytest.approx(16.0111, abs=1e-4)
     assert not found["f2"].holds
@@ -127,6 +128,7 @@ def test_flags_and_missing_intervals_are_counted_apart():
     its = score("f1", sessions)
     assert (its.held, its.facts, its.held_flagged, its.flagged, its.without) == (1, 2, 1, 2, 1)
     assert its.wider == pytest.approx(1.5)
+    assert its.mark_of_all == "<"  # 2 of 4
     assert its.bias == pytest.approx(1.96 * (0.1 + 1.1) / 2, rel=1e-3)
     assert "1/2" in shown("a cell", sessions)
 
@@ -226,3 +228,13 @@ def test_a_session_outlives_its_line():
         Told("f1", 1.0, 1.0, (0.9, 1.1)), Told("f2", 1.0, 1.0, None, "why"), own={"f1": None}
     )
     assert Scored.from_line(one.line()) == one
+
+
+def test_a_flag_that_leaves_only_what_fails_is_seen_through():
+    good = session(Told("f1", 1.0, 1.0, (0.9, 1.1), "doubtful"))
+    bad = session(Told("f1", 2.0, 1.0, (0.9, 1.1)))
+    its = score("f1", [good] * 45 + [bad] * 5)
+    assert (its.mark, its.mark_of_all) == ("<", "")
+    assert (
+        score("f1", [replace(bad, told=(replace(bad.told[0], flag="x"),))] * 9).mark_of_all == "<"
+    )

@@ -65,6 +65,16 @@ def test_twice_the_damping_ratio_of_a_mode_is_its_loss_factor():
         assert factor == pytest.approx(2 * truth.damping_ratio(number), rel=0.02)
 
 
+def test_losses_of_either_damping_add_up():
+    truth = Truth(**PAPER)
+    omega = 16.0
+    parts = truth.internal_loss(omega) + truth.external_loss(omega)
+    assert parts == pytest.approx(truth.loss_factor(np.array([omega / (2 * np.pi)]))[0], rel=0.02)
+    assert truth.external_loss(omega) == pytest.approx(
+        5.5e-2 * 16**0.594 * np.sin(0.297 * np.pi) / (LINK.density_over_stiffness * 256)
+    )
+
+
 @pytest.fixture(scope="module")
 def still() -> Exact:
     return exact(Truth(**PAPER))
