@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from analysis.structures import Structure
     from analysis.whole_record import RecordFit
 
+Kind = tuple[bool, tuple[str, ...]]
+"""Kind of rig: whether the beam is uniform, and what else is free."""
+
 EXTRA_WORDS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "root_compliance_rad_per_nm": "elastic clamp",
@@ -75,7 +78,7 @@ class Candidate:
         return self.deviance + 2 * self.parameters
 
     @property
-    def kind(self) -> tuple[bool, tuple[str, ...]]:
+    def kind(self) -> Kind:
         """Of rig: whether the beam is uniform, and what else was free."""
         return self.uniform, self.extras
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.selection.candidate import Candidate
+from analysis.selection.candidate import Candidate, Kind
 from analysis.selection.extras import with_extras
 from analysis.selection.hum import without_leakage
 from analysis.selection.refit import Refit
@@ -41,6 +41,9 @@ _DISMISSED: Final = 10.0
 _SHOWS: Final = 4.0
 """Deviance that a damping must save to stay in the freest structure: one that saves less moves no
 other parameter by more than two standard deviations, and only makes them uncertain."""
+
+_PLAIN: Final[Kind] = (True, ())
+"""Kind of rig: a uniform beam, and nothing beside it."""
 
 _FREEST: Final = STRUCTURES["VI"]
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
@@ -120,17 +123,29 @@ class Field:
 
     @property
     def freest(self) -> Candidate:
-        """The freest structure that the record supports, on the beam of the best.
+        """The freest structure that the record supports, on the kind of rig that it calls for.
 
         All orders are free, so its intervals hold whichever simpler structure is the true one;
-        those of the lowest BIC hold only if that is. A damping that does not show at all is left
-        out, with its order.
+        those of the lowest BIC hold only if that is. For the same reason kinds of rig are compared
+        by their freest structures: with an order fixed, a tip mass or free modes stand for what
+        the order would be. The uniform beam without anything beside it gives way to a BIC that is
+        lower by 10 only.
         """
-        best = self.best
-        alike = {c.structure.name: c for c in self.candidates if c.kind == best.kind}
+        plain = self._freest_of(_PLAIN)
+        other = self._freest_of(self.best.kind)
+        if plain is None or (other is not None and other.bic < plain.bic - _DISMISSED):
+            return other or self.best
+        return plain
+
+    def _freest_of(self, kind: Kind) -> Candidate | None:
+        """Find the freest on one kind of rig; a damping that does not show is left out.
+
+        None if no structure was fitted with its orders free there.
+        """
+        alike = {c.structure.name: c for c in self.candidates if c.kind == kind}
         freest = alike.get(_FREEST.name)
         if freest is None:
-            return best
+            return None
         lesser = [alike[s.name] for s in _ONE_DAMPING if s.name in alike]
         least = min(lesser, key=lambda c: c.deviance, default=freest)
         return least if least.deviance - freest.deviance < _SHOWS else freest
@@ -148,11 +163,12 @@ class Field:
         within : float
             By how much the BIC may be above the lowest.
         """
-        best: dict[tuple[bool, tuple[str, ...]], Candidate] = {}
-        for candidate in self.candidates:
-            if candidate.bic < self.best.bic + within:
+        lowest = min(candidate.bic for candidate in self.candidates)
+        best: dict[Kind, Candidate] = {}
+        for candidate in sorted(self.candidates, key=lambda candidate: candidate.bic):
+            if candidate.bic < lowest + within:
                 best.setdefault(candidate.kind, candidate)
-        return tuple(each for kind, each in best.items() if kind != self.best.kind)
+        return tuple(each for kind, each in best.items() if kind != self.freest.kind)
 
     @property
     def likeliest(self) -> RecordFit:

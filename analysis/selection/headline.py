@@ -366,11 +366,26 @@ def _doubted_by(told: Headline, other: Candidate) -> Headline:
         else each
         for name, each in told.parameters.items()
     }
-    sizes = []
-    for each in told.sizes:
-        at = _loss(values, each)
-        sizes.append(_flagged(each, flag) if elsewhere(each.size, at) else each)
-    return replace(told, parameters=parameters, sizes=tuple(sizes))
+    sizes = tuple(
+        _flagged(each, flag) if elsewhere(each.size, _loss(values, each)) else each
+        for each in told.sizes
+    )
+    theirs = {mode.number: mode for mode in other.fit.modes}
+
+    def moved(mine: Quantity, value: float) -> Quantity:
+        return replace(mine, flag=mine.flag or flag) if elsewhere(mine, value) else mine
+
+    modes = tuple(
+        replace(
+            mode,
+            frequency_hz=moved(mode.frequency_hz, theirs[mode.number].frequency_hz),
+            damping_ratio=moved(mode.damping_ratio, theirs[mode.number].damping_ratio),
+        )
+        if mode.number in theirs
+        else mode
+        for mode in told.modes
+    )
+    return replace(told, parameters=parameters, sizes=sizes, modes=modes)
 
 
 def _loss(values: Mapping[str, float], each: Size) -> float:

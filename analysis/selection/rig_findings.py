@@ -27,6 +27,7 @@ def of_rig(field: Field) -> Iterator[Finding]:
     close = explanations(field, STRONG)
     kinds = [each.kind for each in close]
     if not kinds[0]:
+        yield from _beside_a_uniform_beam(field)
         return
     if len(close) == 1:
         yield _alone(close[0].candidate, kinds[0])
@@ -51,6 +52,28 @@ def of_rig(field: Field) -> Iterator[Finding]:
             "Check clamp, tip and signal conditioning for these; a sweep that reaches one more "
             "mode tells them apart."
         ),
+    )
+
+
+def _beside_a_uniform_beam(field: Field) -> Iterator[Finding]:
+    """Name what explains the record as well as a uniform beam with its orders free does."""
+    others = field.other_kinds(STRONG)
+    if not others:
+        return
+    named = [
+        f"{_about(each, ''.join(each.extras) or _MODES_FREE)} (type {each.structure.name})"
+        for each in others
+    ]
+    yield Finding(
+        kind="rival explanations",
+        sentence=(
+            "A uniform beam with its orders free explains the record, and so does, as well, one "
+            f"with {' or with '.join(named)}. What they put elsewhere is flagged."
+        ),
+        value=None,
+        interval=None,
+        unit="1",
+        remedy="A sweep that reaches one more mode tells them apart.",
     )
 
 
