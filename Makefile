@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Hundreds of processes start in the tests: each would compile every module once more.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check bench fuzz chaos endurance clean
+.PHONY: demo test test-all check bench fuzz chaos endurance clean
 
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
@@ -14,6 +14,10 @@ demo: $(VENV)/ready
 	$(BIN)/analyze demo/*.mcap --report demo/report
 
 test: $(VENV)/ready
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
+
+# With what is shown once more at full length, or over another transport.
+test-all: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
 check: $(VENV)/ready

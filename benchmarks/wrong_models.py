@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +60,7 @@ class Rig:
         return found
 
     def channel(self, s: Complex) -> Complex:
-        """What the sensor's filters make of a torque."""
+        """Give what the sensor's filters make of a torque."""
         first, second = (s / (2 * np.pi * hz) for hz in (self.first_order_hz, self.second_order_hz))
         found: Complex = 1 / ((1 + first) * (1 + 2**0.5 * second + second**2))
         return found
@@ -417,7 +416,7 @@ _III = ("III",)
 _TWO = ("alpha .92", "III")
 
 
-def _linear(**more: Any) -> Make:
+def _linear(**more: float) -> Make:
     return partial(record, **more)
 
 

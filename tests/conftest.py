@@ -249,20 +249,48 @@ def start_simulator(runtime_folder, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def paper_session(tmp_path_factory, request):
-    """The paper's session on the simulated rig as shipped: its file, and what the command told.
-
-    Made once for all workers, by whoever comes first.
-    """
-    folder = tmp_path_factory.getbasetemp()
+def made_once(tmp_path_factory, request):
+    """Have a folder filled once for all workers, by whoever comes first; nobody changes it."""
+    base = tmp_path_factory.getbasetemp()
     if hasattr(request.config, "workerinput"):
-        folder = folder.parent
-    told = folder / "paper_session.json"
-    with (folder / "paper_session.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not told.exists():
-            command = [RIGD, "run", "chirp", "--fast", "--json", "--output", folder / "paper"]
-            done = subprocess.run(command, check=True, capture_output=True, text=True)
-            told.write_text(done.stdout)
-    (session,) = json.loads(told.read_text())["sessions"]
+        base = base.parent
+
+    def made(name, make) -> Path:
+        folder, complete = base / name, base / f"{name}.complete"
+        with (base / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not complete.exists():
+                shutil.rmtree(folder, ignore_errors=True)  # of one who failed
+                folder.mkdir()
+                make(folder)
+                complete.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def paper_session(made_once):
+    """The paper's session on the simulated rig as shipped: its file, and what the command told."""
+
+    def make(folder):
+        command = [RIGD, "run", "chirp", "--fast", "--json", "--output", folder]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        (folder / "told.json").write_text(done.stdout)
+
+    told = (made_once("paper_session", make) / "told.json").read_text()
+    (session,) = json.loads(told)["sessions"]
     return Path(session["path"]), session
+
+
+@pytest.fixture(scope="session")
+def short_chirps(made_once):
+    """Two chirps of the simulated rig: 0.5 s of rest, 20 s to 50 Hz, 1 s of ring-down."""
+
+    def make(folder):
+        command = [RIGD, "run", "chirp", "--profile", HW_PROFILES / "sim.toml", "--fast"]
+        command += ["--duration", "20", "--rest", "0.5", "--ring-down", "1", "--seed", "3"]
+        command += ["--repeat", "2", "--output", folder]
+        subprocess.run(command, check=True, capture_output=True, timeout=100)
+
+    return sorted(made_once("short_chirps", make).glob("*.mcap"))

@@ -15,8 +15,8 @@ from analysis.exchange.source import (
     SourceChannel,
     check_samples,
     no_such_channel,
-    printable,
 )
+from rigd.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

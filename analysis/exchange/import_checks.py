@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.exchange.errors import ExchangeError
-from analysis.exchange.source import printable
 from analysis.exchange.timebase import from_time_stamps, uniform
 from analysis.exchange.units import canonical_unit, unit_in_brackets, unit_in_suffix
+from rigd.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -11,6 +11,7 @@ import numpy as np
 
 from analysis.exchange.bounded_memory import MAX_MEMORY
 from analysis.exchange.errors import ExchangeError
+from rigd.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -23,6 +24,8 @@ MAX_SAMPLES: Final = 3_000_000
 
 _NAMES_SHOWN: Final = 12
 """Channel names that a message lists."""
+_NAME_SHOWN: Final = 60
+"""Characters of each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +157,7 @@ def check_samples(path: Path, what: str, samples: int) -> None:
 def no_such_channel(path: Path, name: str, available: Iterable[str]) -> ExchangeError:
     """Make the error for a channel that is not there, with the names of those that are."""
     names = list(available)
-    listed = ", ".join(repr(printable(each)) for each in names[:_NAMES_SHOWN])
+    listed = ", ".join(repr(printable(each, _NAME_SHOWN)) for each in names[:_NAMES_SHOWN])
     more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
     return ExchangeError(
         f"{path}: has no channel '{name}'; it has {listed}{more}."
@@ -190,9 +193,3 @@ def missing_library(path: Path, library: str) -> ExchangeError:
         f"{path}: needs the package {library}, which is not installed; get all that import and "
         "export can use with `pip install 'rigd[exchange]'`."
     )
-
-
-def printable(text: str, most: int = 60) -> str:
-    """Make text of a file, which may be of any length and contain anything, fit for a message."""
-    shown = "".join(c if c.isprintable() else "·" for c in text[:most])
-    return shown if len(text) <= most else f"{shown}…"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.exchange.errors import ExchangeError
+from rigd.printable import printable
 
 if TYPE_CHECKING:
     from typing import BinaryIO
@@ -174,4 +175,4 @@ def _characteristics(kind: int, exponents: tuple[int, int], title: str, unit: st
 
 
 def _ascii(text: str) -> str:
-    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
+    return printable(text).encode("ascii", "replace").decode()

@@ -212,9 +212,9 @@ class Field:
     def _without_leakage(self) -> Field:
         """Leave out what hum beyond the band spoils."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
-        return self._under(noise) if noise is not self.noise else self
+        return self.under(noise) if noise is not self.noise else self
 
-    def _under(self, noise: Noise) -> Field:
+    def under(self, noise: Noise) -> Field:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
         again = _ranked(
@@ -247,8 +247,8 @@ class Field:
         noise, closest = _noise(loose, self.comparison), min(loose.fits, key=lambda f: f.cost)
         common = noise.counts & self.noise.counts
         if _deviance(noise, closest, common) > _deviance(self.noise, self.likeliest, common):
-            return every._under(self.noise)
-        return every._under(without_leakage(noise, self.comparison, closest))
+            return every.under(self.noise)
+        return every.under(without_leakage(noise, self.comparison, closest))
 
     def cross_checked(self) -> Field:
         """Start each from where the best is: over a flat valley a search may miss what is there."""
@@ -308,7 +308,7 @@ class Field:
         if freed.best.bic > best.bic - _DISMISSED:
             return freed.cross_checked()
         lowest = min((refit for _, refit in found), key=lambda refit: refit.cost)
-        return freed._under(lowest.noise_here())
+        return freed.under(lowest.noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
         """Fit all again, with what is not linear beside the beam."""

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from analysis.selection.candidate import Candidate
 from analysis.selection.restart import adapted
+from analysis.selection.whiteness import whiteness
 from analysis.structures import STRUCTURES
 from analysis.whole_record.plant import EXTRAS
+from analysis.whole_record.unknowns import ln_stiffness_with_tip
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from analysis.selection.candidates import Field
     from analysis.selection.refit import Refit
-    from analysis.whole_record import Plant
 
 _STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("VI", "VII", "III"))
 _PROMISING: Final = 10.0
@@ -32,16 +34,27 @@ _MANY: Final = 40
 _HOPELESS: Final = 50.0
 """Deviance behind the best after a few steps, from which a structure is not followed further."""
 
-_FIRST_CONSTANT_S: Final = 3e-4
-_SECOND_CONSTANT_S: Final = 6e-4
-"""Where the search for a filter starts: at 0 its effect would be that of a delay, and no step would
-lead anywhere. Corners at 530 and 265 Hz."""
+_FIRST_SIZES: Final[Mapping[str, float]] = MappingProxyType(
+    {
+        "tip_mass_kg": 3e-3,
+        "filter_time_constant_s": 0.3,
+        "second_order_filter_time_constant_s": 0.6,
+    }
+)
+"""Where the search starts for what, next to 0, does nothing that density, stiffness and delay do
+not: a share of the beam's mass, and ms (corners at 530 and 265 Hz)."""
 
-_ROUND_CLOCKS: Final = (2e-5, -2e-5, 6e-5, -6e-5, 1.2e-4, -1.2e-4)
-"""Differences of the clocks from which a search starts anew where what is left is large."""
+_FARTHER_CLOCKS: Final = (2.0, -2.0, 6.0, -6.0, 12.0, -12.0)
+"""Differences of the clocks, in units of 1e-5, from which it starts as well if what is left is not
+noise."""
 
-_LARGE: Final = 2.0
-"""Sum of squares over its expectation."""
+_HALVINGS: Final = 20
+
+_QUIETER: Final = 0.98
+"""Share of the sum of squares left by an extra, below which the noise is estimated anew."""
+
+_DOUBTFUL: Final = 0.01
+"""Probability of a residual's shape by chance, below which a search starts from several sizes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,58 +113,72 @@ def with_extras(field: Field) -> Field:
     if lead is None or "VI" not in bare:
         return field
     found: list[Candidate] = []
+    least = field.best.fit.cost
     for start in _promising(field, lead):
-        found += _fitted(field, start, bare)
+        if start.promised_cost < least * math.exp(_HOPELESS / lead.values):
+            found += _fitted(field, start, bare)
+            least = min([least, *(candidate.fit.cost for candidate in found)])
     if not found:
         return field
     every = (*field.candidates, *found)
     ranked = tuple(sorted(every, key=lambda candidate: candidate.bic))
-    return replace(field, candidates=ranked).cross_checked()
+    freed = replace(field, candidates=ranked)
+    best = freed.best
+    if best.extras and best.fit.cost < _QUIETER * field.best.fit.cost:
+        # Part of what was taken for noise was not.
+        refit = freed.refit(best.structure, True, best.fit.plant, 1, best.extras)
+        freed = freed.under(refit.noise_here())
+    return freed.cross_checked()
 
 
-def _promising(field: Field, lead: Candidate) -> Iterator[Refit]:
-    """Yield searches with one extra each that may be worth going on with."""
+def _promising(field: Field, lead: Candidate) -> list[Refit]:
+    """Begin a search with each of the extras; give those that promise something, the best first."""
     values, cost = lead.values, lead.fit.cost
     needed = cost * math.exp(-_PROMISING / values)
+    counts = field.noise.counts
+    left = whiteness(lead.fit.residual[counts], field.comparison.frequency_hz[counts])
+    # A uniform beam far from the record is astray; one whose modes are free has mode 1 and all
+    # dampings where they are.
+    doubtful = left.probability < _DOUBTFUL or left.loud
+    found = []
     for name in EXTRAS:
-        first = min(
-            (
-                _begun(field, lead, name, start)
-                for start in _starts(name, lead, cost > _LARGE * values)
-            ),
-            key=lambda refit: refit.promised_cost,
+        begun = (
+            _begun(field, other, name, size)
+            for other in ((lead, field.best) if doubtful else (lead,))
+            for size in _starts(name, other, doubtful=doubtful)
         )
+        first = min(begun, key=lambda refit: refit.promised_cost)
+        if doubtful:  # what a first step promises from afar means little
+            first = field.descent(first.objective.unknowns, first.x, _FEW)
         if first.promised_cost < needed:
-            yield first
+            found.append(first)
+    return sorted(found, key=lambda refit: refit.promised_cost)
 
 
-def _starts(name: str, lead: Candidate, large: bool) -> Iterator[Plant]:
-    """Plants from which the search for an extra starts."""
-    plant = lead.fit.plant
-    if name == "filter_time_constant_s":
-        yield replace(
-            plant,
-            filter_time_constant_s=plant.filter_time_constant_s + _FIRST_CONSTANT_S,
-            delay_s=plant.delay_s - _FIRST_CONSTANT_S,
-        )
-    elif name == "second_order_filter_time_constant_s":
-        before = plant.second_order_filter_time_constant_s
-        yield replace(
-            plant,
-            second_order_filter_time_constant_s=before + _SECOND_CONSTANT_S,
-            delay_s=plant.delay_s - 2**0.5 * _SECOND_CONSTANT_S,
-        )
-    else:
-        yield plant
-        if name == "clock_rate_difference" and large:
-            for difference in _ROUND_CLOCKS:
-                yield replace(plant, clock_rate_difference=difference)
+def _starts(name: str, lead: Candidate, *, doubtful: bool) -> Iterator[float]:
+    """Sizes, in the extra's unknown, from which the search for it starts."""
+    yield _FIRST_SIZES.get(name, 0.0)
+    if doubtful and name == "clock_rate_difference":
+        yield from _FARTHER_CLOCKS
+    if doubtful and name == "tip_mass_kg" and lead.fit.plant.stiffness_offsets:
+        yield _tip_share(lead.fit.plant.stiffness_offsets[0])
 
 
-def _begun(field: Field, lead: Candidate, name: str, start: Plant) -> Refit:
+def _tip_share(offset: float) -> float:
+    """Mass at the tip, relative to the beam's, that makes mode 2 so much stiffer beside mode 1."""
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        rise = ln_stiffness_with_tip(2, middle) - ln_stiffness_with_tip(1, middle)
+        low, high = (middle, high) if rise < math.log1p(offset) else (low, middle)
+    return (low + high) / 2
+
+
+def _begun(field: Field, lead: Candidate, name: str, size: float) -> Refit:
     """Look from a start."""
     unknowns = field.unknowns(STRUCTURES["VI"], uniform=True, extras=(name,))
-    x = adapted(unknowns, start, lead.structure)
+    x = adapted(unknowns, lead.fit.plant, lead.structure)
+    x[-1] += size
     return field.descent(unknowns, x, 1)
 
 
@@ -169,8 +196,11 @@ def _fitted(field: Field, start: Refit, bare: dict[str, Candidate]) -> Iterator[
         if structure.name not in bare:
             continue
         if structure is not unknowns.structure:
-            own = field.unknowns(structure, True, extras)
-            first = field.descent(own, adapted(own, plant, unknowns.structure), _FEW)
+            own = field.unknowns(structure, uniform=True, extras=extras)
+            first = field.descent(own, adapted(own, plant, unknowns.structure), 1)
+            if first.promised_cost > most:
+                continue
+            first = field.descent(own, first.x, _FEW)
             if first.promised_cost > most:
                 continue
             found = field.descent(own, first.x, _MANY)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import re
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 Kind = Literal[
     "hum",
@@ -15,6 +16,21 @@ Kind = Literal[
     "ringing start",
     "beam data",
     "not uniform",
+    "elastic clamp",
+    "tip mass",
+    "torque filter",
+    "clock rate difference",
+    "rival explanations",
+    "sign",
+    "unit",
+    "sensor drift",
+    "drifting damping",
+    "drifting stiffness",
+    "drifting gain",
+    "drifting delay",
+    "clipping",
+    "play",
+    "stop",
     "implausible",
     "unexplained",
 ]
@@ -44,3 +60,42 @@ class Finding:
     interval: tuple[float, float] | None
     unit: str
     remedy: str
+
+
+SEEN: Final[frozenset[Kind]] = frozenset(
+    {"hum", "sensor drift", "sign", "unit", "clipping", "stop", "implausible", "unexplained"}
+)
+"""What is seen in the record itself, whatever model is laid over it."""
+
+_INTERVAL: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
+
+
+def doubted(finding: Finding) -> Finding:
+    """Tell as no fact what was found beside a model that does not explain the record.
+
+    Parameters
+    ----------
+    finding : Finding
+
+    Returns
+    -------
+    Finding
+        Without interval; as it was if it does not rest on the model (`SEEN`).
+
+    Examples
+    --------
+    >>> delay = Finding("delay", "The torque comes 1 ms later (0.9 to 1.1 ms; 95 %).",
+    ...                 1e-3, (9e-4, 1.1e-3), "s", "")
+    >>> doubted(delay).sentence
+    'No fact while part of the record is unexplained: the torque comes 1 ms later.'
+    """
+    if finding.kind in SEEN:
+        return finding
+    bare = _INTERVAL.sub("", finding.sentence)
+    if bare[1:2].islower() or bare[1:2] == " ":  # no abbreviation
+        bare = bare[0].lower() + bare[1:]
+    return replace(
+        finding,
+        sentence=f"No fact while part of the record is unexplained: {bare}",
+        interval=None,
+    )

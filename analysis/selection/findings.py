@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from analysis.selection.channel_checks import clipping, stops
 from analysis.selection.finding import Finding
+from analysis.selection.hum import repeats_after_s
+from analysis.selection.scale import wrong_scale
 from analysis.selection.stated_otherwise import at_edges, of_settings
 
 if TYPE_CHECKING:
@@ -19,6 +22,11 @@ if TYPE_CHECKING:
 _NORMAL_95: Final = 1.959963984540054
 _MAINS_WANDER: Final = 0.005
 _MODES_TO_JUDGE: Final = 2
+_FEWEST_PERIODS: Final = 5.0
+"""In the record: what is slower is no hum but a sensor that drifts."""
+
+_SAME_TURN: Final = 0.5
+"""Of a turn over the whole record, within which a line's frequency is that of a harmonic."""
 
 
 def findings(
@@ -40,7 +48,15 @@ def findings(
         Modes that stand out of the noise. With fewer than two, what the file states is not
         doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
     """
-    found = (*_hum(field), *map(_force, forces), *_harmonics(multiples))
+    measurement = field.comparison.measurement
+    found = (
+        *wrong_scale(field.comparison),
+        *clipping(measurement),
+        *stops(measurement),
+        *_hum(field),
+        *map(_force, forces),
+        *_harmonics(multiples),
+    )
     edges = tuple(at_edges(field))
     if edges:
         return (*found, *edges)
@@ -59,21 +75,54 @@ def mains(frequency_hz: float) -> str:
 
 
 def _hum(field: Field) -> Iterator[Finding]:
+    comparison = field.comparison
+    duration_s = comparison.samples / comparison.decimation.rate_hz
+    slow = [line for line in field.noise.lines if line.frequency_hz * duration_s < _FEWEST_PERIODS]
+    if slow:
+        yield _drift(max(line.amplitude_nm for line in slow))
+    period_s = repeats_after_s(comparison)
     for line in field.noise.lines:
+        if line in slow:
+            continue
         near = mains(line.frequency_hz)
         source = f", {near}" if near else ""
+        turns = line.frequency_hz * period_s
+        with_drive = period_s > 0 and abs(turns - round(turns)) < _SAME_TURN * period_s / duration_s
         yield Finding(
             kind="hum",
             sentence=(
-                f"The torque hums at {line.frequency_hz:.2f} Hz{source}, with "
-                f"{1e3 * line.amplitude_nm:.3g} mN·m all through the record. The motor did not "
-                "cause it; it was taken out."
+                f"The torque holds a line at {line.frequency_hz:.2f} Hz{source}, with "
+                f"{1e3 * line.amplitude_nm:.3g} mN·m all through the record. "
+                + (
+                    f"The drive repeats every {period_s:.4g} s, and so does this line: the motor "
+                    "may cause it, as a harmonic of what is not linear. It was left out."
+                    if with_drive
+                    else "The motor did not cause it; it was taken out."
+                )
             ),
             value=line.amplitude_nm,
             interval=None,
             unit="N·m",
-            remedy="Check shield and earth of the torque sensor's cable.",
+            remedy=(
+                "Repeat with half the amplitude: a line that shrinks is the motor's doing."
+                if with_drive
+                else "Check shield and earth of the torque sensor's cable."
+            ),
         )
+
+
+def _drift(size_nm: float) -> Finding:
+    return Finding(
+        kind="sensor drift",
+        sentence=(
+            f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m in the "
+            "course of the record; that is slower than anything the beam does, and was left out."
+        ),
+        value=size_nm,
+        interval=None,
+        unit="N·m",
+        remedy="",
+    )
 
 
 def _force(force: NonlinearForce) -> Finding:

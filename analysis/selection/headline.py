@@ -77,7 +77,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Size of a damping at the frequency where it does not depend on its order.
+    """Loss factor of a damping at the frequency where it does not depend on its order.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Size:
     omega_rad_s : float or None
         That frequency; None if the order is fixed: then it is the coefficient itself.
     size : Quantity
-        ``zeta omega^alpha`` (no unit) or ``gamma omega^lambda`` (1/m⁴).
+        As `DampingSize` has it.
     """
 
     damping: Damping
@@ -248,9 +248,12 @@ def of_fit(
             if _has(fit.structure, each)
         },
         sizes=tuple(
-            # What a record shows is a loss; the size that goes with it depends on the order, if
-            # only to the second degree where the two are uncorrelated.
-            _size(each, size, unexplained or reasons.get(_NAMES[each][1]))
+            # A loss factor is known without its order; a coefficient alone belongs to it.
+            _size(
+                each,
+                size,
+                unexplained or (reasons.get(_NAMES[each][1]) if size.omega_rad_s is None else None),
+            )
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
             if size is not None
         ),
@@ -365,10 +368,20 @@ def _doubted_by(told: Headline, other: Candidate) -> Headline:
     }
     sizes = []
     for each in told.sizes:
-        coefficient, order = _NAMES[each.damping]
-        at = values[coefficient] * (each.omega_rad_s or 1.0) ** values[order]
+        at = _loss(values, each)
         sizes.append(_flagged(each, flag) if elsewhere(each.size, at) else each)
     return replace(told, parameters=parameters, sizes=tuple(sizes))
+
+
+def _loss(values: Mapping[str, float], each: Size) -> float:
+    """Loss factor of a damping at the frequency of a size, or its coefficient."""
+    coefficient, order = _NAMES[each.damping]
+    omega = each.omega_rad_s
+    if omega is None:
+        return values[coefficient]
+    stored = 1.0 if each.damping == "internal" else values["density_over_stiffness"] * omega**2
+    lost = values[coefficient] * math.pow(omega, values[order])
+    return lost * math.sin(math.pi / 2 * values[order]) / stored
 
 
 def _flagged(each: Size, flag: str) -> Size:

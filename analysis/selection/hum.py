@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 _NEAR_HZ: Final = 5.0
 _SAME_HZ: Final = 0.1
+_APART: Final = 0.5
+_ALIKE: Final = 0.95
+"""Correlation of the angle with itself a period later, and below which it is another motion."""
+
 _LEAKS: Final = 0.3
 """Leaked power over that of the noise that does no harm."""
 
@@ -58,3 +62,27 @@ def without_leakage(noise: Noise, comparison: Comparison, fit: RecordFit) -> Noi
     bins = np.arange(counts.size)
     power = np.exp(np.interp(bins, bins[counts], np.log(smooth_power(clean) / share)))
     return Noise(power, counts, tuple(lines))
+
+
+def repeats_after_s(comparison: Comparison) -> float:
+    """Period of the angle's motion in s, 0 if it does not repeat at least once as a whole."""
+    angle = comparison.angle_rad[comparison.kept]
+    angle = angle - angle.mean()
+    count = angle.size
+    spectrum = np.fft.rfft(angle, 2 * count)
+    own = np.fft.irfft(np.abs(spectrum) ** 2)[: count // 2 + 1]
+    # Energy of what overlaps at a lag, of either part.
+    squares = np.concatenate([[0.0], np.cumsum(angle**2)])
+    lags = np.arange(own.size)
+    both = np.sqrt(squares[count - lags] * (squares[count] - squares[lags]))
+    alike = own / np.maximum(both, np.finfo(float).tiny)
+    apart = np.flatnonzero(alike < _APART)
+    if apart.size == 0:
+        return 0.0
+    again = np.flatnonzero((alike > _ALIKE) & (lags > apart[0]))
+    if again.size == 0:
+        return 0.0
+    end = int(again[0])
+    while end + 1 < own.size and alike[end + 1] > alike[end]:
+        end += 1
+    return end / comparison.decimation.rate_hz

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.whole_record.unknowns import FILTER_DELAYS, bare_beam
 from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def vector(unknowns: Unknowns, plant: Plant) -> NDArray[np.float64]:
         "bending_stiffness_n_m2": math.log(
             plant.beam.bending_stiffness_n_m2 / nominal.beam.bending_stiffness_n_m2
         ),
-        "delay_s": plant.delay_s * 1e3,
+        "delay_s": plant.delay_s / unknowns.units["delay_s"],
         "tool_inertia_kg_m2": plant.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
         **{
             name: value
@@ -65,6 +66,13 @@ def vector(unknowns: Unknowns, plant: Plant) -> NDArray[np.float64]:
         at["density_over_stiffness"] += math.log(
             abs(1 - size * complex(math.cos(turn), math.sin(turn)))
         )
+    if "tip_mass_kg" in unknowns.extras:
+        ln_ratio, ln_stiffness = bare_beam(at["tip_mass_kg"])
+        at["density_over_stiffness"] -= ln_ratio
+        at["bending_stiffness_n_m2"] -= ln_stiffness
+    for name, share in FILTER_DELAYS.items():
+        if name in unknowns.extras:
+            at["delay_s"] += share * plant.extras[name] / unknowns.units["delay_s"]
     return np.array([at.get(name, 0.0) for name in unknowns.names])
 
 

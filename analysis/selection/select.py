@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from analysis.selection import sentences
 from analysis.selection.candidates import Field
 from analysis.selection.experiments import experiments
+from analysis.selection.finding import doubted
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
 from analysis.selection.headline import Headline, headline
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
     from analysis.selection.candidate import Candidate
     from analysis.whole_record import Measurement, RecordFit, Setting
+
+_FIRST: Final = ("sign", "unit")
+"""What makes every number wrong is said before any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +116,7 @@ def select(
     close = rivals(field, EVEN)
     found = findings(told, forces, multiples, visible)
     if not explained:
-        found = (*found, unexplained(white, related, fit.modes))
+        found = (*map(doubted, found), unexplained(white, related, fit.modes))
     numbers = headline(field, orders, visible, adequate=adequate)
     best = field.best
     return Selection(
@@ -135,8 +139,9 @@ def select(
             input_relation=related,
             harmonics=multiples,
             sentences=(
+                *(each.sentence for each in found if each.kind in _FIRST),
                 *sentences.of_headline(numbers, orders, adequate=adequate),
-                *(finding.sentence for finding in found),
+                *(each.sentence for each in found if each.kind not in _FIRST),
             ),
             experiments=tuple(experiments(field, orders, visible, found, close)),
         ),

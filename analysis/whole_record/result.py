@@ -20,15 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DampingSize:
-    """Damping at the frequency where its size and its order are uncorrelated.
+    """Loss factor of a damping at the frequency where it is uncorrelated with its order.
 
     Attributes
     ----------
     omega_rad_s : float or None
         That frequency; None if the order is fixed or not determined.
     value, std : float
-        ``zeta omega^alpha`` (relative to the stiffness) or ``gamma omega^lambda`` (per rho/EI an
-        acceleration, 1/m⁴), or zeta or gamma itself without that frequency.
+        ``zeta omega^alpha sin(alpha pi/2)`` of internal damping, of external damping
+        ``gamma omega^lambda sin(lambda pi/2)`` over ``rho/EI omega²``: what is lost in a radian
+        over what is stored. Without that frequency zeta or gamma itself.
     """
 
     omega_rad_s: float | None

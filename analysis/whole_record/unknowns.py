@@ -16,7 +16,9 @@ directly; orders then change alone:
   the modes' stiffness;
 * of the `EXTRAS` those that a candidate carries: the root's compliance relative to the nominal
   beam's L/EI, the tip's mass relative to its mass, time constants in ms, the clocks' difference in
-  units of 1e-5.
+  units of 1e-5. To first order a tip mass does what density and stiffness do, and a filter what a
+  delay does. So where they are free, the other unknowns are those of a bare beam whose first mode
+  and torque are the same, and of the delay with the filter's own.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ import numpy as np
 
 from analysis.unknowns import ORDER_RANGE, SIZE_RANGE
 from analysis.whole_record.plant import EXTRAS, SETTINGS, Plant
-from analysis.whole_record.response import FIRST_OFFSET, offset_name
+from analysis.whole_record.response import FIRST_OFFSET, eigenvalues, offset_name
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -56,6 +58,14 @@ _EXTRA_RANGES: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
         "clock_rate_difference": (-100.0, 100.0),
     }
 )
+_TIP: Final = "tip_mass_kg"
+_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
+FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
+    {"filter_time_constant_s": 1.0, "second_order_filter_time_constant_s": 2**0.5}
+)
+"""Delay of a filter at low frequency over its time constant."""
+
+_NEWTON_STEPS: Final = 30
 _GRADIENT_NAMES: Final[Mapping[str, str]] = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
@@ -245,6 +255,10 @@ class Unknowns:
             inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
             if "lambda" in place:
                 derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
+        for name, (moved, slope) in zip(_BEAM, _bare_beam(given.get(_TIP, 0.0)), strict=True):
+            if name in place and _TIP in place:
+                values[name] *= math.exp(moved)
+                derivative[place[name], place[_TIP]] = slope
         for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
             if name in place:
                 added = sign * stiffening - (inertial if sign > 0 else 0.0)
@@ -259,6 +273,10 @@ class Unknowns:
         for name in units.keys() & place.keys():
             values[name] = given[name] * units[name]
             derivative[place[name], place[name]] = units[name]
+        for name, share in FILTER_DELAYS.items():
+            if name in place and "delay_s" in place:
+                values["delay_s"] -= share * values[name]
+                derivative[place["delay_s"], place[name]] = -share * units[name]
         return values, derivative
 
     def _addition(
@@ -284,3 +302,58 @@ def _size(ln_loss: float, order: float) -> tuple[float, float]:
     """``ln size`` of a damping of that loss, and its slope by the order."""
     angle = _QUARTER_TURN * order
     return ln_loss - math.log(math.sin(angle)), -_QUARTER_TURN / math.tan(angle)
+
+
+def bare_beam(share: float) -> tuple[float, float]:
+    """Logarithms of rho/EI and EI of a beam with a tip mass, over those of one without.
+
+    Of one whose first mode is at the same frequency, and whose torque is the same to first order.
+
+    Parameters
+    ----------
+    share : float
+        Of the tip's mass, relative to the nominal beam's.
+    """
+    (ln_ratio, _), (ln_stiffness, _) = _bare_beam(share)
+    return ln_ratio, ln_stiffness
+
+
+def ln_stiffness_with_tip(mode: int, share: float) -> float:
+    """Logarithm of the stiffness of a mode with a tip mass over that without, and all else equal.
+
+    Parameters
+    ----------
+    mode : int
+        From 1.
+    share : float
+        Of the tip's mass, relative to the beam's.
+    """
+    return _with_tip(float(eigenvalues(mode)[-1]), share)[0]
+
+
+def _bare_beam(share: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Give the same as `bare_beam`, each with its slope by the share."""
+    return _with_tip(float(eigenvalues(1)[0]), share), (share, 1.0)
+
+
+def _with_tip(bare: float, share: float) -> tuple[float, float]:
+    """Fourth power of a mode's root over that of the bare beam: logarithm, and slope by share."""
+    z = bare
+    for _ in range(_NEWTON_STEPS if share else 0):
+        value, by_z, _ = _tip_equation(z, share)
+        z -= value / by_z
+        if abs(value / by_z) < 1e-15 * z:
+            break
+    _, by_z, by_share = _tip_equation(z, share)
+    return 4 * math.log(z / bare), -4 * by_share / (by_z * z)
+
+
+def _tip_equation(z: float, share: float) -> tuple[float, float, float]:
+    """``1 + cos z cosh z - share z (sin z cosh z - cos z sinh z)``, its slopes by z and share."""
+    sine, cosine, sinh, cosh = math.sin(z), math.cos(z), math.sinh(z), math.cosh(z)
+    pinned = sine * cosh - cosine * sinh
+    return (
+        1 + cosine * cosh - share * z * pinned,
+        -pinned - share * (pinned + 2 * z * sine * sinh),
+        -z * pinned,
+    )

@@ -14,10 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rigd.printable import printable
+
 MAX_BYTES: Final = 4_000_000
 """Of a file: the greatest that vendors publish have a quarter of it."""
 MAX_ENTRIES: Final = 20_000
 """Of its objects and sub-indices: five times what the greatest drives have."""
+
+_MOST_SHOWN: Final = 80
+"""Characters of a text of the file."""
 
 _BIT_RATES_KBIT_S: Final = (10, 20, 50, 125, 250, 500, 800, 1000)
 _ARRAY, _RECORD = 0x8, 0x9
@@ -378,4 +383,4 @@ def _whole(text: str) -> int | None:
 
 def _shown(text: str) -> str:
     """Return a text of the file as messages may show it: one line, printable, not too long."""
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:80]
+    return printable(" ".join(text.split()), _MOST_SHOWN)

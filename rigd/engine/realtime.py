@@ -97,7 +97,8 @@ class Precedence:
     def __init__(self, priority: int, loop_cpu: int, *, root: Path = Path("/")) -> None:
         self._priority = priority
         self.cores_before = frozenset(os.sched_getaffinity(0))
-        self._others = self.cores_before - {_core_of_loop(loop_cpu, root)}
+        core, _ = _core_of_loop(loop_cpu, root)
+        self._others = self.cores_before - {core}
         self._put: Callable[[int], None] | None = None
 
     def take(self) -> dict[str, str]:
@@ -226,11 +227,28 @@ def _set_timer_slack(libc: ctypes.CDLL) -> str:
     return "1 ns"
 
 
-def _core_of_loop(cpu: int, root: Path) -> int:
-    """Return the core that a control process of this computer is going to choose."""
+def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
+    """Return the core that a control process chooses, and whether that one is isolated.
+
+    Parameters
+    ----------
+    cpu
+        As given to :func:`obtain`. One that is named is chosen whether it may be used or not.
+    root
+        Of the file system.
+    """
     if cpu >= 0:
-        return cpu
-    return max(isolated_cores(root) or os.sched_getaffinity(0))
+        return cpu, False
+    isolated = isolated_cores(root)
+    if isolated:
+        # They are not among those that a process may use until it asks for one by its number; so
+        # whether it may use one is seen by asking.
+        before = os.sched_getaffinity(0)
+        with contextlib.suppress(OSError):
+            os.sched_setaffinity(0, {max(isolated)})
+            os.sched_setaffinity(0, before)
+            return max(isolated), True
+    return max(os.sched_getaffinity(0)), False
 
 
 def _list_of(cores: frozenset[int]) -> str:
@@ -238,21 +256,9 @@ def _list_of(cores: frozenset[int]) -> str:
 
 
 def _pin(cpu: int, root: Path) -> str:
-    if cpu >= 0:
-        os.sched_setaffinity(0, {cpu})
-        return str(cpu)
-    isolated = isolated_cores(root)
-    if isolated:
-        # They are not among those that a process may use until it asks for one by its number.
-        try:
-            os.sched_setaffinity(0, {max(isolated)})
-        except OSError:
-            pass
-        else:
-            return f"{max(isolated)}, isolated"
-    cpu = max(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpu})
-    return str(cpu)
+    core, isolated = _core_of_loop(cpu, root)
+    os.sched_setaffinity(0, {core})
+    return f"{core}, isolated" if isolated else str(core)
 
 
 def _keep_awake(root: Path) -> str:

@@ -10,6 +10,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from rigd.printable import printable
 from rigd.session.errors import SessionError
 from rigd.session.format import Status
 from rigd.session.reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
@@ -108,7 +109,7 @@ class SessionInfo:
             *(("not shown", sentence) for sentence in self.left_out),
         ]
         width = min(max(len(key) for key, _ in rows), _WIDEST_KEY)
-        return [f"{one_line(key):{width}}  {one_line(value)}" for key, value in rows]
+        return [f"{printable(key):{width}}  {printable(value)}" for key, value in rows]
 
 
 def describe(path: str | PathLike[str]) -> SessionInfo:
@@ -182,7 +183,7 @@ def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str]
     """
     left_out: list[str] = []
     shown = _Shown(what, _MOST_CHARACTERS, left_out).texts(values)
-    return {one_line(key): one_line(value) for key, value in shown.items()}, left_out
+    return {printable(key): printable(value) for key, value in shown.items()}, left_out
 
 
 class _Shown:
@@ -265,8 +266,3 @@ def _recovery(outcome: dict[str, str]) -> dict[str, str]:
         for key, value in outcome.items()
         if key.startswith(_RECOVERED)
     }
-
-
-def one_line(text: str) -> str:
-    """Make control characters of the file harmless to a terminal."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else " " for c in text)

@@ -6,9 +6,7 @@ for a file that was cut off how far it can be read. Messages are handed on stret
 not kept: those of equal length that follow one another, as a session's do, as one run of bytes.
 
 Nothing in the file is believed before it is checked, and none can take more than its share of
-memory and time, however few bytes unpack to however many records: what a chunk claims to hold is
-bounded by `MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked
-piece by piece; and all that takes a step of the program is counted against `MAX_STEPS`.
+memory and time (:mod:`rigd.session.mcap_limits`).
 """
 
 import mmap
@@ -20,40 +18,31 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Final, TypeVar
 
-import lz4.frame
 import numpy as np
 import numpy.typing as npt
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 
 from rigd.session.format import Buffer
+from rigd.session.mcap_limits import (
+    CHUNK_STEPS,
+    DECLARATION_STEPS,
+    MAX_FILE_BYTES,
+    MAX_MESSAGE_BYTES,
+    MAX_SKIPPED,
+    MAX_TEXT_BYTES,
+    PIECE_BYTES,
+    Allowance,
+    McapDamageError,
+    McapError,
+    McapTooLargeError,
+    prefixed,
+    unpacked,
+    unpacked_pieces,
+)
 from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
-
-MAX_CHUNK_BYTES: Final = 256 << 20
-MAX_TOTAL_BYTES: Final = 2 << 30
-"""Most bytes of all chunks, unpacked: two hours and a half at 1 kHz."""
-MAX_FILE_BYTES: Final = 2 << 30
-MAX_DECLARED_BYTES: Final = 64 << 20
-"""Most memory for schemas, channels, metadata and attachments together."""
-MAX_TEXT_BYTES: Final = 32 << 20
-"""Most of that for all but the attachments: as text it takes up to four times as much."""
-MAX_ENTRIES: Final = 100_000
-"""Most keys in all metadata."""
-MAX_MESSAGE_BYTES: Final = 16 << 20
-"""Longest message that is read where it is wanted."""
-MAX_STEPS: Final = 6_000_000
-"""Most work on a file, in what a run of messages costs: about a microsecond."""
-MAX_SKIPPED: Final = 20
-"""Most damaged records that are told one by one."""
-
-_CHUNK_STEPS: Final = 20
-_DECLARATION_STEPS: Final = 15
-
-_DECLARED_COST: Final = 1000
-"""Bytes that an object for one of them takes, about, however small its record."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
@@ -73,25 +62,13 @@ _SHORT_RUN: Final = 8
 _FIRST_STRETCH: Final = 256
 _MOST_RUNS: Final = 1 << 16
 """Runs that are handed on at once."""
-_PIECE_BYTES: Final = 4 << 20
-"""Longest chunk that is unpacked at once, and length of a piece of a longer one."""
-_FEED_BYTES: Final = 1 << 18
 _PASSED_BYTES: Final = 32 << 20
 """After so much of the file what was read of it is given back to the system."""
-_MAX_ZSTD_WINDOW: Final = 32 << 20
 
 _Record = TypeVar("_Record")
 Run = tuple[int, int, int, int]
 """Messages of equal length that follow one another: channel, bytes of a record with its head, byte
 at which the first begins, and how many there are."""
-
-
-class McapError(Exception):
-    """The bytes are no MCAP file of use; the message is a predicate to the file's name."""
-
-
-class McapTooLargeError(McapError):
-    """The file takes more memory or time than it may; the message likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,17 +183,13 @@ def read_mcap(
     contents.complete = _has_end(data)
     try:
         reader.read(on_progress)
-    except _DamageError as error:
+    except McapDamageError as error:
         contents.damage = str(error)
         if salvage and contents.complete:
             contents.stated_counts = reader.stated_counts()
     except MemoryError:
         contents.damage = "does not fit into the memory of this machine"
     return contents
-
-
-class _DamageError(Exception):
-    """Something in the file contradicts the format."""
 
 
 def _has_end(data: memoryview) -> bool:
@@ -241,12 +214,12 @@ def _record_at(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
     return opcode, content, end
 
 
-def _torn(position: int, where: str) -> _DamageError:
-    return _DamageError(f"ends in the middle of a record, at byte {position}{where}")
+def _torn(position: int, where: str) -> McapDamageError:
+    return McapDamageError(f"ends in the middle of a record, at byte {position}{where}")
 
 
-def _no_record(position: int, where: str) -> _DamageError:
-    return _DamageError(f"has no record where one must be, at byte {position}{where}")
+def _no_record(position: int, where: str) -> McapDamageError:
+    return McapDamageError(f"has no record where one must be, at byte {position}{where}")
 
 
 class _Reader:
@@ -266,18 +239,13 @@ class _Reader:
         self._topics = topics
         self._take = take
         self._wanted: dict[int, bool] = {}  # channel → whether its messages are
-        self._uncompressed = 0
-        self._steps = 0
-        self._declared = 0
-        self._declared_text = 0
-        self._entries = 0
+        self._allowance = Allowance()
         self._skipped = 0
         self._unit = 0  # of messages without chunk: first byte, and how many go into it
         self._unit_room = 0
         self._declarations: dict[tuple[int, bytes], bytes] = {}  # opcode and number → content
         self._crc = 0
         self._passed = 0  # how far the checksum was computed, and the file given back
-        self._zstd = zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
 
     def read(self, on_progress: Callable[[float], None] | None) -> None:
         data, contents = self._data, self.contents
@@ -285,7 +253,7 @@ class _Reader:
         while end < len(data):
             start = end
             opcode, content, end = _record_at(data, start, "")
-            self._spend(1)
+            self._allowance.spend(1)
             if opcode == Opcode.CHUNK:
                 self._read_chunk(data[content:end], start)
                 if on_progress is not None:
@@ -305,22 +273,14 @@ class _Reader:
             else:
                 try:
                     self._read_other(opcode, data[content:end], f" at byte {start}")
-                except _DamageError as error:
+                except McapDamageError as error:
                     if not self._salvage:
                         raise
                     self._skip(str(error))
             contents.sound_bytes = end
             if end - self._passed > _PASSED_BYTES:
                 self._give_back(end)
-        raise _DamageError("has no end of its data section")
-
-    def _spend(self, steps: int) -> None:
-        self._steps += steps
-        if self._steps > MAX_STEPS:
-            raise McapTooLargeError(
-                "is made of so many small parts that reading it would take too long: more than "
-                f"{MAX_STEPS} runs of messages, chunks and other records, each weighed by its work"
-            )
+        raise McapDamageError("has no end of its data section")
 
     def _skip(self, damage: str) -> None:
         """Note a damaged record that is left out; of very many, how many they are."""
@@ -352,13 +312,13 @@ class _Reader:
         """Take the messages from `start` on that stand outside of chunks; return their end."""
         where = f" at byte {start}"
         if first_end - start < MESSAGE_HEAD.size:
-            raise _DamageError(f"has a message that is too short{where}")
+            raise McapDamageError(f"has a message that is too short{where}")
         if self._is_stray(_RUN_HEAD.unpack_from(self._data, start)[2]):
             # Its writer uses chunks: this is another record, with a damaged opcode.
-            raise _DamageError(f"has a message outside of a chunk{where}")
+            raise McapDamageError(f"has a message outside of a chunk{where}")
         if self._unit_room == 0:
             self._unit, self._unit_room = start, _BARE_MESSAGES
-        limit = min(len(self._data), max(first_end, start + _PIECE_BYTES))
+        limit = min(len(self._data), max(first_end, start + PIECE_BYTES))
         end, count = self._read_messages(
             self._data, start, limit, self._unit, where, self._unit_room
         )
@@ -373,21 +333,21 @@ class _Reader:
         contents = self.contents
         if opcode not in _DECLARATIONS:
             return
-        self._spend(_DECLARATION_STEPS)
+        self._allowance.spend(DECLARATION_STEPS)
         # Many writers repeat schemas and channels in every chunk, which takes no room again.
         number = (opcode, bytes(content[: _CHANNEL_ID.size]))
         if self._declarations.get(number) == content:
             return
-        self._declare(opcode, content, where)
+        self._allowance.declare(opcode, content, where)
         if opcode == Opcode.SCHEMA:
             schema = _parsed(Schema.read, content, where)
             if contents.schemas.setdefault(schema.id, schema) != schema:
-                raise _DamageError(f"declares schema {schema.id} twice, differently{where}")
+                raise McapDamageError(f"declares schema {schema.id} twice, differently{where}")
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.CHANNEL:
             channel = _parsed(Channel.read, content, where)
             if contents.channels.setdefault(channel.id, channel) != channel:
-                raise _DamageError(f"declares channel {channel.id} twice, differently{where}")
+                raise McapDamageError(f"declares channel {channel.id} twice, differently{where}")
             self._wanted[channel.id] = self._topics is None or channel.topic in self._topics
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.METADATA:
@@ -396,114 +356,39 @@ class _Reader:
             if len(content) >= 4:
                 (crc,) = struct.unpack_from("<I", content, len(content) - 4)
                 if crc not in (0, zlib.crc32(content[:-4])):
-                    raise _DamageError(f"has an attachment with a wrong checksum{where}")
+                    raise McapDamageError(f"has an attachment with a wrong checksum{where}")
             contents.attachments.append(_parsed(Attachment.read, content, where))
 
-    def _declare(self, opcode: int, content: Buffer, where: str) -> None:
-        """Count what a declaration takes before it is parsed."""
-        self._declared += len(content) + _DECLARED_COST
-        if opcode != Opcode.ATTACHMENT:
-            self._declared_text += len(content)
-        if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._entries += _entries(content, opcode, MAX_ENTRIES)
-        for amount, most, of_what in (
-            (self._declared, MAX_DECLARED_BYTES, "MiB of channels, schemas, metadata and files"),
-            (self._declared_text, MAX_TEXT_BYTES, "MiB of channels, schemas and metadata"),
-        ):
-            if amount > most:
-                raise McapError(
-                    "declares channels, schemas, metadata and attachments without end: more than "
-                    f"{most >> 20} {of_what}{where}"
-                )
-        if self._entries > MAX_ENTRIES:
-            raise McapError(f"has more than {MAX_ENTRIES} keys in its metadata{where}")
-
     def _read_chunk(self, content: memoryview, start: int) -> None:
-        self._spend(_CHUNK_STEPS)
+        self._allowance.spend(CHUNK_STEPS)
         where = f" in the chunk at byte {start}"
         try:
             *_, size, crc = _CHUNK_HEAD.unpack_from(content)
-            name, position = _prefixed(content, _CHUNK_HEAD.size, "<I")
-            packed, _ = _prefixed(content, position, "<Q")
+            name, position = prefixed(content, _CHUNK_HEAD.size, "<I")
+            packed, _ = prefixed(content, position, "<Q")
         except struct.error:
-            raise _DamageError(f"has a malformed head{where}") from None
-        self._uncompressed += size
-        if size > MAX_CHUNK_BYTES or self._uncompressed > MAX_TOTAL_BYTES:
-            raise _DamageError(
-                f"claims {size} bytes{where}, which is more than the {MAX_CHUNK_BYTES >> 20} MiB "
-                f"for a chunk or the {MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
-            )
+            raise McapDamageError(f"has a malformed head{where}") from None
+        self._allowance.unpack(size, where)
         compression = bytes(name[:20])
-        if size <= _PIECE_BYTES:
-            records = self._decompressed(compression, packed, size, where)
+        if size <= PIECE_BYTES:
+            records = unpacked(compression, packed, size, where)
             if crc not in (0, zlib.crc32(records)):
-                raise _DamageError(f"has a wrong checksum{where}")
+                raise McapDamageError(f"has a wrong checksum{where}")
             end = self._read_records(records, 0, start, where)
             if end < len(records):
                 raise _torn(end, where)
             return
         # Too long to be held: unpacked once to be checked, and once more to be read.
         found, found_crc = 0, 0
-        for piece in self._pieces(compression, packed, size, where):
+        for piece in unpacked_pieces(compression, packed, size, where):
             found += len(piece)
             found_crc = zlib.crc32(piece, found_crc)
             self._let_go()
         if found != size:
-            raise _DamageError(f"decompresses to a wrong size{where}")
+            raise McapDamageError(f"decompresses to a wrong size{where}")
         if crc not in (0, found_crc):
-            raise _DamageError(f"has a wrong checksum{where}")
-        self._read_pieces(self._pieces(compression, packed, size, where), start, where)
-
-    def _decompressed(self, compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
-        """Decompress a chunk to exactly `size` bytes, never allocating more."""
-        try:
-            if compression == b"":
-                records = bytes(packed[: size + 1])
-            elif compression == b"zstd":
-                _check_zstd_size(packed, size, where)
-                records = self._zstd.decompress(packed, max_output_size=size)
-            elif compression == b"lz4":
-                # One byte more than is right, so that what is too long is seen.
-                records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-            else:
-                raise _DamageError(f"uses the unknown compression {compression!r}{where}")
-        except (zstandard.ZstdError, RuntimeError, ValueError):
-            raise _DamageError(f"does not decompress{where}") from None
-        if len(records) != size:
-            raise _DamageError(f"decompresses to a wrong size{where}")
-        return records
-
-    def _pieces(
-        self, compression: bytes, packed: memoryview, size: int, where: str
-    ) -> Iterator[Buffer]:
-        """Yield a chunk piece by piece, and at most one piece more than its `size`."""
-        done = 0
-        try:
-            if compression == b"":
-                for start in range(0, len(packed), _PIECE_BYTES):
-                    yield packed[start : start + _PIECE_BYTES]
-            elif compression == b"zstd":
-                _check_zstd_size(packed, size, where)
-                stream = self._zstd.stream_reader(packed)
-                while done <= size and (piece := stream.read(_PIECE_BYTES)):
-                    done += len(piece)
-                    yield piece
-            elif compression == b"lz4":
-                lz4_stream = lz4.frame.LZ4FrameDecompressor()
-                for start in range(0, len(packed), _FEED_BYTES):
-                    feed: Buffer = packed[start : start + _FEED_BYTES]
-                    while not lz4_stream.eof and done <= size:
-                        piece = lz4_stream.decompress(feed, max_length=_PIECE_BYTES)
-                        done += len(piece)
-                        if piece:
-                            yield piece
-                        if lz4_stream.needs_input:
-                            break
-                        feed = b""
-            else:
-                raise _DamageError(f"uses the unknown compression {compression!r}{where}")
-        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError):
-            raise _DamageError(f"does not decompress{where}") from None
+            raise McapDamageError(f"has a wrong checksum{where}")
+        self._read_pieces(unpacked_pieces(compression, packed, size, where), start, where)
 
     def _read_pieces(self, pieces: Iterator[Buffer], unit: int, where: str) -> None:
         """Read records that begin in one piece and end in another, and skip what is not wanted."""
@@ -553,7 +438,7 @@ class _Reader:
             "that are accepted"
         )
         if not self._salvage:
-            raise _DamageError(damage)
+            raise McapDamageError(damage)
         self._skip(damage)
         return False
 
@@ -577,9 +462,9 @@ class _Reader:
             end = content + length
             if end > len(records):
                 return start
-            self._spend(1)
+            self._allowance.spend(1)
             if opcode == Opcode.MESSAGE:
-                raise _DamageError(f"has a message that is too short{where}")
+                raise McapDamageError(f"has a message that is too short{where}")
             self._read_other(opcode, records[content:end], where)
             if opcode == Opcode.CHANNEL:
                 (channel,) = _CHANNEL_ID.unpack_from(records, content)
@@ -614,7 +499,9 @@ class _Reader:
                     break
                 is_wanted = wanted.get(channel)
                 if is_wanted is None:
-                    raise _DamageError(f"has a message of an undeclared channel {channel}{where}")
+                    raise McapDamageError(
+                        f"has a message of an undeclared channel {channel}{where}"
+                    )
                 if most is not None and (taken == most or self._is_stray(channel)):
                     break
                 end = position + size
@@ -636,28 +523,32 @@ class _Reader:
         finally:
             if runs and self._take is not None:
                 self._take(self.contents, Stretch(records, runs, unit))
-        self._spend(passed)
+        self._allowance.spend(passed)
         return position, taken
 
     def _check_data_end(self, content: memoryview, start: int) -> None:
         if len(content) < 4:
-            raise _DamageError(f"has a malformed end of its data section at byte {start}")
+            raise McapDamageError(f"has a malformed end of its data section at byte {start}")
         (crc,) = struct.unpack_from("<I", content)
         if crc != 0 and crc != self._crc_of(self._passed, start, self._crc):
-            raise _DamageError("has a wrong checksum over its data section")
+            raise McapDamageError("has a wrong checksum over its data section")
         self.contents.verified = crc != 0
 
     def _check_summary(self, start: int) -> None:
         """Compare the summary, if there is one, with what was found."""
         data = self._data
         if not self.contents.complete:
-            raise _DamageError("ends in the middle of its summary, or something was appended to it")
+            raise McapDamageError(
+                "ends in the middle of its summary, or something was appended to it"
+            )
         footer = len(data) - len(MAGIC) - _FOOTER.size
         *_, summary_start, _, crc = _FOOTER.unpack_from(data, footer)
         if summary_start not in (0, start) or (summary_start == 0 and footer != start):
-            raise _DamageError(f"has a footer that contradicts its data section at byte {footer}")
+            raise McapDamageError(
+                f"has a footer that contradicts its data section at byte {footer}"
+            )
         if crc not in (0, self._crc_of(start, footer + _FOOTER.size - 4)):
-            raise _DamageError("has a wrong checksum over its summary")
+            raise McapDamageError("has a wrong checksum over its summary")
         for opcode, content in self._summary_records(start, footer):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # Those of channels without messages may stand here only.
@@ -667,7 +558,7 @@ class _Reader:
                 found = self.contents.message_counts
                 counts = statistics.channel_message_counts
                 if any(found[channel] != count for channel, count in counts.items()):
-                    raise _DamageError("has not the messages that its statistics count")
+                    raise McapDamageError("has not the messages that its statistics count")
 
     def _summary_records(self, start: int, footer: int) -> Iterator[tuple[int, memoryview]]:
         """Yield opcode and content of the summary's records."""
@@ -679,7 +570,7 @@ class _Reader:
                 self._let_go()
             # Each channel that statistics count takes its time.
             is_statistics = opcode == Opcode.STATISTICS
-            self._spend(1 + (end - content) // 4 if is_statistics else 1)
+            self._allowance.spend(1 + (end - content) // 4 if is_statistics else 1)
             yield opcode, data[content:end]
 
     def stated_counts(self) -> dict[int, int]:
@@ -696,49 +587,9 @@ class _Reader:
                 if opcode == Opcode.STATISTICS:
                     statistics = _parsed(Statistics.read, content, "")
                     return dict(statistics.channel_message_counts)
-        except _DamageError:
+        except McapDamageError:
             pass
         return {}
-
-
-def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:
-    """Compare the size that the frame may state, which the decompressor would believe."""
-    stated = zstandard.get_frame_parameters(packed).content_size
-    if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-        raise _DamageError(f"states two different sizes{where}")
-
-
-def _prefixed(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
-    """Return the bytes behind a length of format `prefix`, and where they end."""
-    (length,) = struct.unpack_from(prefix, content, position)
-    start = position + struct.calcsize(prefix)
-    if length > len(content) - start:
-        raise struct.error
-    return content[start : start + length], start + length
-
-
-def _entries(content: Buffer, opcode: int, most: int) -> int:
-    """Count the entries of the map at the end of a metadata or channel record, up to `most` + 1.
-
-    What is malformed has none: it is found out when the record is parsed.
-    """
-    view = memoryview(content)
-    count = 0
-    try:
-        if opcode == Opcode.METADATA:
-            _, position = _prefixed(view, 0, "<I")
-        else:
-            _, position = _prefixed(view, 4, "<I")
-            _, position = _prefixed(view, position, "<I")
-        entries, _ = _prefixed(view, position, "<I")
-        position = 0
-        while position < len(entries) and count <= most:
-            _, position = _prefixed(entries, position, "<I")
-            _, position = _prefixed(entries, position, "<I")
-            count += 1
-    except struct.error:
-        pass
-    return count
 
 
 def _parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
@@ -747,7 +598,7 @@ def _parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: s
         stream = ReadDataStream(BytesIO(content))
         record = read(stream)
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
-        raise _DamageError(f"has a malformed record{where}") from None
+        raise McapDamageError(f"has a malformed record{where}") from None
     return record
 
 

@@ -16,14 +16,8 @@ import numpy.typing as npt
 from rigd.session.durable import is_being_written
 from rigd.session.errors import SessionError
 from rigd.session.format import to_native
-from rigd.session.mcap_reader import (
-    McapContents,
-    McapError,
-    McapTooLargeError,
-    Stretch,
-    Taker,
-    read_mcap,
-)
+from rigd.session.mcap_limits import McapError, McapTooLargeError
+from rigd.session.mcap_reader import McapContents, Stretch, Taker, read_mcap
 from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
 from rigd.session.message_decoder import (
     CONTROLS,

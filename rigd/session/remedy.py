@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Final
 
 from rigd.session.errors import SessionError
-from rigd.session.mcap_reader import McapError, read_mcap
+from rigd.session.mcap_limits import McapError
+from rigd.session.mcap_reader import read_mcap
 from rigd.session.reader import load_contents
 from rigd.session.recovery import recovered_path
 from rigd.session.schema import SAMPLE_TOPIC

@@ -21,6 +21,7 @@ from rigd.devices.registry import (
 from rigd.devices.simulator import unreachable_simulators
 from rigd.excitation import Excitation
 from rigd.planning import RefusedError
+from rigd.printable import printable
 from rigd.profile import Profile, load_profile
 from rigd.safety import Limits
 from rigd.session.writer import PART_SUFFIX
@@ -110,8 +111,7 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
             if uid == os.getuid():
                 whose = "in another environment"
                 remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
-        # Whoever made it has chosen its name.
-        shown = "".join(c if c.isprintable() else "?" for c in str(path))
+        shown = printable(str(path))  # whoever made it has chosen its name
         raise RefusedError(
             f"A simulated rig of {profile.name} is run {whose} ({shown}), which this command does "
             f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "

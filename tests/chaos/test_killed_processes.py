@@ -30,7 +30,8 @@ def rig():
         # The others have to go on by themselves, for the drive's sake and for the file's.
         ("all", signal.SIGSTOP, 0.4, {"afterwards": signal.SIGKILL}),
         ("recorder", signal.SIGSTOP, 0.3, {"sweep_s": 1.5}),
-        ("publisher", signal.SIGKILL, 0.3, {"sweep_s": 1.5}),
+        # In a session of this process it is killed in tests/live/test_live_rig.py.
+        pytest.param("publisher", signal.SIGKILL, 0.3, {"sweep_s": 1.5}, marks=pytest.mark.slow),
         ("supervisor", signal.SIGSTOP, 0.3, {}),
     ],
 )

@@ -89,17 +89,20 @@ def rows(batches: list, name: str) -> list[tuple[int, list]]:
 
 
 @pytest.fixture(scope="module")
-def paper(tmp_path_factory):
+def paper(made_once):
     """The paper's session, but of half its length, and what `--save` made of it."""
-    folder = tmp_path_factory.mktemp("paper")
-    half = ("--duration", "60", "--stop-hz", "25", "--ring-down", "1", "--fast")
-    done = run("run", "chirp", *half, "--json", "--output", "out", cwd=folder)
-    assert done.returncode == 0, done.stderr
-    (session,) = json.loads(done.stdout)["sessions"]
-    path = folder / session["path"]
-    done = run("replay", path, "--save", "paper.rrd", cwd=folder)
-    assert (done.returncode, done.stdout) == (0, ""), done.stderr
-    assert done.stderr == "paper.rrd: open it with rigd replay paper.rrd.\n"
+
+    def make(folder):
+        half = ("--duration", "60", "--stop-hz", "25", "--ring-down", "1", "--fast")
+        done = run("run", "chirp", *half, "--output", "out", cwd=folder)
+        assert done.returncode == 0, done.stderr
+        (path,) = folder.glob("out/*.mcap")
+        done = run("replay", path, "--save", "paper.rrd", cwd=folder)
+        assert (done.returncode, done.stdout) == (0, ""), done.stderr
+        assert done.stderr == "paper.rrd: open it with rigd replay paper.rrd.\n"
+
+    folder = made_once("replayed", make)
+    (path,) = folder.glob("out/*.mcap")
     return read_session(path), chunks(folder / "paper.rrd"), folder / "paper.rrd"
 
 

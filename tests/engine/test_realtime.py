@@ -158,6 +158,7 @@ def test_touching_new_memory_is_counted():
 
 PRECEDENCE = """
 import json, os, resource, sys, threading
+from pathlib import Path
 from rigd.engine.process import Child
 from rigd.engine.realtime import Precedence
 {before}
@@ -177,7 +178,7 @@ def as_child():
     return json.loads(os.read(there, 1000))
 
 told = dict(before=state())
-precedence = Precedence({priority}, {cpu})
+precedence = Precedence({priority}, {cpu}, root=Path("{root}"))
 told["obtained"], told["with"] = precedence.take(), state()
 wait = threading.Event()
 thread = threading.Thread(target=wait.wait, daemon=True)
@@ -207,8 +208,8 @@ os.sched_setscheduler = without_realtime
 ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="needs rights that only root is sure to have")
 
 
-def precedence_of_a_process(*, priority=20, cpu=-1, before=""):
-    code = PRECEDENCE.format(priority=priority, cpu=cpu, before=before)
+def precedence_of_a_process(*, priority=20, cpu=-1, before="", root="/"):
+    code = PRECEDENCE.format(priority=priority, cpu=cpu, before=before, root=root)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     return json.loads(done.stdout)
 
@@ -245,6 +246,16 @@ def test_a_loop_on_a_core_of_its_own_is_kept_off_that_one():
     others = sorted(os.sched_getaffinity(0) - {first}) or [first]
     told = precedence_of_a_process(cpu=first)
     assert told["with"][2] == others
+
+
+@pytest.mark.parametrize("isolated", ["4000", ""])
+def test_the_core_that_is_kept_off_is_the_one_that_the_loop_gets(machine, isolated):
+    granted_realtime()
+    first = str(min(os.sched_getaffinity(0)))
+    root = machine("sys/devices/system/cpu/isolated", f"{isolated or first}\n")
+    (loop,) = obtained_by_a_process(root=root)[1]
+    others = sorted(os.sched_getaffinity(0) - {loop}) or [loop]
+    assert precedence_of_a_process(root=root)["with"][2] == others
 
 
 def test_without_any_right_the_refusal_is_told_and_nothing_changes():

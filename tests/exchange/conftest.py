@@ -1,7 +1,5 @@
 """A session of the simulated rig, sessions of given arrays, and files of other programs."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +25,9 @@ METADATA = {
 
 
 @pytest.fixture(scope="session")
-def simulated(tmp_path_factory):
+def simulated(short_chirps):
     """A short chirp of the simulated rig: 0.5 s of rest, 20 s to 50 Hz, 1 s of ring-down."""
-    folder = tmp_path_factory.mktemp("simulated")
-    rigd = Path(sys.executable).parent / "rigd"
-    command = [rigd, "run", "chirp", "--profile", PROFILE, "--fast", "--duration", "20"]
-    command += ["--rest", "0.5", "--ring-down", "1", "--seed", "3", "--output", folder]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
-    return next(folder.glob("*.mcap"))
+    return short_chirps[0]
 
 
 @pytest.fixture

@@ -20,7 +20,9 @@ import seqpacket_bus  # noqa: E402
 
 RIGD = Path(sys.executable).parent / "rigd"
 SHIPPED = HERE.parents[1] / "hw_profiles" / "antenna_can.toml"
-NAME = "independent"
+NAME = f"independent-{os.getpid()}"
+"""One of its own for each process that runs trials: a rig of hardware is in use on all of the
+computer."""
 NODE_ID = 5
 HEARTBEAT_TIMEOUT_S = 0.2
 TIMES = ("polls", "turnaround median", "turnaround 99 %", "both replies after")

@@ -17,35 +17,49 @@ def hostile(load_script):
     return load_script("fuzz_hostile")
 
 
-def test_sixty_hostile_and_damaged_files(hostile):
+@pytest.mark.timeout(400)
+def test_a_file_of_each_hostile_kind_and_as_many_damaged_ones(hostile):
     """In a process of its own, which forks for each command: this one is large, and has threads."""
     script = Path(hostile.__file__)
+    count = 2 * len((*hostile.LOST_ONCE, *hostile.OTHERS))  # every second one is damaged
     code = f"import sys; sys.path.insert(0, {str(script.parent)!r}); import fuzz_hostile as f; "
-    code += "wrong = f.fuzz(60, 3, scale=0.02); sys.exit('\\n'.join(wrong) or 0)"
+    code += f"wrong = f.fuzz({count}, 3, scale=0.02); sys.exit('\\n'.join(wrong) or 0)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=1800
     )
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["digits", "long_key", "control_characters", "wide_chunks", "other_topic", "in_turn",
-     "log_flood", "permuted"],
-)  # fmt: skip
-def test_what_once_took_all_memory_or_time(hostile, kind):
-    """At full scale, `rigd info` alone: the others read in the same way."""
-    script = Path(hostile.__file__)
-    code = f"""
+FULL_SCALE = """
 import random, sys, tempfile
 from pathlib import Path
-sys.path.insert(0, {str(script.parent)!r})
+sys.path.insert(0, {folder!r})
 import fuzz_hostile as f
-f.warm_up()
-with tempfile.TemporaryDirectory() as folder:
-    make = lambda: f.{kind}(random.Random(1))
-    sys.exit("".join(o.wrong() for o in f.check_file(make, "", Path(folder), ["info"])) or 0)
+f.MOST_MEGABYTES = {megabytes}
+f.warm_up(["info"])
+wrong = []
+for kind in {kinds!r}.split():
+    with tempfile.TemporaryDirectory() as folder:
+        make = lambda: getattr(f, kind)(random.Random(1), {scale})
+        wrong += [o.wrong() for o in f.check_file(make, kind, Path(folder), ["info"])]
+sys.exit("".join(wrong) or 0)
 """
+
+
+@pytest.mark.parametrize(
+    ("kinds", "scale", "megabytes"),
+    [
+        ("digits long_key control_characters log_flood permuted", 1.0, 500),
+        # A chunk of these has 50 MB, for which there is no room if it is held as a whole.
+        ("wide_chunks other_topic", 0.2, 80),
+        pytest.param("wide_chunks other_topic in_turn", 1.0, 500, marks=pytest.mark.slow),
+    ],
+    ids=["full", "long chunks", "longest chunks"],
+)
+def test_what_once_took_all_memory_or_time(hostile, kinds, scale, megabytes):
+    """`rigd info` alone: the others read in the same way."""
+    folder = str(Path(hostile.__file__).parent)
+    code = FULL_SCALE.format(folder=folder, kinds=kinds, scale=scale, megabytes=megabytes)
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=1800
     )

@@ -10,7 +10,7 @@ import pytest
 
 from rigd.session import Status, message_decoder, read_session
 from rigd.session.format import CONTROL_TYPES, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
-from rigd.session.mcap_reader import (
+from rigd.session.mcap_limits import (
     MAX_CHUNK_BYTES,
     MAX_DECLARED_BYTES,
     MAX_ENTRIES,

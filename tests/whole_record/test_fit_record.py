@@ -333,8 +333,10 @@ def test_intervals_correlations_and_what_follows(all_seven, true_parameters):
         (found.internal, "zeta", "alpha"),
         (found.external, "gamma", "lambda"),
     ):
-        truth = true_parameters("VI")
-        expected = truth[coefficient] * size.omega_rad_s ** truth[order]
+        truth, omega = true_parameters("VI"), size.omega_rad_s
+        expected = truth[coefficient] * omega ** truth[order] * np.sin(np.pi / 2 * truth[order])
+        if coefficient == "gamma":
+            expected /= truth["density_over_stiffness"] * omega**2
         assert abs(size.value - expected) < 4 * size.std
         assert size.std / size.value < 0.5 * found.std[coefficient] / found.parameters[coefficient]
     assert all_seven["I"].internal.omega_rad_s is None

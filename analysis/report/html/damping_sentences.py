@@ -15,8 +15,8 @@ _SMALL: Final = 1e-3
 """Sizes below are told in the power of ten that zeta has in the paper."""
 
 _SYMBOLS: Final = {
-    "internal": ("ζ", "ω^α", "", "zeta", "alpha", "α"),
-    "external": ("γ", "ω^λ", " 1/m⁴", "gamma", "lambda", "λ"),
+    "internal": ("ζ", "", "zeta", "alpha", "α"),
+    "external": ("γ", " 1/m⁴", "gamma", "lambda", "λ"),
 }
 
 
@@ -49,10 +49,10 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
             f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals)."
         )
     found.extend(
-        f"The {each.damping} damping is {_size(each)}{_order(told, each)}."
+        f"The {each.damping} damping {_size(each)}{_order(told, each)}."
         for each in told.sizes
-        # A size that holds for one assumed order says nothing of the antenna.
-        if each.omega_rad_s is not None or not _flagged(told, each)
+        # A coefficient that holds for one assumed order says nothing of the antenna.
+        if each.size.flag is None and (each.omega_rad_s is not None or not _flagged(told, each))
     )
     return tuple(found)
 
@@ -72,20 +72,19 @@ def _percent(ratio: Quantity) -> str:
 
 
 def _size(each: Size) -> str:
-    coefficient, power, unit, *_names = _SYMBOLS[each.damping]
+    coefficient, unit, *_names = _SYMBOLS[each.damping]
     size = each.size
     factor, tenth = (1e5, " · 10⁻⁵") if size.value < _SMALL else (1.0, "")
     value, low, high = estimate((size.value, *(size.interval_95 or (None, None))), size.std, factor)
-    bounds = f"{value.text} ({low.text} to {high.text}){tenth}{unit}"
+    bounds = f"{value.text} ({low.text} to {high.text}){tenth}"
     if each.omega_rad_s is None:
-        return f"{coefficient}\u00a0=\u00a0{bounds}"
-    hertz = each.omega_rad_s / (2 * math.pi)
-    return f"{coefficient}\u00a0{power}\u00a0=\u00a0{bounds} at {hertz:.3g} Hz"
+        return f"is {coefficient}\u00a0=\u00a0{bounds}{unit}"
+    return f"has a loss factor of {bounds} at {each.omega_rad_s / (2 * math.pi):.3g} Hz"
 
 
 def _flagged(told: Headline, each: Size) -> bool:
     """Whether coefficient and order of a damping carry a flag."""
-    return told.parameters[_SYMBOLS[each.damping][3]].flag is not None
+    return told.parameters[_SYMBOLS[each.damping][2]].flag is not None
 
 
 def _order(told: Headline, each: Size) -> str:
@@ -96,7 +95,7 @@ def _order(told: Headline, each: Size) -> str:
     if order.interval_95 is None or order.flag is not None:
         return f"; its order {symbol} is not known"
     value, low, high = estimate((order.value, *order.interval_95), order.std)
-    return f", of the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
+    return f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text})"
 
 
 def _listed(parts: list[str]) -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.report.html.reported import MARK, greyed, marked
-from analysis.report.html.table import ABSENT, Cell, Column, Table, count, estimate, number
+from analysis.report.html.table import Cell, Column, Table, count, estimate, number
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -88,15 +88,14 @@ def parameters_table(subject: Subject) -> Table:
 
 
 def sizes_table(subject: Subject) -> Table:
-    """Sizes of the damping where they are uncorrelated with its orders."""
+    """Loss factors of either damping where they are uncorrelated with its order."""
     told = subject.headline
     return Table(
         "damping_sizes",
-        "Size of the damping at the frequency where it does not depend on the order found",
+        "Loss factor of either damping at the frequency where it does not depend on its order",
         (
             Column("Damping", "damping", numeric=False),
             Column("Quantity", "quantity", numeric=False),
-            Column("Unit", "unit", numeric=False),
             Column("at ω (rad/s)", "omega_rad_s"),
             Column("Value", "value"),
             Column("std", "std"),
@@ -178,12 +177,12 @@ def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Cell, ...
 
 def _size_row(told: Headline, each: Size) -> tuple[Cell, ...]:
     size, internal = each.size, each.damping == "internal"
-    symbol, unit = ("ζ ω^α", "1") if internal else ("γ ω^λ", "1/m⁴")
+    symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
     flag = size.flag
     if each.omega_rad_s is None:
         # Without its frequency a size is the coefficient for an order that was only assumed.
         flag = flag or told.parameters["zeta" if internal else "gamma"].flag
-        symbol, unit = symbol[0], ABSENT
+        symbol = symbol[0]
     at = number(each.omega_rad_s, ".4g")
     shown = [
         *estimate((size.value, size.std), size.std),
@@ -192,7 +191,7 @@ def _size_row(told: Headline, each: Size) -> tuple[Cell, ...]:
     ]
     if flag is not None:
         shown = [marked(shown[0]), *map(greyed, shown[1:])]
-    return (each.damping, symbol, unit, at, *shown)
+    return (each.damping, symbol, at, *shown)
 
 
 def _ends(quantity: Quantity) -> tuple[float | None, float | None]:

@@ -22,12 +22,7 @@ from rigd.devices.cia402.requirements import (
 )
 from rigd.devices.cia402.sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
 from rigd.devices.cia402.standing import command_off, require_off, still_on, wait_for
-from rigd.devices.cia402.values import (
-    interpolation_time,
-    max_speed_rpm,
-    sync_period_us,
-    torque_limit_per_mille,
-)
+from rigd.devices.cia402.values import wanted_values
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters, ServoDrive
 
@@ -98,8 +93,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     """
     settings = rig.cia402
     assert settings is not None
-    period_us = sync_period_us(rig.rate_hz)
-    interpolation = interpolation_time(rig.rate_hz)
+    wanted = wanted_values(rig)
     with SdoAccess(port, settings.node_id, name) as sdo:
         # Before anything else, whoever it is: a session that was killed may have left it turning.
         command_off(sdo)
@@ -112,16 +106,16 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
         except DeviceError as error:
             raise DeviceError(f"{error}{still_on(sdo)}") from None
         require_off(sdo, rig, name)
-        work = _SetUp(sdo, settings, name)
+        work = _SetUp(sdo, settings, name, wanted)
         work.assign()
         work.check_torque(identity, rig)
-        work.configure_torque(torque_limit_per_mille(rig))
+        work.configure_torque()
         work.configure_speed()
-        work.configure_sync(period_us, interpolation)
+        work.configure_sync()
         stands = work.configure_guards()
         work.configure_pdos(stands)
         work.look_at_the_rest(identity)
-        work.settle(requirement(objects.MODE), objects.CYCLIC_TORQUE)
+        work.settle(requirement(objects.MODE))
         # Some drives show it only once they are enabled: it is looked at again then.
         wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
     return Outfit(
@@ -172,24 +166,48 @@ def _check_identity(
 
 
 class _SetUp:
-    """The work on one drive that is disabled; collects what it has not."""
+    """The work on one drive that is disabled; collects what it has not.
 
-    def __init__(self, sdo: SdoAccess, settings: ServoDrive, name: str) -> None:
+    Parameters
+    ----------
+    sdo
+        The way to it.
+    settings
+        Of the profile.
+    name
+        Of the drive, for messages.
+    wanted
+        What its objects are to hold, by index and sub-index.
+    """
+
+    def __init__(
+        self, sdo: SdoAccess, settings: ServoDrive, name: str, wanted: dict[tuple[int, int], int]
+    ) -> None:
         self._sdo = sdo
         self._settings = settings
         self._name = name
+        self._wanted = wanted
         self.lacks: list[Requirement] = []
 
-    def settle(self, row: Requirement, wanted: int) -> bool:
+    def settle(self, row: Requirement, wanted: int | None = None) -> bool:
         """Have an object hold a value, and return whether the drive has it.
 
         A write-only one is written and not read back, where that may be.
+
+        Parameters
+        ----------
+        row
+            Of the object.
+        wanted
+            The value; the one of the table of values if it is not given.
 
         Raises
         ------
         DeviceError
             If the drive cannot do without, or keeps another value that does not do.
         """
+        if wanted is None:
+            wanted = self._wanted[row.index, row.sub]
         try:
             found = self._sdo.read_if_there(row.index, row.sub)
         except SdoRefusal as refusal:
@@ -256,12 +274,12 @@ class _SetUp:
                 "would be wrong by that ratio. Correct the profile or the drive."
             )
 
-    def configure_torque(self, limit_per_mille: int) -> None:
+    def configure_torque(self) -> None:
         """Have the drive exert what it is told: up to the limit, and nothing on top of it."""
-        self.settle(requirement(objects.MAX_TORQUE), limit_per_mille)
+        self.settle(requirement(objects.MAX_TORQUE))
         for index in objects.TORQUE_LIMITS:
             if self._sdo.read_if_there(index) is not None:
-                self.settle(requirement(index), limit_per_mille)
+                self.settle(requirement(index))
         self._clear(requirement(objects.TORQUE_OFFSET))
         self._clear(requirement(objects.POLARITY))
 
@@ -270,26 +288,27 @@ class _SetUp:
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
-        if not self.settle(row, max_speed_rpm(self._settings)):
+        if not self.settle(row):
             raise DeviceError(
                 f"{self._name}: it has no object {row.place} ({row.name}). {row.sentence}"
             )
 
-    def configure_sync(self, period_us: int, interpolation: tuple[int, int]) -> None:
+    def configure_sync(self) -> None:
         """Have the drive go by a SYNC of this period, of no window and without a counter."""
         sdo = self._sdo
         cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
-        if cob_id is not None and cob_id & ~objects.PDO_DISABLED != objects.SYNC_ID:
-            self.settle(requirement(objects.SYNC_COB_ID), objects.SYNC_ID)
+        row = requirement(objects.SYNC_COB_ID)
+        if cob_id is not None and cob_id & ~objects.PDO_DISABLED != self._wanted[row.index, 0]:
+            self.settle(row)
         if sdo.read_if_there(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
             if sdo.read_if_there(objects.SYNC_PERIOD_US):
                 self.settle(requirement(objects.SYNC_PERIOD_US), 0)
             self._clear(requirement(objects.SYNC_OVERFLOW))
         self._clear(requirement(objects.SYNC_WINDOW_US))
-        self.settle(requirement(objects.SYNC_PERIOD_US), period_us)
-        for sub, value in enumerate(interpolation, 1):
-            self.settle(requirement(objects.INTERPOLATION_TIME, sub), value)
+        self.settle(requirement(objects.SYNC_PERIOD_US))
+        for sub in (1, 2):
+            self.settle(requirement(objects.INTERPOLATION_TIME, sub))
 
     def configure_guards(self) -> Watchdog:
         """Set what the drive does when this computer falls silent, and how it is heard itself.
@@ -313,26 +332,22 @@ class _SetUp:
             raise DeviceError(f"{self._name}: {row.missing()}")
         if stands in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The maker's own watchdog does what its maker says, whatever stands here.
-            self.settle(requirement(objects.ABORT_OPTION), settings.abort_option)
-        communication_error = settings.communication_error_option
+            self.settle(requirement(objects.ABORT_OPTION))
         row = requirement(objects.COMMUNICATION_ERROR, 1)
-        if not self.settle(row, communication_error) and communication_error:
+        if not self.settle(row) and settings.communication_error_option:
             raise DeviceError(
                 f"{self._name}: it has no object {row.place} ({row.name}), so that it goes "
                 "pre-operational on a lost connection; set cia402.communication_error_option = 0."
             )
-        period_ms = round(settings.drive_heartbeat_period_s * 1000)
-        self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS), period_ms)
-        emergency = sdo.read_if_there(objects.EMERGENCY_COB_ID)
-        if emergency is not None and emergency != 0x80 + settings.node_id:
-            self.settle(requirement(objects.EMERGENCY_COB_ID), 0x80 + settings.node_id)
+        self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS))
+        row = requirement(objects.EMERGENCY_COB_ID)
+        if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
+            self.settle(row)
         return stands
 
     def configure_pdos(self, stands: Watchdog) -> None:
         """Map one PDO each way and switch all others off."""
         settings, sdo = self._settings, self._sdo
-        node_id = settings.node_id
-        at_sync = settings.torque_delivery == "at_sync"
         for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
             _disable_others(sdo, communication)
         entries: tuple[int, ...] = objects.TPDO_ENTRIES
@@ -342,17 +357,15 @@ class _SetUp:
             entries = entries[:-1]
         self._configure_pdo(
             objects.TPDO_COMMUNICATION,
-            0x180 + node_id | objects.NO_REMOTE_REQUEST,
+            objects.NO_REMOTE_REQUEST,
             entries,
-            objects.AT_EVERY_SYNC,
             {objects.INHIBIT_TIME: 0},
         )
         deadline_ms = round(settings.heartbeat_timeout_s * 1000)
         self._configure_pdo(
             objects.RPDO_COMMUNICATION,
-            0x200 + node_id,
+            0,
             objects.RPDO_ENTRIES,
-            objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
             {objects.EVENT_TIMER: deadline_ms} if stands is Watchdog.RPDO_DEADLINE else {},
         )
 
@@ -417,9 +430,8 @@ class _SetUp:
     def _configure_pdo(
         self,
         communication: int,
-        can_id: int,
+        flags: int,
         entries: tuple[int, ...],
-        transmission: int,
         parameters: dict[int, int],
     ) -> None:
         """Have a PDO carry these entries; one that does so already is left alone.
@@ -428,17 +440,17 @@ class _SetUp:
         ----------
         communication
             Index of its communication parameters; those of its mapping are 0x200 further.
-        can_id
-            Identifier with the bits of its COB-ID.
+        flags
+            Further bits of its COB-ID.
         entries
             What it carries, as mapping entries.
-        transmission
-            Type.
         parameters
             Further sub-indices of the communication parameters, and what they are to hold where
             the drive has them and they are not 0, or are wanted.
         """
         sdo, mapping = self._sdo, communication + 0x200
+        can_id = self._wanted[communication, 1] | flags
+        transmission = self._wanted[communication, 2]
         cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
         mapped = self._reads(mapping, (len(entries), *entries))
         typed = sdo.read_if_there(communication, 2) == transmission

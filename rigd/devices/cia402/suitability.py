@@ -21,12 +21,7 @@ from rigd.devices.cia402.requirements import (
     requirement,
     watchdog,
 )
-from rigd.devices.cia402.values import (
-    interpolation_time,
-    max_speed_rpm,
-    sync_period_us,
-    torque_limit_per_mille,
-)
+from rigd.devices.cia402.values import fixed_values, wanted_values
 from rigd.devices.eds import Eds, EdsEntry
 
 if TYPE_CHECKING:
@@ -79,13 +74,12 @@ _LENGTHS: Final = {
     entry >> 16: entry & 0xFF for entries in _PDO_ENTRIES.values() for entry in entries
 }
 """Bits that each mapped object has in its PDO."""
-_COB_IDS: Final = {
-    (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
-    (objects.EMERGENCY_COB_ID, 0): 0x080,
-    (objects.TPDO_COMMUNICATION, 1): 0x180,
-    (objects.RPDO_COMMUNICATION, 1): 0x200,
-}
-"""Identifiers that CiA 301 sets beforehand; the node id is added to all but that of SYNC."""
+_COB_IDS: Final = (
+    (objects.SYNC_COB_ID, 0),
+    (objects.EMERGENCY_COB_ID, 0),
+    (objects.TPDO_COMMUNICATION, 1),
+    (objects.RPDO_COMMUNICATION, 1),
+)
 _NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
 _TOLD_BEFORE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
@@ -109,6 +103,7 @@ class _Judge:
         self._eds = eds
         self._rig = rig if rig is not None and rig.cia402 is not None else None
         self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
+        self._wanted = wanted_values(self._rig) if self._rig else fixed_values(eds.node_id)
 
     def findings(self) -> Iterator[Finding]:
         yield from self._identity()
@@ -236,7 +231,7 @@ class _Judge:
 
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
         what = f"{needed.place} {needed.name}"
-        wanted = self._wanted(needed)
+        wanted = self._wanted.get((needed.index, needed.sub))
         asked = "" if wanted is None else _shown(needed, wanted)
         told = "" if entry.default is None else f", {_shown(needed, entry.default)}"
         found = f"{entry.access}{told}"
@@ -317,41 +312,6 @@ class _Judge:
         count = self._eds.get(mapping, 0)
         held = [self._eds.get(mapping, sub) for sub in range(1, 1 + min(_default(count) or 0, 64))]
         return tuple(map(_default, held)) if _default(count) is not None else (None,)
-
-    def _wanted(self, needed: Requirement) -> int | None:
-        """Return the value that the set-up writes, or None where it has none of its own."""
-        if needed.zero:
-            return 0
-        if needed.index == objects.MODE:
-            return objects.CYCLIC_TORQUE
-        if (needed.index, needed.sub) == (objects.TPDO_COMMUNICATION, 2):
-            return objects.AT_EVERY_SYNC
-        place = needed.index, needed.sub
-        if place in _COB_IDS:
-            node_id = 0 if needed.index == objects.SYNC_COB_ID else self._eds.node_id
-            return _COB_IDS[place] + node_id
-        rig, settings = self._rig, self._settings
-        if rig is None or settings is None:
-            return None
-        at_sync = settings.torque_delivery == "at_sync"
-        value, exponent = interpolation_time(rig.rate_hz)
-        limit = torque_limit_per_mille(rig)
-        wanted = {
-            (objects.RPDO_COMMUNICATION, 2): (
-                objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL
-            ),
-            (objects.SYNC_PERIOD_US, 0): sync_period_us(rig.rate_hz),
-            (objects.INTERPOLATION_TIME, 1): value,
-            (objects.INTERPOLATION_TIME, 2): exponent,
-            (objects.ABORT_OPTION, 0): settings.abort_option,
-            (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option,
-            (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
-            (objects.MAX_TORQUE, 0): limit,
-            **{(index, 0): limit for index in objects.TORQUE_LIMITS},
-        }
-        if settings.max_speed_rad_s > 0:
-            wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
-        return wanted.get(place)
 
 
 def _default(entry: EdsEntry | None) -> int | None:

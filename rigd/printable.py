@@ -1,0 +1,25 @@
+"""Text from outside, fit for a terminal and for a line of a message."""
+
+from typing import Final
+
+UNPRINTABLE: Final = "?"
+"""What stands for a character that cannot be printed."""
+
+
+def printable(text: str, most: int | None = None) -> str:
+    """Return a text as a message can show it, whatever somebody has put into it.
+
+    Control characters, which a terminal obeys, ends of lines and everything else that has no shape
+    of its own are each replaced by :data:`UNPRINTABLE`.
+
+    Parameters
+    ----------
+    text
+        Of a file, a device, or a path.
+    most
+        Characters of it that are shown; an ellipsis stands for the rest. All if it is not given.
+    """
+    shown = text[:most]
+    if not shown.isprintable():
+        shown = "".join(c if c.isprintable() else UNPRINTABLE for c in shown)
+    return shown if len(shown) == len(text) else f"{shown}…"

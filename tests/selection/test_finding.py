@@ -1,0 +1,34 @@
+"""What is found is a fact only beside a model that explains the record."""
+
+import pytest
+
+from analysis.selection.finding import SEEN, Finding, doubted
+
+
+@pytest.mark.parametrize(
+    ("sentence", "bare"),
+    [
+        (
+            "The torque comes 0.3 ms later than the file says (0.28 to 0.32 ms; 95 %): a delay.",
+            "the torque comes 0.3 ms later than the file says: a delay.",
+        ),
+        (
+            "The modes lie elsewhere: mode 2 +1.13 % (± 0.5 %), mode 3 -0.94 % (± 0.4 %).",
+            "the modes lie elsewhere: mode 2 +1.13 %, mode 3 -0.94 %.",
+        ),
+        (
+            "EI is 2.00 % higher (+1.90 to +2.10 %; 95 %), or the gain is.",
+            "EI is 2.00 % higher, or the gain is.",
+        ),
+    ],
+)
+def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
+    found = doubted(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."))
+    assert found.sentence == f"No fact while part of the record is unexplained: {bare}"
+    assert (found.value, found.interval, found.remedy) == (1.0, None, "Look.")
+
+
+@pytest.mark.parametrize("kind", sorted(SEEN))
+def test_what_is_seen_in_the_record_stays_a_fact(kind):
+    found = Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), "1", "")
+    assert doubted(found) is found
