@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -73,11 +75,24 @@ def main() -> None:
     # Threads gain nothing on matrices as small as a fit's, and cost a tenth of the time.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    _quieten_libraries()
     with standard_streams():
         try:
             app()
         except KeyboardInterrupt:
             sys.exit(_EXIT_INTERRUPTED)
+
+
+def _quieten_libraries() -> None:
+    """Keep warnings that libraries address to programmers off the operator's terminal.
+
+    A record that suits no model drives searches where numbers overflow; what becomes of it is said
+    in the verdict. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
+    """
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ["PYTHONWARNINGS"] = "ignore"  # of worker processes
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 @app.command(DEFAULT, epilog=_EPILOG)

@@ -80,7 +80,7 @@ class PooledSize:
     omega_rad_s : float or None
         That frequency; None if the order is fixed: then the size is the coefficient.
     value, std : float
-        ``zeta omega^alpha`` (no unit) or ``gamma omega^lambda`` (1/m⁴).
+        Loss factor, or without that frequency the coefficient: see `DampingSize`.
     interval : (float, float)
         95 %.
     """

@@ -29,9 +29,6 @@ _ADEQUATE: Final = 0.9
 _SURE: Final = 0.999
 """Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
 
-_ONE: Final = ("compatible", "integer")
-"""What a session says of an order that may be 1."""
-
 _FEW_MODES: Final = "one mode alone shows how much damping there is, not of which order"
 
 
@@ -124,7 +121,7 @@ def _judged(
     if ("zeta" if order == "alpha" else "gamma") not in structure.free:
         return "absent", "no such damping shows"
     free = freest.by_name.get(order)
-    if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) in _ONE:
+    if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) == "compatible":
         # None of those fitted has it free: the sessions' own verdicts are all that there is.
         return "compatible", None
     if free is None or _wide(free.interval) > WIDEST_SHARE:

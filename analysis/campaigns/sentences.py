@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
-_SIZES: Final = {"internal": ("ζω^α", ""), "external": ("γω^λ", " m⁻⁴")}
+_SIZES: Final = {"internal": "material", "external": "surroundings"}
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
@@ -67,12 +67,11 @@ def sizes(freest: PooledEstimate) -> list[str]:
         if each.omega_rad_s is None:
             continue
         low, high = each.interval
-        symbol, unit = _SIZES[each.damping]
         said.append(
-            f"{symbol} = {each.value:.4g}{unit} (95 %: {low:.4g} to {high:.4g}) at "
+            f"{each.value:.4g} by the {_SIZES[each.damping]} (95 %: {low:.4g} to {high:.4g}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
         )
-    return [f"Damping at the pivot frequency: {'; '.join(said)}."] if said else []
+    return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
 
 
 def selected(

@@ -110,7 +110,16 @@ def import_command(
         bool,
         typer.Option("--reverse-torque", help="The torque is the reaction: change its sign."),
     ] = False,
-    note: Annotated[str, typer.Option(metavar="TEXT", help="Goes into the session file.")] = "",
+    operator: Annotated[
+        str, typer.Option(metavar="TEXT", help="Operator name, stored in the session file.")
+    ] = "",
+    specimen: Annotated[
+        str,
+        typer.Option(metavar="TEXT", help="Label of the specimen: campaigns tell by it."),
+    ] = "",
+    note: Annotated[
+        str, typer.Option(metavar="TEXT", help="Note, stored in the session file.")
+    ] = "",
 ) -> None:
     """Make a session file of a record that another program measured.
 
@@ -172,6 +181,8 @@ def import_command(
             torque_delay_s,
             reverse_torque,
             note,
+            specimen,
+            operator,
         )
         done = import_record(source, session, plan)
         for warning in done.warnings:

@@ -35,8 +35,8 @@ class ImportPlan:
         Age of either value at its time stamp.
     reverse_torque : bool
         Whether the coupling torque counts against the angle's sense, as a reaction does.
-    note : str
-        From the operator.
+    note, label, operator : str
+        From the operator; the label is what they call the specimen.
     """
 
     channels: Mapping[str, ChannelChoice]
@@ -48,6 +48,8 @@ class ImportPlan:
     torque_delay_s: float = 0.0
     reverse_torque: bool = False
     note: str = ""
+    label: str = ""
+    operator: str = ""
 
     def __post_init__(self) -> None:
         if any(name not in self.channels for name in REQUIRED):

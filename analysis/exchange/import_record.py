@@ -195,7 +195,15 @@ def _metadata(
     return {
         "id": target.stem,
         **{name: repr(float(value)) for name, value in numbers.items()},
-        **({"note": plan.note} if plan.note else {}),
+        **{
+            key: text
+            for key, text in (
+                ("operator", plan.operator),
+                ("specimen", plan.label),
+                ("note", plan.note),
+            )
+            if text
+        },
         "software": f"rigd {rigd.__version__}",
         "imported_from": source.name.encode("utf-8", "replace").decode("utf-8"),
         "import_format": file_format,

@@ -145,8 +145,8 @@ def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     assert differing.startswith("The sessions are not of one specimen in one state: frequency of")
     assert "in 2 files (0.mcap, 1.mcap)" in where
     assert "in 2 files (stiff20.mcap, stiff21.mcap)" in where
-    assert structure.startswith("The numbers are those of type III")
-    assert "takes for granted that alpha and lambda are 1" in structure
+    assert structure.startswith("The numbers are those of type VI")
+    assert "type III has the lowest BIC" in structure
     assert not any("they repeat" in each for each in mixture.verdict.sentences)
     assert tables_text(mixture).startswith("The files are not of one specimen")
 
@@ -159,10 +159,12 @@ def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
     frequency = mixture.homogeneity.of("frequency_hz_1")
     values = {name: value for name, value, _ in frequency.values}
     soft, stiff = (np.mean([values[name] for name in part]) for part in frequency.groups)
-    assert stiff - soft == pytest.approx(apart_hz, rel=0.05)
+    # The difference of two means of two: as uncertain as one session.
+    own_hz = math.sqrt(np.mean([std**2 for _, _, std in frequency.values]))
+    assert stiff - soft == pytest.approx(apart_hz, abs=3 * own_hz)
     # Of two equal groups d apart the variance of four is d²/3, nearly all of it between sessions.
     assert frequency.between_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
-    assert frequency.own_stds > 30
+    assert frequency.own_stds > 10
 
 
 def test_what_agrees_is_not_marked_as_a_mixture(mixture):
@@ -186,7 +188,7 @@ def test_page_and_json_tell_it_too(mixture):
     assert [row["files"] for row in content["specimens"]] == [4, 1]
     assert {row["mixture"] for row in content["table3"]} == {True}
     page = campaign_page(mixture, {}, datetime.now(UTC), with_paper=False)
-    assert page.index("The files are not of one specimen") < page.index("type III: damping")
+    assert page.index("The files are not of one specimen") < page.index("type VI: damping")
     for name in ("specimens", "homogeneity"):
         assert f'id="{name}"' in page
         assert content[name]

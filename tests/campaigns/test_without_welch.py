@@ -30,7 +30,7 @@ def found(make_file, tmp_path_factory):
 def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
     assert found.failures == ()
     assert (found.nominal, found.statistics) == ((), ())
-    assert found.headline.name == "III"
+    assert found.headline.name == "VI"
     _, damping = truth
     zeta = found.headline.by_name["zeta"]
     assert zeta.interval[0] < damping.zeta < zeta.interval[1]

@@ -29,14 +29,27 @@ MAPPING = ("--angle", "q:deg", "--torque", "T:N.mm", "--time", "t:s")
 
 
 def test_an_import_says_what_it_made(analyze, arguments, tmp_path):
-    result = analyze(*arguments, *MAPPING, "--sweep", "0.5,2.5", "--note", "first")
+    result = analyze(
+        *arguments,
+        *MAPPING,
+        "--sweep",
+        "0.5,2.5",
+        "--note",
+        "first",
+        "--specimen",
+        "A",
+        "--operator",
+        "Eve",
+    )
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
     assert "3000 samples at 1000 Hz" in result.stdout
     assert "whole record" not in result.stdout
     session = read_session(tmp_path / "a.mcap")
     assert session.segments == {"sweep": (500, 2500)}
-    assert session.metadata["note"] == "first"
+    assert [session.metadata[key] for key in ("note", "specimen", "operator")] == [
+        "first", "A", "Eve",
+    ]  # fmt: skip
     again = analyze(*arguments, *MAPPING)
     assert again.exit_code == 2
     assert "exists" in again.stderr

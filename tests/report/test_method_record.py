@@ -14,8 +14,11 @@ def done(write_session, make_signals, tmp_path_factory):
     path = write_session(folder / "a.mcap", make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3))
     result = CliRunner().invoke(
         app,
-        [str(path), "--method", "record", "--band", "1,20", "--json", str(folder / "a.json")],
-    )
+        [
+            str(path), "--method", "record", "--band", "1,20", "--weights", "omega",
+            "--json", str(folder / "a.json"),
+        ],
+    )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     return result, folder, json.loads((folder / "a.json").read_text())
 
@@ -26,7 +29,7 @@ def test_only_the_whole_record_is_fitted_and_by_every_type(done):
     assert {fit["type"] for fit in content["fits"]} == {"I", "II", "III", "IV", "V", "VI", "VII"}
     assert {mode["estimator"] for mode in content["modes"]} == {"record"}
     (record,) = content["records"]
-    assert record["verdict"][0] in result.stdout.replace("\n  ", " ")
+    assert record["verdict"][0] in " ".join(result.stdout.split())
     assert "weights" not in result.stdout
 
 
@@ -45,4 +48,11 @@ def test_the_report_has_no_figure_of_the_paper(done):
 
 
 def test_options_without_effect_are_told(done):
-    assert done[0].stderr.startswith("Warning: --segment, --weights")
+    (warning,) = done[0].stderr.splitlines()
+    assert warning.startswith("Warning: --weights concerns the Welch fits alone, which --method")
+
+
+def test_the_band_is_the_whole_record_s(done):
+    (record,) = done[2]["records"]
+    assert record["band_hz"] == [1.0, 20.0]
+    assert {mode["mode"] for mode in done[2]["modes"]} == {1, 2}

@@ -1,6 +1,9 @@
 """What suits a record is done with it: its band, and Welch's fits only where they say something."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -142,3 +145,30 @@ def test_a_step_gets_the_whole_record_s_analysis_and_a_line(
     assert content["errors"] == []
     assert any("left out" in warning for warning in content["files"][0]["warnings"])
     assert "Welch fits left out" in (tmp_path / "r" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_warnings_of_libraries_stay_off_the_terminal(tmp_path, asked):
+    """Those of numpy and matplotlib, here and in the processes that it starts; unless asked for."""
+    inner = "import numpy; numpy.float64(1e308) * 10"
+    program = f"""
+import logging, subprocess, sys
+from analysis import cli
+def work():
+    import numpy
+    numpy.float64(1e308) * 10
+    logging.getLogger("matplotlib.font_manager").warning("no such font")
+    subprocess.run([sys.executable, "-c", {inner!r}], check=True)
+cli.app = work
+cli.main()
+"""
+    switches = ["-W", "always"] if asked else []
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
+    done = subprocess.run(
+        [sys.executable, *switches, "-c", program], cwd=tmp_path, env=environment,
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert "no such font" not in done.stderr
+    assert ("overflow" in done.stderr) == asked
+    if not asked:
+        assert done.stderr == ""

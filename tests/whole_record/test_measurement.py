@@ -19,6 +19,7 @@ RECORD = SimpleNamespace(
     torque_delay_s=5e-4,
     angle_delay_s=2e-4,
     tool_inertia_kg_m2=1e-5,
+    torque_filter_s=(0.0, 0.0),
     reference_rad=np.linspace(0.1, 0.2, 300),
     metadata={"excitation": "chirp"},
 )

@@ -1,0 +1,47 @@
+"""A blade of one mode, as vibration laboratories record it: its damping does not go with the band.
+
+Of such a record the reaction is what a beam has at its first mode, plus a share of its quasi-static
+response that no beam has: other modes and the fixture.
+"""
+
+import numpy as np
+import pytest
+
+from analysis.structures import STRUCTURES
+from analysis.whole_record import Measurement, fit_record
+from rigd.beam import Beam, undamped_frequencies_rad_s
+
+RATE_HZ = 500.0
+FREQUENCY_HZ, DAMPING_RATIO = 18.556, 0.00523
+DELAY_S = 0.69e-3
+
+
+def blade(share):
+    """Two minutes of a sweep to 50 Hz, with 1 % of noise."""
+    n, padded = 60_000, 1 << 18
+    t = np.arange(n) / RATE_HZ
+    angle = np.sin(2 * np.pi * (0.5 * t + (50 - 0.5) * t**2 / (2 * t[-1])))
+    sigma = 5 * RATE_HZ / padded
+    s = sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / RATE_HZ)
+    omega = 2 * np.pi * FREQUENCY_HZ
+    resonance = 1 / (s**2 + 2 * DAMPING_RATIO * omega * s + omega**2) + share / omega**2
+    # The first mode of a clamped beam has 97 % of its inertia about the root.
+    response = 0.323 * omega**2 * s**2 * resonance * np.exp(-s * DELAY_S)
+    decay = np.exp(-sigma * t)
+    torque = np.fft.irfft(np.fft.rfft(angle * decay, padded) * response, padded)[:n] / decay
+    torque += 0.01 * np.std(torque) * np.random.default_rng(1).standard_normal(n)
+    (unit_rad_s,) = undamped_frequencies_rad_s(Beam(1.0, 1.0, 1.0), 1)
+    beam = Beam(1.0, 1.0, (1.01 * omega / unit_rad_s) ** 2)
+    known = np.ones(n, dtype=bool)
+    return Measurement("blade", angle, torque, RATE_HZ, beam, known, known)
+
+
+@pytest.mark.parametrize(("share", "within"), [(0.05, 3e-6), (-0.3, 3e-5)])
+def test_frequency_and_damping_ratio_do_not_go_with_the_band(share, within):
+    """The second share asks for a negative inertia of the tool, which no rig has."""
+    record = blade(share)
+    for band_hz in ((0.0, 50.0), (2.0, 30.0)):
+        (fit,) = fit_record(record, [STRUCTURES["VI"]], band_hz=band_hz).fits
+        mode = fit.modes[0]
+        assert mode.frequency_hz == pytest.approx(FREQUENCY_HZ, abs=1e-3)
+        assert mode.damping_ratio == pytest.approx(DAMPING_RATIO, abs=within)
