@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analysis.selection import sentences
+from analysis.selection.along_time import along_time, changing
 from analysis.selection.candidates import Field
 from analysis.selection.experiments import experiments
 from analysis.selection.findings import findings, unexplained
@@ -81,6 +82,7 @@ def select(
     field, forces = nonlinear_forces(linear, visible)
     if not field.best.uniform:
         field = field.with_orders_free()
+    field, changes = along_time(field)
     field, of_alpha, of_lambda = profiled(field)
     white, related = _tests(field)
     comparison, fit = field.comparison, field.best.fit
@@ -97,7 +99,7 @@ def select(
         for profile in (of_alpha, of_lambda)
     )
     close = rivals(field, EVEN)
-    found = findings(field, forces, multiples, visible)
+    found = (*findings(field, forces, multiples, visible), *changing(changes))
     if not explained:
         found = (*found, unexplained(white, related, fit.modes))
     unsure = {
