@@ -56,6 +56,11 @@ class WrenchSensor:
     """Inertia about the motor axis between sensor and beam (the clamp)."""
     delay_s: NonNegative = 0.0
     """Age of the wrench at the tick that asks for it."""
+    filter_hz: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """Corner of the sensor's own low-pass filter, which the analysis is told of; 0: none is known.
+    Its delay is not part of `delay_s`."""
+    filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
+    """Of that filter: 1, or 2 (Butterworth)."""
 
 
 @dataclass(frozen=True, slots=True)
