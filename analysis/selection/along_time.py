@@ -1,9 +1,10 @@
 """Changes along the record, and the motor's play.
 
 Columns of known shape and unknown size, as `analysis.selection.refit` takes them: what the torque
-would gain if damping, stiffness, gain or delay rose in proportion to the time, and what a hub does
-that follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
-damping that drifts competes with an order of the damping, and a gain that drifts with a filter.
+would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
+follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
+damping that drifts competes with an order of the damping, and a gain that drifts with a filter. A
+delay that rises so is what clocks of different rates make: see `analysis.selection.extras`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from analysis.selection.chance import SURE
 from analysis.selection.finding import Finding
 from analysis.selection.orders import STRONG
 from analysis.selection.refit import Refit
+from analysis.selection.scale import wrong_scale
 from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
@@ -31,12 +33,12 @@ if TYPE_CHECKING:
     from analysis.whole_record import Plant
     from analysis.whole_record.comparison import Comparison
 
-What = Literal["damping", "stiffness", "gain", "delay", "play"]
+What = Literal["damping", "stiffness", "gain", "play"]
 
 _LEADS: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
-_GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness", "delay_s")
+_GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
 _GAIN: Final = SURE**2 + 2 * math.log(20)
-"""Deviance that a column must save: five of them are tried on four candidates."""
+"""Deviance that a column must save: four of them are tried on four candidates."""
 
 _UNIT_PLAY_RAD: Final = 1e-4
 _ROUNDS: Final = 3
@@ -52,7 +54,7 @@ class Change:
     ----------
     what : str
     size, std : float
-        Change from the first sample to the last, relative, or in s for the delay; the play in rad.
+        Change from the first sample to the last, relative; the play in rad.
     behind : float
         BIC with it above the lowest without it.
     """
@@ -82,6 +84,8 @@ def along_time(field: Field) -> tuple[Field, tuple[Change, ...]]:
     changes : tuple of Change
         What explains the record best of all, or as well as the best candidate.
     """
+    if any(wrong_scale(field.comparison)):
+        return field, ()
     lag = _lag_of_play(field.comparison)
     tried: dict[What, tuple[float, Refit]] = {}
     for lead in _leads(field):
@@ -124,8 +128,6 @@ def _promising(
     projected = refit.objective.project(at, field.noise.weight)
     known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
     for what, column in _columns(field.comparison, lead.fit.plant, lag).items():
-        if what == "delay" and "clock_rate_difference" in lead.extras:
-            continue
         free = _without(column * field.noise.weight, known)
         saved = float(np.vdot(free, projected.residual).real) ** 2
         saved /= max(float(np.vdot(free, free).real), np.finfo(float).tiny)
@@ -161,13 +163,12 @@ def _columns(
     comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
 ) -> dict[What, NDArray[np.complex128]]:
     """Spectra of the torque by a change of 1 from the first sample to the last, each of (K,)."""
-    _, (zeta, gamma, gain, ratio, delay) = comparison.prediction.torque(plant, _GRADIENT)
+    _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
     changes: dict[What, NDArray[np.float64]] = {
         "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
         "stiffness": gain - ratio,  # EI rises, rho stays
         "gain": gain,
-        "delay": delay,
     }
     spectra = {what: comparison.spectrum(ramp * values) for what, values in changes.items()}
     spectra["play"] = comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
@@ -194,18 +195,15 @@ def _column(
 
 
 def _changed(plant: Plant, what: What, size: float) -> Plant:
-    """Plant whose damping or stiffness is larger by a share, or whose delay is longer."""
+    """Plant whose damping or stiffness is larger by a share."""
     if what == "damping":
         damping, factor = plant.damping, max(1 + size, 0.0)
         return replace(
             plant,
             damping=replace(damping, zeta=factor * damping.zeta, gamma=factor * damping.gamma),
         )
-    if what == "stiffness":
-        beam = plant.beam
-        stiffness = max(1 + size, 0.1) * beam.bending_stiffness_n_m2
-        return replace(plant, beam=replace(beam, bending_stiffness_n_m2=stiffness))
-    return replace(plant, delay_s=plant.delay_s + size)
+    stiffness = max(1 + size, 0.1) * plant.beam.bending_stiffness_n_m2
+    return replace(plant, beam=replace(plant.beam, bending_stiffness_n_m2=stiffness))
 
 
 def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
@@ -257,21 +255,17 @@ _NAMES: Final[dict[What, str]] = {
     "damping": "Damping that changes along the record",
     "stiffness": "Stiffness that changes along the record",
     "gain": "A torque gain that changes along the record",
-    "delay": "A delay between the channels that changes along the record",
     "play": "Play between encoder and beam",
 }
 _KINDS: Final[dict[What, Kind]] = {
     "damping": "drifting damping",
     "stiffness": "drifting stiffness",
     "gain": "drifting gain",
-    "delay": "drifting delay",
     "play": "play",
 }
 
 
 def _size(change: Change) -> str:
-    if change.what == "delay":
-        return f"{1e3 * change.size:+.3g} ms from beginning to end"
     if change.what == "play":
         return f"{1e3 * change.size:.2g} mrad"
     return f"{100 * change.size:+.2g} % from beginning to end"
@@ -280,7 +274,7 @@ def _size(change: Change) -> str:
 def _finding(change: Change) -> Finding:
     half = _NORMAL_95 * change.std
     of_play = change.what == "play"
-    scale = 1e3 if change.what in ("play", "delay") else 100.0
+    scale = 1e3 if of_play else 100.0
     return Finding(
         kind=_KINDS[change.what],
         sentence=(
@@ -294,7 +288,7 @@ def _finding(change: Change) -> Finding:
         ),
         value=change.size,
         interval=(change.size - half, change.size + half),
-        unit="rad" if of_play else "s" if change.what == "delay" else "1",
+        unit="rad" if of_play else "1",
         remedy=(
             "Take the play out of gear and clamp."
             if of_play

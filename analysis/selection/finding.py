@@ -26,7 +26,6 @@ Kind = Literal[
     "drifting damping",
     "drifting stiffness",
     "drifting gain",
-    "drifting delay",
     "clipping",
     "play",
     "stop",

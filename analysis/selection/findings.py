@@ -8,6 +8,7 @@ from analysis.selection.channel_checks import clipping, stops
 from analysis.selection.finding import Finding
 from analysis.selection.hum import repeats_after_s
 from analysis.selection.scale import wrong_scale
+from analysis.selection.sensor_drift import drift_of_zero
 from analysis.selection.stated_otherwise import at_edges, of_settings
 
 if TYPE_CHECKING:
@@ -77,12 +78,12 @@ def mains(frequency_hz: float) -> str:
 def _hum(field: Field) -> Iterator[Finding]:
     comparison = field.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
-    slow = [line for line in field.noise.lines if line.frequency_hz * duration_s < _FEWEST_PERIODS]
-    if slow:
-        yield _drift(max(line.amplitude_nm for line in slow))
+    drift_nm = drift_of_zero(field)
+    if drift_nm > 0:
+        yield _drift(drift_nm)
     period_s = repeats_after_s(comparison)
     for line in field.noise.lines:
-        if line in slow:
+        if line.frequency_hz * duration_s < _FEWEST_PERIODS:
             continue
         near = mains(line.frequency_hz)
         source = f", {near}" if near else ""
@@ -116,7 +117,7 @@ def _drift(size_nm: float) -> Finding:
         kind="sensor drift",
         sentence=(
             f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m in the "
-            "course of the record; that is slower than anything the beam does, and was left out."
+            "course of the record. That is slower than anything the beam does."
         ),
         value=size_nm,
         interval=None,

@@ -14,6 +14,7 @@ from analysis.selection.harmonics import harmonics, in_time
 from analysis.selection.nonlinear_search import nonlinear_forces
 from analysis.selection.orders import EVEN, order_verdict, rivals
 from analysis.selection.profiles import profiled
+from analysis.selection.scale import wrong_scale
 from analysis.selection.verdict import Row, Verdict
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import InputRelation, Whiteness, input_relation, whiteness
@@ -79,7 +80,8 @@ def select(
     """
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = nonlinear_forces(linear, visible)
+    misread = any(wrong_scale(linear.comparison))
+    field, forces = (linear, ()) if misread else nonlinear_forces(linear, visible)
     if not field.best.uniform:
         field = field.with_orders_free()
     field, changes = along_time(field)
