@@ -17,6 +17,7 @@ import numpy as np
 
 from analysis.selection.chance import SURE
 from analysis.selection.finding import Finding
+from analysis.selection.modulated_damping import late_damping
 from analysis.selection.orders import STRONG
 from analysis.selection.refit import Refit
 from analysis.selection.scale import wrong_scale
@@ -41,7 +42,8 @@ _GAIN: Final = SURE**2 + 2 * math.log(20)
 """Deviance that a column must save: four of them are tried on four candidates."""
 
 _UNIT_PLAY_RAD: Final = 1e-4
-_ROUNDS: Final = 3
+_ROUNDS: Final = 4
+_SETTLED: Final = 0.01
 _MANY: Final = 40
 _NORMAL_95: Final = 1.959963984540054
 
@@ -152,8 +154,9 @@ def _fitted(
         refit = Refit.descend(
             field.comparison, unknowns, refit.x, field.noise, columns, max_evaluations=_MANY
         )
-        size = float(refit.amplitudes()[0][-1])
-        if abs(lead.values * math.log(before / refit.cost)) < 1:
+        moved, size = size, float(refit.amplitudes()[0][-1])
+        settled = abs(size - moved) < _SETTLED * abs(size)
+        if settled and abs(lead.values * math.log(before / refit.cost)) < 1:
             break
     deviance = lead.values * math.log(refit.cost / lead.values)
     return refit, deviance + (lead.parameters + 1) * math.log(lead.values)
@@ -171,6 +174,7 @@ def _columns(
         "gain": gain,
     }
     spectra = {what: comparison.spectrum(ramp * values) for what, values in changes.items()}
+    spectra["damping"] += comparison.spectrum(late_damping(comparison, plant, ramp))
     spectra["play"] = comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
     return spectra
 
@@ -191,7 +195,10 @@ def _column(
         for share in (-0.5, 0.0, 0.5)
     )
     change = place * (last - first) / 2 + place**2 * ((first + last) / 2 - middle)
-    return comparison.spectrum(change / size)
+    change /= size
+    if what == "damping":
+        change += late_damping(comparison, plant, place / 2)
+    return comparison.spectrum(change)
 
 
 def _changed(plant: Plant, what: What, size: float) -> Plant:
