@@ -103,7 +103,7 @@ def test_a_sign_and_a_unit_are_seen_at_once(factor, kinds):
 
 
 def test_a_wrong_sign_comes_first():
-    verdict = select(record(-1.0)).verdict
+    verdict = select(record(-1.0), band_hz=(0.0, 20.0)).verdict
     assert verdict.findings[0].kind == "sign"
     assert not verdict.adequate
 
