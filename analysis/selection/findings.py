@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _NORMAL_95: Final = 1.959963984540054
 _MAINS_WANDER: Final = 0.005
 _MODES_TO_JUDGE: Final = 2
+_SLOW_HZ: Final = 0.5
 _FEWEST_PERIODS: Final = 5.0
 """In the record: what is slower is no hum but a sensor that drifts."""
 
@@ -198,6 +199,12 @@ def unexplained(
             "magnifies, or something of that mode that the model lacks."
         )
         remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
+    elif white.loud and high < _SLOW_HZ:
+        what = (
+            f"What remains below {high:.2f} Hz is {white.loudest_ratio:.1f} times as loud as the "
+            "noise and does not follow the motor: drift of the torque sensor's zero."
+        )
+        remedy = ""
     else:
         near = mains((low + high) / 2)
         what = (
