@@ -12,6 +12,7 @@ from analysis.selection.extras import with_extras
 from analysis.selection.hum import without_leakage
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted, resonances_kept, vector
+from analysis.selection.scale import wrong_scale
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import whiteness
 from analysis.structures import STRUCTURES
@@ -107,6 +108,8 @@ class Field:
             candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
             columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
         )._without_leakage()
+        if any(wrong_scale(comparison)):
+            return field.cross_checked()  # no beam explains such a record
         likeliest = field.likeliest
         if len(visible_modes(comparison, field.noise, likeliest)) > 1:
             field = (

@@ -27,7 +27,6 @@ Kind = Literal[
     "drifting damping",
     "drifting stiffness",
     "drifting gain",
-    "drifting delay",
     "clipping",
     "play",
     "stop",

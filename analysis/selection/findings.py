@@ -8,6 +8,7 @@ from analysis.selection.channel_checks import clipping, stops
 from analysis.selection.finding import Finding
 from analysis.selection.hum import repeats_after_s
 from analysis.selection.scale import wrong_scale
+from analysis.selection.sensor_drift import drift_of_zero
 from analysis.selection.stated_otherwise import at_edges, of_settings
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 _NORMAL_95: Final = 1.959963984540054
 _MAINS_WANDER: Final = 0.005
 _MODES_TO_JUDGE: Final = 2
+_SLOW_HZ: Final = 0.5
 _FEWEST_PERIODS: Final = 5.0
 """In the record: what is slower is no hum but a sensor that drifts."""
 
@@ -77,12 +79,12 @@ def mains(frequency_hz: float) -> str:
 def _hum(field: Field) -> Iterator[Finding]:
     comparison = field.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
-    slow = [line for line in field.noise.lines if line.frequency_hz * duration_s < _FEWEST_PERIODS]
-    if slow:
-        yield _drift(max(line.amplitude_nm for line in slow))
+    drift_nm = drift_of_zero(field)
+    if drift_nm > 0:
+        yield _drift(drift_nm)
     period_s = repeats_after_s(comparison)
     for line in field.noise.lines:
-        if line in slow:
+        if line.frequency_hz * duration_s < _FEWEST_PERIODS:
             continue
         near = mains(line.frequency_hz)
         source = f", {near}" if near else ""
@@ -116,7 +118,7 @@ def _drift(size_nm: float) -> Finding:
         kind="sensor drift",
         sentence=(
             f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m in the "
-            "course of the record; that is slower than anything the beam does, and was left out."
+            "course of the record. That is slower than anything the beam does."
         ),
         value=size_nm,
         interval=None,
@@ -197,6 +199,12 @@ def unexplained(
             "magnifies, or something of that mode that the model lacks."
         )
         remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
+    elif white.loud and high < _SLOW_HZ:
+        what = (
+            f"What remains below {high:.2f} Hz is {white.loudest_ratio:.1f} times as loud as the "
+            "noise and does not follow the motor: drift of the torque sensor's zero."
+        )
+        remedy = ""
     else:
         near = mains((low + high) / 2)
         what = (

@@ -165,6 +165,32 @@ class Headline:
         """Numbers of the modes that the record shows."""
         return tuple(mode.number for mode in self.modes if mode.shown)
 
+    def doubted(self, flag: str) -> Headline:
+        """Flag every number that has no flag yet.
+
+        Parameters
+        ----------
+        flag : str
+            The reason.
+        """
+
+        def doubt(quantity: Quantity) -> Quantity:
+            return replace(quantity, flag=quantity.flag or flag)
+
+        return replace(
+            self,
+            parameters={name: doubt(each) for name, each in self.parameters.items()},
+            sizes=tuple(_flagged(each, flag) for each in self.sizes),
+            modes=tuple(
+                replace(
+                    each,
+                    frequency_hz=doubt(each.frequency_hz),
+                    damping_ratio=doubt(each.damping_ratio),
+                )
+                for each in self.modes
+            ),
+        )
+
     def with_status(self, status: StructureStatus) -> tuple[str, ...]:
         """Names of the structures with a status.
 

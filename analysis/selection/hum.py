@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _NEAR_HZ: Final = 5.0
 _SAME_HZ: Final = 0.1
 _APART: Final = 0.5
-_ALIKE: Final = 0.95
+_ALIKE: Final = 0.9
 """Correlation of the angle with itself a period later, and below which it is another motion."""
 
 _LEAKS: Final = 0.3

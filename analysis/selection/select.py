@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from analysis.selection import sentences
+from analysis.selection.along_time import along_time, changing
 from analysis.selection.candidates import Field
 from analysis.selection.experiments import experiments
 from analysis.selection.finding import doubted
@@ -16,6 +17,7 @@ from analysis.selection.nonlinear_search import nonlinear_forces
 from analysis.selection.orders import EVEN, order_verdict, rivals, untold_reason
 from analysis.selection.profile import Profile
 from analysis.selection.profiles import profiled
+from analysis.selection.scale import wrong_scale
 from analysis.selection.verdict import Row, Verdict
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import InputRelation, Whiteness, input_relation, whiteness
@@ -89,8 +91,9 @@ def select(
     """
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = nonlinear_forces(linear, visible)
-    field = field.with_orders_free()
+    misread = any(wrong_scale(linear.comparison))
+    field, forces = (linear, ()) if misread else nonlinear_forces(linear, visible)
+    field, changes = along_time(field.with_orders_free())
     if untold_reason(field, visible) is None:
         field, of_alpha, of_lambda = profiled(field)
     else:
@@ -114,10 +117,13 @@ def select(
         order_verdict(field, of_lambda, visible, adequate=adequate),
     )
     close = rivals(field, EVEN)
-    found = findings(told, forces, multiples, visible)
+    found = (*findings(told, forces, multiples, visible), *changing(changes))
     if not explained:
         found = (*map(doubted, found), unexplained(white, related, fit.modes))
     numbers = headline(field, orders, visible, adequate=adequate)
+    for change in changes:
+        if not (change.certain and len(changes) == 1):
+            numbers = numbers.doubted(f"{change.name} would explain the record as well")
     best = field.best
     return Selection(
         candidates=field.candidates,

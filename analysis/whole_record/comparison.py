@@ -222,12 +222,14 @@ class Comparison:
         return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
 
     def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Spectra of what has amplitudes that nobody knows: free decays, then hum; shape (m, K)."""
-        decays = self.decays.columns(poles)
-        if not self.hum:
-            return decays
+        """Spectra of what has amplitudes that nobody knows, shape (m, K).
+
+        Free decays, hum, and last a zero of the torque sensor that drifts in proportion to time:
+        the jump from the record's end to its beginning would leak into all bins.
+        """
         hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
-        return np.concatenate([decays, hum])
+        drift = self.spectrum(np.linspace(-0.5, 0.5, self.samples))
+        return np.concatenate([self.decays.columns(poles), hum, drift[None]])
 
     def filled(self, plant: Plant) -> Comparison:
         """Put what `plant` predicts where the torque is unknown, so that it does not count there.

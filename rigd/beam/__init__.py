@@ -1,6 +1,6 @@
 """Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
 
-from rigd.beam.coupled import CoupledModel, couple, propagator
+from rigd.beam.coupled import CoupledModel, couple, propagator, with_filter
 from rigd.beam.deflection import DeflectionFilter
 from rigd.beam.modes import (
     Mode,
@@ -41,4 +41,5 @@ __all__ = [
     "transfer",
     "transfer_and_gradient",
     "undamped_frequencies_rad_s",
+    "with_filter",
 ]

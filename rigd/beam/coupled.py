@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,6 +41,38 @@ class CoupledModel:
     sensor_torque: Real
     """(n,) row: what a sensor between motor and clamp measures, ``Γ + J_tool θ''``, in N·m."""
     sensor_torque_per_torque: float
+    sensed_torque: Real | None = None
+    """(n,) row: what the sensor's filter lets through, in N·m; None: it has none."""
+
+
+def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledModel:
+    """Let the sensor's torque through a low-pass filter, of order 1 or 2 (Butterworth).
+
+    The filter's states come last.
+    """
+    n, omega = model.b.size, 2 * math.pi * corner_hz
+    a = np.zeros((n + order, n + order))
+    b = np.zeros(n + order)
+    a[:n, :n], b[:n] = model.a, model.b
+    # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
+    a[-1, :n] = omega * model.sensor_torque
+    b[-1] = omega * model.sensor_torque_per_torque
+    a[-1, n] = -omega
+    if order == 2:
+        a[n, n + 1] = omega
+        a[n + 1, n + 1] = -math.sqrt(2) * omega
+    none = np.zeros(order)
+    return replace(
+        model,
+        a=a,
+        b=b,
+        angle=np.append(model.angle, none),
+        velocity=np.append(model.velocity, none),
+        acceleration=np.append(model.acceleration, none),
+        beam_torque=np.append(model.beam_torque, none),
+        sensor_torque=np.append(model.sensor_torque, none),
+        sensed_torque=np.eye(1, n + order, n)[0],
+    )
 
 
 def couple(

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam.coupled import couple
-from rigd.beam.modes import clamped_free_eigenvalues, poles_for_eigenvalues
+from rigd.beam.modes import clamped_free_eigenvalues
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.state_space import Realisation, basis
+from rigd.beam.tip_mass import LoadedBeam
 from rigd.beam.transfer_function import TransferGrid
 
 Real = NDArray[np.float64]
@@ -50,13 +51,22 @@ class RealisationError(ValueError):
     """The damping cannot be realised to the error asked for, or not stably."""
 
 
-def realise(beam: Beam, damping: Damping, *, max_relative_error: float = 1e-3) -> Realisation:
+def realise(
+    beam: Beam,
+    damping: Damping,
+    *,
+    max_relative_error: float = 1e-3,
+    tip_mass_kg: float = 0.0,
+    root_compliance_rad_per_nm: float = 0.0,
+) -> Realisation:
     """Real-time realisation of the beam.
 
     Parameters
     ----------
     beam, damping
         What to realise.
+    tip_mass_kg, root_compliance_rad_per_nm
+        Point mass at its tip, and by how much its clamp turns for a torque.
     max_relative_error
         Largest acceptable relative error over `ERROR_BAND_HZ`.
 
@@ -68,18 +78,19 @@ def realise(beam: Beam, damping: Damping, *, max_relative_error: float = 1e-3) -
         coefficients, orders outside 0…2; or if the beam has more than 300 modes to realise.
     """
     _check_passive(damping)
-    poles = _poles(beam, damping)
-    zeros = _zeros(beam, damping)
+    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
+    poles = _poles(loaded)
+    zeros = _zeros(loaded)
     landmarks = np.concatenate([poles[poles.imag > 0], zeros])
 
     omega, weight = _fit_grid(landmarks)
     apart = _apart(omega, poles, zeros)
     s = 1j * omega[apart]
-    exact = TransferGrid(s).evaluate(beam, damping)
+    exact = _exact(loaded, s)
     scale = weight[apart] / exact
     coefficients = _fit(basis(s, poles) * scale[:, None], weight[apart].astype(np.complex128))
 
-    error = _relative_error(beam, damping, poles, zeros, coefficients)
+    error = _relative_error(loaded, poles, zeros, coefficients)
     if not error <= max_relative_error:
         raise RealisationError(
             f"{damping} on {beam} is realised with a relative error of {error:.1e} between "
@@ -104,8 +115,16 @@ def _check_passive(damping: Damping) -> None:
         )
 
 
-def _poles(beam: Beam, damping: Damping) -> Complex:
+def _exact(loaded: LoadedBeam, s: Complex) -> Complex:
+    """Transfer function of the beam as it is, of the shape of s."""
+    if loaded.tip_mass_kg == 0 and loaded.root_compliance_rad_per_nm == 0:
+        return TransferGrid(s).evaluate(loaded.beam, loaded.damping)
+    return loaded.transfer(np.asarray(s, dtype=np.complex128))
+
+
+def _poles(loaded: LoadedBeam) -> Complex:
     """Modes up to 1.2 kHz, upper half plane first, then every real pole."""
+    beam = loaded.beam
     reach = (2 * np.pi * _MODES_UP_TO_HZ) ** 2 * beam.density_over_stiffness
     # Damping may shift the highest modes down, so a few more are looked at than the undamped count.
     count = int(1.25 * reach**0.25 * beam.length_m / np.pi) + 3
@@ -115,7 +134,7 @@ def _poles(beam: Beam, damping: Damping) -> Complex:
             f"{_MOST_MODES} that are realised; check the units of its length, density and "
             "stiffness."
         )
-    pairs = poles_for_eigenvalues(clamped_free_eigenvalues(count), beam, damping)
+    pairs = loaded.poles(clamped_free_eigenvalues(count))
     pairs = pairs[~np.isnan(pairs[:, 0])]
     oscillating = pairs[:, 0].imag > 0
     upper = pairs[oscillating, 0]
@@ -128,12 +147,13 @@ def _poles(beam: Beam, damping: Damping) -> Complex:
     return np.concatenate([upper, over_damped, _CUT_POLES])
 
 
-def _zeros(beam: Beam, damping: Damping) -> Complex:
+def _zeros(loaded: LoadedBeam) -> Complex:
     """Zeros of G up to the end of the fit's band: the modes of the pinned–free beam."""
+    beam = loaded.beam
     reach = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
     count = int(reach**0.25 * beam.length_m / np.pi) + 1
     z = np.pi * np.arange(1.25, count + 1)  # of tan z = tanh z, within 4e-4
-    zeros = poles_for_eigenvalues(z, beam, damping)[:, 0]
+    zeros = loaded.zeros(z)[:, 0]
     upper: Complex = zeros[zeros.imag > 0]
     return upper
 
@@ -179,7 +199,7 @@ def _fit(columns: Complex, target: Complex) -> Real:
 
 
 def _relative_error(
-    beam: Beam, damping: Damping, poles: Complex, zeros: Complex, coefficients: Real
+    loaded: LoadedBeam, poles: Complex, zeros: Complex, coefficients: Real
 ) -> float:
     """Largest relative error over a grid several times as dense as the fit's."""
     low, high = ERROR_BAND_HZ
@@ -187,7 +207,7 @@ def _relative_error(
     frequency = np.concatenate([np.geomspace(low, high, 1200), _clusters(landmarks, 34)])
     omega = 2 * np.pi * frequency[(frequency >= low) & (frequency <= high)]
     s = 1j * omega[_apart(omega, poles, zeros)]
-    exact = TransferGrid(s).evaluate(beam, damping)
+    exact = _exact(loaded, s)
     return float(np.max(np.abs(basis(s, poles) @ coefficients / exact - 1)))
 
 

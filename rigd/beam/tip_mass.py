@@ -40,6 +40,7 @@ _N = np.array(
 _HOMOTOPY_STEPS = 12
 _NEWTON_STEPS = 60
 _CONVERGED = 1e-13
+_ASIDE = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,11 +151,25 @@ class LoadedBeam:
         ndarray of complex
             As `rigd.beam.modes.poles_for_eigenvalues` has them; NaN where a path was lost.
         """
+        return self._followed(z, zeros=False)
+
+    def zeros(self, z: Real) -> Complex:
+        """Zeros of the response, in pairs as `poles` has them.
+
+        Parameters
+        ----------
+        z : ndarray
+            Roots of ``tan z = tanh z``: those of the bare beam.
+        """
+        return self._followed(z, zeros=True)
+
+    def _followed(self, z: Real, *, zeros: bool) -> Complex:
+        """Follow poles or zeros from those of the bare beam."""
         found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
         if self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0:
             return found
         known = ~np.isnan(found[:, 0])
-        upper = found[known].ravel()
+        here = found[known].ravel() * (1 - _ASIDE)  # G is infinite at an undamped pole
         for fraction in np.arange(1, _HOMOTOPY_STEPS + 1) / _HOMOTOPY_STEPS:
             partly = LoadedBeam(
                 self.beam,
@@ -162,17 +177,17 @@ class LoadedBeam:
                 fraction * self.tip_mass_kg,
                 fraction * self.root_compliance_rad_per_nm,
             )
-            upper = partly._newton(upper)
-        found[known] = upper.reshape(-1, 2)
+            here = partly._newton(here, zeros=zeros)
+        found[known] = here.reshape(-1, 2)
         return found
 
-    def _newton(self, s: Complex) -> Complex:
-        """Roots of ``1/G + kappa`` from starts close by; NaN where it does not converge."""
+    def _newton(self, s: Complex, *, zeros: bool) -> Complex:
+        """Roots of ``1/G + kappa``, or of G, from starts close by; NaN where none is found."""
         with np.errstate(all="ignore"):
             for _ in range(_NEWTON_STEPS):
                 at = self.at(s)
-                excess = at.response * (1 + self.root_compliance_rad_per_nm * at.response)
-                step = excess / self.slope(s, at)
+                step = at.response / self.slope(s, at)
+                step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
                 s = s + step
                 if not np.nanmax(np.abs(step / s), initial=0.0) > _CONVERGED:
                     return s

@@ -56,6 +56,11 @@ class WrenchSensor:
     """Inertia about the motor axis between sensor and beam (the clamp)."""
     delay_s: NonNegative = 0.0
     """Age of the wrench at the tick that asks for it."""
+    filter_hz: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """Corner of the sensor's own low-pass filter, which the analysis is told of; 0: none is known.
+    Its delay is not part of `delay_s`."""
+    filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
+    """Of that filter: 1, or 2 (Butterworth)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +81,19 @@ class Simulation:
     offset: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """What the sensor shows without a load, N and N·m: what the tare has to take away."""
     seed: Annotated[int, Ge(0)] = 0
+    clamp_compliance_rad_per_nm: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """By how much the clamp turns, between sensor and beam, for a torque; 0: it is rigid."""
+    tip_mass_kg: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """Point mass at the beam's tip."""
+    torque_filter_hz: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """Corner of a low-pass filter of the sensor; 0: it has none."""
+    torque_filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
+    """Of that filter: 1, or 2 (Butterworth)."""
+    clock_rate_difference: Annotated[float, Ge(-1e-3), Le(0)] = field(
+        default=0.0, metadata=OPTIONAL
+    )
+    """By how much the torque's samples lie farther apart than the angle's; below 0 the torque grows
+    older all the time, and it cannot grow younger than it is."""
 
 
 @dataclass(frozen=True, slots=True)

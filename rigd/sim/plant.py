@@ -10,8 +10,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import CoupledModel, couple, propagator, realise
-from rigd.devices.parameters import RigParameters
+from rigd.beam import CoupledModel, couple, propagator, realise, with_filter
+from rigd.devices.parameters import RigParameters, Simulation
+from rigd.sim.other_clock import OtherClock
 
 Real = NDArray[np.float64]
 
@@ -93,7 +94,13 @@ class SimulatedPlant:
         torque_periods, torque_age = _split(parameters.sensor.delay_s, period)
         instants = (switch, period - angle_age, period - torque_age)
 
-        beam = realise(parameters.beam, parameters.damping)
+        simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
+        beam = realise(
+            parameters.beam,
+            parameters.damping,
+            tip_mass_kg=simulation.tip_mass_kg,
+            root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
+        )
         tool_inertia = parameters.sensor.tool_inertia_kg_m2
         free = couple(
             beam,
@@ -103,6 +110,12 @@ class SimulatedPlant:
         )
         # No torque turns an infinite inertia: the beam on a locked shaft.
         locked = couple(beam, motor_inertia_kg_m2=np.inf, tool_inertia_kg_m2=tool_inertia)
+        filtered = simulation.torque_filter_hz > 0
+        if filtered:
+            free, locked = (
+                with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
+                for model in (free, locked)
+            )
         n = free.b.size
         step = _step(free, locked.sensor_torque, period, *instants)
         locked_step = _step(locked, locked.sensor_torque, period, *instants)
@@ -131,12 +144,17 @@ class SimulatedPlant:
         self._share_before_switch = switch / period
         next_is_known = switch == 0 and periods > 0
         self._jump_gain = 0.5 * free.sensor_torque_per_torque if next_is_known else 0.0
-        self._sensed_jump_gain = self._jump_gain if torque_age == 0 else 0.0
+        self._sensed_jump_gain = self._jump_gain if torque_age == 0 and not filtered else 0.0
 
         self._torque_nm = 0.0
         self._torques = deque([0.0] * (periods + 2), maxlen=periods + 2)
         self._sensed_angles = deque([0.0] * (angle_periods + 1), maxlen=angle_periods + 1)
-        self._sensed_torques = deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
+        difference = simulation.clock_rate_difference
+        self._sensed_torques: deque[float] | OtherClock = (
+            OtherClock(torque_periods, -difference)
+            if difference
+            else deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
+        )
         self.enabled = False
         self.angle_rad = 0.0
         self.velocity_rad_s = 0.0
@@ -278,6 +296,8 @@ def _step(
             torque_at(period_s),
             holding_torque @ end,
             model.angle @ state_at(angle_instant_s),
-            torque_at(torque_instant_s),
+            torque_at(torque_instant_s)
+            if model.sensed_torque is None
+            else model.sensed_torque @ state_at(torque_instant_s),
         ]
     )

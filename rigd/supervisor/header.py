@@ -66,6 +66,9 @@ def _metadata(order: Order, connected: Message, tare: Message) -> dict[str, str]
     if rig.ati_serial is not None:
         metadata["sensor_filter"] = rig.ati_serial.filter
         metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+    if rig.sensor.filter_hz > 0:
+        metadata["torque_filter_hz"] = repr(rig.sensor.filter_hz)
+        metadata["torque_filter_order"] = repr(rig.sensor.filter_order)
     if rig.devices.drive == "sim" and rig.simulation is not None:
         metadata["simulation_seed"] = str(rig.simulation.seed)
     return metadata

@@ -19,7 +19,7 @@ RECORD = SimpleNamespace(
     torque_delay_s=5e-4,
     angle_delay_s=2e-4,
     tool_inertia_kg_m2=1e-5,
-    torque_filter_s=(0.0, 0.0),
+    torque_filter_s=(2e-3, 0.0),
     reference_rad=np.linspace(0.1, 0.2, 300),
     metadata={"excitation": "chirp"},
 )
@@ -30,6 +30,8 @@ def test_a_record_is_taken_over():
     assert measurement.name == "session.mcap"
     assert measurement.delay_s == pytest.approx(3e-4)  # by how much the torque is older
     assert measurement.tool_inertia_kg_m2 == 1e-5
+    assert measurement.nominal.filter_time_constant_s == 2e-3
+    assert measurement.nominal.second_order_filter_time_constant_s == 0.0
     assert measurement.reference_rad is RECORD.reference_rad
     assert measurement.angle_known.all()
     assert measurement.torque_known.all()

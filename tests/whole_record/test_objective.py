@@ -28,11 +28,11 @@ def test_the_gradient_is_that_of_the_cost(objective):
         assert 2 * here.gradient[k] == pytest.approx((after - before) / 2e-6, rel=2e-4)
 
 
-def test_free_decay_does_not_count(objective):
+def test_neither_free_decay_nor_a_drifting_zero_counts(objective):
     x = objective.unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8]))
     at = objective.linearise(x)
     projected = objective.project(at, 2.0)
-    ringing = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.4])
+    ringing = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.4, 0.05])  # of three modes, then the drift
     with_more = type(at)(at.residual + ringing @ at.columns, at.jacobian, at.poles, at.columns)
     again = objective.project(with_more, 2.0)
     assert again.residual == pytest.approx(projected.residual, abs=1e-6)
