@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.whole_record.decimation import Decimation, fast_length_below
+from analysis.whole_record.drag import DragResponse
+from analysis.whole_record.drag_expansion import DragExpansion
 from analysis.whole_record.feedback import following
 from analysis.whole_record.free_decay import DecaySpectra
 from analysis.whole_record.measurement import MeasurementError
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.whole_record.drag import DragLaw
     from analysis.whole_record.free_decay import Pole
     from analysis.whole_record.measurement import Measurement
     from analysis.whole_record.plant import Plant
@@ -54,6 +57,8 @@ class Comparison:
         The same at the ticks whose torque is unknown.
     hum : tuple of Hum
         What was taken out besides, as well as it was known; the rest of it is projected out.
+    drag : DragExpansion, optional
+        The torque by drag that was taken out, and what it changes by with the beam.
     """
 
     measurement: Measurement
@@ -69,6 +74,7 @@ class Comparison:
     apart_nm: NDArray[np.float64] | float = 0.0
     apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
+    drag: DragExpansion | None = None
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -214,6 +220,43 @@ class Comparison:
             apart_nm=self.apart_nm + more,
             apart_at_unknown_nm=self.apart_at_unknown_nm
             + (other._hum_at(time_s) - self._hum_at(time_s)),
+        )
+
+    def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
+        """Take the torque by drag out, and tell what it changes by.
+
+        Parameters
+        ----------
+        plant : Plant
+            The beam whose drag it is.
+        law : DragLaw
+        """
+        response = DragResponse(self.angle_rad, self.decimation.rate_hz, plant)
+        found = response.torque(law, range(1, self.visible_modes + 1))
+        torque_nm = self.torque_nm.copy()
+        torque_nm -= found.torque_nm
+        unknown = self._places(~self.measurement.torque_known)
+        between = np.fft.irfft(
+            self.decimation.factor * np.fft.rfft(found.torque_nm),
+            self.decimation.factor * found.torque_nm.size,
+        )
+        return replace(
+            self,
+            torque_nm=torque_nm,
+            apart_nm=self.apart_nm + found.torque_nm[self.kept],
+            apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
+            drag=DragExpansion(
+                plant=plant,
+                law=law,
+                by_pole={
+                    mode: self.spectrum(rows[:, self.kept]) for mode, rows in found.by_pole.items()
+                },
+                by_ln_density=self.spectrum(found.by_ln_density[self.kept]),
+                by_delay=self.spectrum(found.by_delay[self.kept]),
+                by_law=self.spectrum(found.by_law[:, self.kept]),
+                speed_m_s=found.speed_m_s,
+                top_speed_m_s=found.top_speed_m_s,
+            ),
         )
 
     def _hum_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:

@@ -1,0 +1,271 @@
+"""Whether the air brakes the beam, and how large C_D d is.
+
+Drag along the whole beam is one number, or two where the coefficient falls with the speed. Left
+out, it passes for a fractional order, a delay, modes of their own stiffness and another density:
+it damps each mode by as much as the mode is fast at the time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.selection.candidate import Candidate
+from analysis.selection.refit import Refit
+from analysis.selection.restart import adapted
+from analysis.whole_record.drag import DragLaw, DragResponse
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.selection.candidates import Field
+    from analysis.whole_record import Plant
+    from analysis.whole_record.comparison import Comparison
+    from analysis.whole_record.noise import Noise
+    from analysis.whole_record.unknowns import Unknowns
+
+_SCORED: Final = ("III", "VI", "VII")
+"""Structures beside which drag is looked for: those that have either damping."""
+
+_PROMISE: Final = 6.0
+"""Deviance by which the first order may fail to foresee what drag saves."""
+
+_ROUNDS: Final = 10
+_FEW: Final = 12
+"""Evaluations of a descent before the drag is computed anew."""
+
+_MANY: Final = 40
+_SETTLED: Final = 0.3
+"""Squares that another step would save, and the step of the drag in standard deviations, from
+which the drag need not be computed anew."""
+
+_SLOWING: Final = 12.0
+"""Deviance that a coefficient that falls with the speed must save; chance saves 10.8 once in a
+thousand records."""
+
+_SLOWEST: Final = 0.02
+"""Of the highest speed: slower air tells nothing."""
+
+_NORMAL_95: Final = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True)
+class DragEstimate:
+    """Drag of the air as found.
+
+    Attributes
+    ----------
+    value_m : float
+        C_D d at `speed_m_s`; 1.2 kg/m³ is taken for the density of the air.
+    std_m : float
+    interval_95_m : tuple of float
+        Not below 0.
+    speed_m_s : float
+        Where the coefficient falls with the speed, the one at which it is known best; else the one
+        that counts most, to which the constant coefficient is a mean.
+    law : DragLaw
+        For all speeds.
+    """
+
+    value_m: float
+    std_m: float
+    interval_95_m: tuple[float, float]
+    speed_m_s: float
+    law: DragLaw
+
+    @property
+    def falls(self) -> bool:
+        """Whether the coefficient falls with the speed, as far as the record tells."""
+        return self.law.slowing > 0
+
+
+def with_air_drag(field: Field) -> Field:
+    """Fit all candidates anew with the air's drag, if that explains the record better.
+
+    To first order a column of known shape tells what drag could save beside each of a few
+    structures. Only if one of them could then be the best of all is anything fitted.
+
+    Parameters
+    ----------
+    field : Field
+        Without drag.
+
+    Returns
+    -------
+    Field
+        The one given, if there is no drag; else with `drag`, the lowest BIC first.
+    """
+    if not _promising(field):
+        return field
+    leads = [c for c in field.candidates if c.uniform and c.structure.name in ("VI", "III")]
+    for lead in sorted(leads, key=lambda candidate: -candidate.parameters):
+        settled = _settled(field, lead.fit.plant, field.unknowns(lead.structure, uniform=True))
+        if settled is None:
+            continue
+        found = _all(field, settled)
+        if found.bic < field.bic:
+            return found
+    return field
+
+
+def _promising(field: Field) -> bool:
+    """Whether some structure with drag could be better than the best without."""
+    best = field.best
+    for candidate in field.candidates:
+        if candidate is not best and candidate.structure.name not in _SCORED:
+            continue
+        refit = field.refit(candidate.structure, candidate.uniform, candidate.fit.plant, 1)
+        column = _first_order(field.comparison, candidate.fit.plant)
+        beside = Refit.descend(
+            field.comparison,
+            refit.objective.unknowns,
+            refit.x,
+            field.noise,
+            np.concatenate([field.columns, column]),
+            max_evaluations=1,
+        )
+        size, saved = _last_amplitude(beside)
+        cost = max(refit.cost - saved, 1e-3 * refit.cost)
+        gain = candidate.values * math.log(refit.cost / cost)
+        if size > 0 and candidate.bic - gain + math.log(candidate.values) < best.bic + _PROMISE:
+            return True
+    return False
+
+
+def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+    """Spectrum of a small drag's torque, over C_D d, shape (1, K)."""
+    response = DragResponse(comparison.angle_rad, comparison.decimation.rate_hz, plant)
+    return comparison.spectrum(response.first_order()[None, comparison.kept])
+
+
+def _last_amplitude(refit: Refit) -> tuple[float, float]:
+    """Amplitude of the last column, all else free, and the squares that it saves."""
+    at = refit.objective.linearise(refit.x)
+    weight = refit.noise.weight
+    without = replace(at, columns=at.columns[:-1])
+    projected = refit.objective.project(without, weight)
+    known = np.concatenate([projected.jacobian, without.columns * weight])
+    column = at.columns[-1] * weight
+    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
+    known, scale = known[scale > 0], scale[scale > 0]
+    known = known / scale[:, None]
+    gram = (known.conj() @ known.T).real + 1e-12 * np.eye(len(known))
+    # The residual has nothing left of the decays; of the unknowns it may have, at no minimum.
+    right = np.column_stack([known.conj() @ column, known.conj() @ projected.residual]).real
+    of_column, of_residual = np.linalg.solve(gram, right).T
+    column = column - of_column @ known
+    residual = projected.residual - of_residual @ known
+    square = float(np.vdot(column, column).real)
+    if square <= 0:
+        return 0.0, 0.0
+    along = float(np.vdot(column, residual).real)
+    return -along / square, along**2 / square
+
+
+def _settled(field: Field, plant: Plant, unknowns: Unknowns) -> Refit | None:
+    """Fit one structure with drag; None if the air would have to push, or nothing settles."""
+    noise, two = field.noise, False
+    first = np.concatenate([field.columns, _first_order(field.comparison, plant)])
+    size, _ = _last_amplitude(_descent(field.comparison, unknowns, plant, noise, first, 1))
+    if size <= 0:
+        return None
+    law = DragLaw(size)
+    for _ in range(_ROUNDS):
+        comparison = field.comparison.with_drag(plant, law)
+        assert comparison.drag is not None
+        columns = comparison.drag.by_law[: 1 + two]
+        here = _descent(comparison, unknowns, plant, noise, columns, 1)
+        if here.cost - here.promised_cost < _SETTLED and _stays(here):
+            # Only at the minimum can be told whether the second number is called for.
+            both = _descent(comparison, unknowns, plant, noise, comparison.drag.by_law, 1)
+            more, saved = _last_amplitude(both)
+            if two or more <= 0 or saved < _SLOWING:
+                return here
+            two, columns = True, comparison.drag.by_law
+        here = _descent(comparison, unknowns, plant, noise, columns, _FEW)
+        law, plant, noise = _law_at(here), here.plant, here.noise_here()
+        if law.at(comparison.drag.speed_m_s) <= 0:
+            return None
+    return None
+
+
+def _descent(
+    comparison: Comparison,
+    unknowns: Unknowns,
+    plant: Plant,
+    noise: Noise,
+    columns: NDArray[np.complex128],
+    max_evaluations: int,
+) -> Refit:
+    start = adapted(unknowns, plant, unknowns.structure)
+    return Refit.descend(
+        comparison, unknowns, start, noise, columns, max_evaluations=max_evaluations
+    )
+
+
+def _stays(refit: Refit) -> bool:
+    """Whether the drag is where the torque was computed, by a fraction of its uncertainty."""
+    step, std = refit.amplitudes()
+    return bool(np.all(np.abs(step) < _SETTLED * std))
+
+
+def _law_at(refit: Refit) -> DragLaw:
+    """Drag at a minimum: where it was computed, and the step from there."""
+    expansion = refit.objective.comparison.drag
+    assert expansion is not None
+    step = refit.amplitudes()[0].tolist()
+    slowing = expansion.law.slowing + (step[1] if len(step) > 1 else 0.0)
+    return DragLaw(expansion.law.constant_m + step[0], slowing)
+
+
+def _all(field: Field, settled: Refit) -> Field:
+    """Fit all candidates with the drag settled in one, and say how large it is."""
+    other = replace(
+        field,
+        comparison=settled.objective.comparison,
+        columns=settled.columns,
+        noise=settled.noise_here(),
+    )
+    of, plant = settled.objective.unknowns.structure, settled.plant
+    candidates = []
+    for before in field.candidates:
+        unknowns = other.unknowns(before.structure, before.uniform)
+        refit = other.descent(unknowns, adapted(unknowns, plant, of), _MANY)
+        candidates.append(
+            Candidate(before.structure, before.uniform, refit.fit(), len(other.columns))
+        )
+    ranked = tuple(sorted(candidates, key=lambda candidate: candidate.bic))
+    found = replace(other, candidates=ranked).cross_checked()
+    return replace(found, drag=_estimate(found))
+
+
+def _estimate(field: Field) -> DragEstimate:
+    """Drag with its deviation, beside all the damping that the best beam may have."""
+    best = field.best
+    freest = max(
+        (c for c in field.candidates if c.uniform == best.uniform),
+        key=lambda c: (len(c.structure.free), -c.bic),
+    )
+    refit = field.refit(freest.structure, freest.uniform, freest.fit.plant)
+    law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
+    covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
+    expansion = refit.objective.comparison.drag
+    assert expansion is not None
+    speed = expansion.speed_m_s
+    slope = np.ones(1)
+    if len(covariance) > 1:
+        falls = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
+        top = expansion.top_speed_m_s
+        speed = min(max(float(falls**-1.5), _SLOWEST * top), top)
+        slope = np.array([1.0, speed ** (-2 / 3)])
+    value, std = law.at(speed), math.sqrt(float(slope @ covariance @ slope))
+    return DragEstimate(
+        value_m=value,
+        std_m=std,
+        interval_95_m=(max(value - _NORMAL_95 * std, 0.0), value + _NORMAL_95 * std),
+        speed_m_s=speed,
+        law=law,
+    )
