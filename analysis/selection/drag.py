@@ -9,23 +9,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.selection.candidate import Candidate
 from analysis.selection.refit import Refit
-from analysis.selection.restart import adapted
+from analysis.selection.restart import adapted, vector
+from analysis.structures import STRUCTURES
 from analysis.whole_record.drag import DragLaw, DragResponse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.selection.candidates import Field
+    from analysis.structures import Structure
     from analysis.whole_record import Plant
     from analysis.whole_record.comparison import Comparison
     from analysis.whole_record.noise import Noise
-    from analysis.whole_record.unknowns import Unknowns
 
 _SCORED: Final = ("III", "VI", "VII")
 """Structures beside which drag is looked for: those that have either damping."""
@@ -33,14 +35,17 @@ _SCORED: Final = ("III", "VI", "VII")
 _PROMISE: Final = 6.0
 """Deviance by which the first order may fail to foresee what drag saves."""
 
-_ROUNDS: Final = 10
+_ROUNDS: Final = 12
 _FEW: Final = 12
 """Evaluations of a descent before the drag is computed anew."""
 
 _MANY: Final = 40
-_SETTLED: Final = 0.3
-"""Squares that another step would save, and the step of the drag in standard deviations, from
-which the drag need not be computed anew."""
+_SETTLED: Final = 0.5
+_ROUGHLY: Final = 5.0
+"""Squares that another step may save where the drag need not be computed anew."""
+
+_LEAD: Final = "III"
+_FREEST: Final = "VI"
 
 _SLOWING: Final = 12.0
 """Deviance that a coefficient that falls with the speed must save; chance saves 10.8 once in a
@@ -100,15 +105,22 @@ def with_air_drag(field: Field) -> Field:
     """
     if not _promising(field):
         return field
-    leads = [c for c in field.candidates if c.uniform and c.structure.name in ("VI", "III")]
-    for lead in sorted(leads, key=lambda candidate: -candidate.parameters):
-        settled = _settled(field, lead.fit.plant, field.unknowns(lead.structure, uniform=True))
-        if settled is None:
-            continue
+    lead = next((c for c in field.candidates if c.uniform and c.structure.name == _LEAD), None)
+    start = None if lead is None else _start(field, lead)
+    if start is None:
+        return field
+    settled = _settled(field, start, STRUCTURES[_LEAD], uniform=True, tolerance=_ROUGHLY)
+    if settled is None:
+        return field
+    # Thence to the freest damping; without drag its fit may be that of no beam at all.
+    settled = _settled(field, _Point.of(settled), STRUCTURES[_FREEST], uniform=True) or settled
+    found = _all(field, settled)
+    if not found.best.uniform:
+        best = found.best
+        point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
+        settled = _settled(field, point, best.structure, uniform=False) or settled
         found = _all(field, settled)
-        if found.bic < field.bic:
-            return found
-    return field
+    return found if found.bic < field.bic else field
 
 
 def _promising(field: Field) -> bool:
@@ -165,51 +177,86 @@ def _last_amplitude(refit: Refit) -> tuple[float, float]:
     return -along / square, along**2 / square
 
 
-def _settled(field: Field, plant: Plant, unknowns: Unknowns) -> Refit | None:
-    """Fit one structure with drag; None if the air would have to push, or nothing settles."""
-    noise, two = field.noise, False
-    first = np.concatenate([field.columns, _first_order(field.comparison, plant)])
-    size, _ = _last_amplitude(_descent(field.comparison, unknowns, plant, noise, first, 1))
-    if size <= 0:
-        return None
-    law = DragLaw(size)
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """Where a search with drag stands."""
+
+    plant: Plant
+    structure: Structure
+    law: DragLaw
+    noise: Noise
+
+    @classmethod
+    def of(cls, refit: Refit) -> _Point:
+        structure = refit.objective.unknowns.structure
+        return cls(refit.plant, structure, _law_at(refit), refit.noise)
+
+
+def _start(field: Field, lead: Candidate) -> _Point | None:
+    """First order of the drag beside a fit without it; None if the air would have to push."""
+    plant, structure = lead.fit.plant, lead.structure
+    columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
+    size, _ = _last_amplitude(
+        Refit.descend(
+            field.comparison,
+            field.unknowns(structure, lead.uniform),
+            vector(field.unknowns(structure, lead.uniform), plant),
+            field.noise,
+            columns,
+            max_evaluations=1,
+        )
+    )
+    return _Point(plant, structure, DragLaw(size), field.noise) if size > 0 else None
+
+
+def _settled(
+    field: Field,
+    point: _Point,
+    structure: Structure,
+    *,
+    uniform: bool,
+    tolerance: float = _SETTLED,
+) -> Refit | None:
+    """Fit one structure with drag.
+
+    Parameters
+    ----------
+    field : Field
+        Without drag.
+    point : _Point
+        Where to start.
+    structure : Structure
+    uniform : bool
+    tolerance : float
+        Squares that a further step may still save.
+
+    Returns
+    -------
+    Refit or None
+        None if the air would have to push, or nothing settles.
+    """
+    unknowns = field.unknowns(structure, uniform)
+    x = adapted(unknowns, point.plant, point.structure)
+    law, noise = point.law, point.noise
     for _ in range(_ROUNDS):
+        plant = unknowns.plant(x)
         comparison = field.comparison.with_drag(plant, law)
         assert comparison.drag is not None
-        columns = comparison.drag.by_law[: 1 + two]
-        here = _descent(comparison, unknowns, plant, noise, columns, 1)
-        if here.cost - here.promised_cost < _SETTLED and _stays(here):
+        descent = partial(Refit.descend, comparison, unknowns, x)
+        columns = comparison.drag.by_law[: 1 + (law.slowing > 0)]
+        here = descent(noise, columns, max_evaluations=1)
+        if here.cost - here.promised_cost < tolerance:
             # Only at the minimum can be told whether the second number is called for.
-            both = _descent(comparison, unknowns, plant, noise, comparison.drag.by_law, 1)
+            both = descent(noise, comparison.drag.by_law, max_evaluations=1)
             more, saved = _last_amplitude(both)
-            if two or more <= 0 or saved < _SLOWING:
+            if law.slowing > 0 or more <= 0 or saved < _SLOWING:
                 return here
-            two, columns = True, comparison.drag.by_law
-        here = _descent(comparison, unknowns, plant, noise, columns, _FEW)
-        law, plant, noise = _law_at(here), here.plant, here.noise_here()
+            columns = comparison.drag.by_law
+        here = descent(noise, columns, max_evaluations=_FEW)
+        x, law, noise = here.x, _law_at(here), here.noise_here()
         if law.at(comparison.drag.speed_m_s) <= 0:
             return None
     return None
-
-
-def _descent(
-    comparison: Comparison,
-    unknowns: Unknowns,
-    plant: Plant,
-    noise: Noise,
-    columns: NDArray[np.complex128],
-    max_evaluations: int,
-) -> Refit:
-    start = adapted(unknowns, plant, unknowns.structure)
-    return Refit.descend(
-        comparison, unknowns, start, noise, columns, max_evaluations=max_evaluations
-    )
-
-
-def _stays(refit: Refit) -> bool:
-    """Whether the drag is where the torque was computed, by a fraction of its uncertainty."""
-    step, std = refit.amplitudes()
-    return bool(np.all(np.abs(step) < _SETTLED * std))
 
 
 def _law_at(refit: Refit) -> DragLaw:

@@ -233,8 +233,10 @@ class Comparison:
         """
         response = DragResponse(self.angle_rad, self.decimation.rate_hz, plant)
         found = response.torque(law, range(1, self.visible_modes + 1))
-        torque_nm = self.torque_nm.copy()
-        torque_nm -= found.torque_nm
+
+        def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return self.spectrum(values[..., self.kept])
+
         unknown = self._places(~self.measurement.torque_known)
         between = np.fft.irfft(
             self.decimation.factor * np.fft.rfft(found.torque_nm),
@@ -242,18 +244,18 @@ class Comparison:
         )
         return replace(
             self,
-            torque_nm=torque_nm,
+            torque_nm=self.torque_nm - found.torque_nm,
             apart_nm=self.apart_nm + found.torque_nm[self.kept],
             apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
-                by_pole={
-                    mode: self.spectrum(rows[:, self.kept]) for mode, rows in found.by_pole.items()
-                },
-                by_ln_density=self.spectrum(found.by_ln_density[self.kept]),
-                by_delay=self.spectrum(found.by_delay[self.kept]),
-                by_law=self.spectrum(found.by_law[:, self.kept]),
+                response=response,
+                band=band,
+                by_pole={mode: band(rows) for mode, rows in found.by_pole.items()},
+                by_ln_density=band(found.by_ln_density),
+                by_delay=band(found.by_delay),
+                by_law=band(found.by_law),
                 speed_m_s=found.speed_m_s,
                 top_speed_m_s=found.top_speed_m_s,
             ),

@@ -125,6 +125,11 @@ class DragResponse:
     rate_hz : float
     plant : Plant
         The linear beam.
+
+    Attributes
+    ----------
+    s : ndarray of complex, shape (bins,)
+        Where its transforms are told: a line beside the imaginary axis, in rad/s.
     """
 
     def __init__(self, angle_rad: Real, rate_hz: float, plant: Plant) -> None:
@@ -133,7 +138,7 @@ class DragResponse:
         self._length = fast_length(int(np.ceil(_PADDED * n)))
         self._sigma = sigma = _DECAY * rate_hz / self._length
         bins = np.arange(self._length // 2 + 1)
-        self._s = s = sigma + 2j * np.pi * rate_hz / self._length * bins
+        self.s = s = sigma + 2j * np.pi * rate_hz / self._length * bins
         fine = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
         self._growth = np.exp(sigma * fine)
         beam, damping = plant.beam, plant.damping
@@ -146,6 +151,7 @@ class DragResponse:
         z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
         self._follow = p / z  # (MODES, bins): what inertia makes of a force
         self._yield = s / z / beam.bending_stiffness_n_m2
+        self._inertial = p
         self._late = np.exp(-plant.delay_s * s)
         turned = np.fft.rfft(angle_rad / self._growth[::_OVERSAMPLING], self._length)
         self._driven = -self._grid.leverage_m[:, None] * (self._follow * s * turned)
@@ -174,11 +180,11 @@ class DragResponse:
         sources, direct = [], []
         for mode in modes:
             pole = self._pairs[mode - 1][0]
-            share, mirror = 1 / (self._s - pole), 1 / (self._s - pole.conjugate())
+            share, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
             for change in (share + mirror, 1j * (share - mirror)):
                 sources.append((mode - 1, self._fine(moved[mode - 1] * change)))
                 own = self._leverage[mode - 1] * self._follow[mode - 1] * spectra[mode - 1]
-                direct.append(self._in_time(own * change))
+                direct.append(self.in_time(own * change))
         changed = self._perturbed(speed, law, sources)
         by = [self._torque(change) for change in changed]
         for row, more in zip(by, direct, strict=False):
@@ -186,10 +192,10 @@ class DragResponse:
         torque = self._response(spectra)
         return DragTorque(
             law=law,
-            torque_nm=self._in_time(torque),
+            torque_nm=self.in_time(torque),
             by_pole={mode: np.array(by[2 * i : 2 * i + 2]) for i, mode in enumerate(modes)},
             by_law=np.array(by[2 * len(modes) :]),
-            by_delay=self._in_time(-self._s * torque),
+            by_delay=self.in_time(-self.s * torque),
             speed_m_s=self._mean_speed(speed),
             top_speed_m_s=float(np.abs(speed).max()),
         )
@@ -345,7 +351,7 @@ class DragResponse:
     def _spectra(self, forces: Real) -> Complex:
         """Transforms of what `_modal` gives, shape (MODES + 1, bins)."""
         every = np.fft.rfft(forces / self._growth, _OVERSAMPLING * self._length)
-        spectra: Complex = every[:, : self._s.size] / _OVERSAMPLING
+        spectra: Complex = every[:, : self.s.size] / _OVERSAMPLING
         return spectra
 
     def _response(self, spectra: Complex) -> Complex:
@@ -354,13 +360,28 @@ class DragResponse:
         return torque
 
     def _torque(self, forces: Real) -> Real:
-        return self._in_time(self._response(self._spectra(forces)))
+        return self.in_time(self._response(self._spectra(forces)))
 
-    def _in_time(self, torque: Complex) -> Real:
-        """Values of a torque, delayed, at the samples of the angle."""
-        values = np.fft.irfft(torque * self._late, self._length)[: self._samples]
+    def in_time(self, torque: Complex) -> Real:
+        """Values (..., m) of a torque, delayed, at the samples of the angle.
+
+        Parameters
+        ----------
+        torque : ndarray of complex, shape (..., bins)
+            On the grid `s`.
+        """
+        values = np.fft.irfft(torque * self._late, self._length)[..., : self._samples]
         values *= self._growth[::_OVERSAMPLING]
         return values
+
+    def modal_torque(self, mode: int) -> Complex:
+        """Part of one mode, from 1, in the linear torque, without the delay, shape (bins,).
+
+        The mode's poles are in all of it, and in nothing else of the torque.
+        """
+        share = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
+        torque: Complex = share * self._inertial * self._driven[mode - 1] / self.s
+        return torque
 
     def _fine(self, spectrum: Complex) -> Real:
         """Values over the record at the multiple of the rate."""

@@ -1,4 +1,4 @@
-"""Drag in a whole-record fit: its torque at one beam, and to first order beside it.
+"""Drag in a whole-record fit: its torque at one beam, and what it changes by beside it.
 
 The torque by drag is not linear in the motion, so no response function gives it. At a beam and a
 drag it is computed (`analysis.whole_record.drag`) and taken out of the measured torque; what it
@@ -11,6 +11,10 @@ changes by when beam or drag change is linear in
 
 The first three follow from a fit's unknowns, the last is free: its columns are projected out as
 those of a free decay are. A fit with drag repeats both steps until they agree.
+
+Without drag a peak grows as the damping falls, beyond all bounds; with it, it hardly grows. Where
+the linear torque curves with a pole, the torque by drag curves against it. So of the linear torque
+too only the first order in the poles counts: its remainder is taken away again.
 """
 
 from __future__ import annotations
@@ -23,11 +27,11 @@ import numpy as np
 from analysis.whole_record.free_decay import mode_poles
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from analysis.whole_record.drag import DragLaw
+    from analysis.whole_record.drag import DragLaw, DragResponse
     from analysis.whole_record.free_decay import Pole
     from analysis.whole_record.plant import Plant
 
@@ -44,6 +48,10 @@ class DragExpansion:
     plant : Plant
     law : DragLaw
         At these the torque was taken out of the record.
+    response : DragResponse
+        Of that beam.
+    band : callable
+        Spectrum in the band of samples of the angle's times.
     by_pole : dict of int to ndarray of complex, shape (2, K)
         Of each mode: by the real and the imaginary part of its upper pole.
     by_ln_density, by_delay : ndarray of complex, shape (K,)
@@ -55,6 +63,8 @@ class DragExpansion:
 
     plant: Plant
     law: DragLaw
+    response: DragResponse
+    band: Callable[[Real], Complex]
     by_pole: dict[int, Complex]
     by_ln_density: Complex
     by_delay: Complex
@@ -84,9 +94,13 @@ class DragExpansion:
         for pole in poles:
             if pole.mode in self.by_pole and pole.oscillates and pole.mode in own:
                 apart = pole.at_rad_s - own[pole.mode]
-                rows += list(self.by_pole[pole.mode])
-                moved += [apart.real, apart.imag]
-                slopes += [pole.derivative.real, pole.derivative.imag]
+                curved, steeper = self._remainder(pole.mode, own[pole.mode], pole.at_rad_s)
+                by_pole = self.by_pole[pole.mode]
+                # Slopes at the pole itself, the values of the remainder as a row of their own.
+                rows += [*by_pole, *steeper, curved]
+                moved += [apart.real, apart.imag, 0.0, 0.0, -1.0]
+                turn = [pole.derivative.real, pole.derivative.imag]
+                slopes += [*turn, *(-part for part in turn), np.zeros(chain.shape[1])]
         of_density = sum(
             (chain[names.index(name)] for name in _OF_DENSITY if name in names),
             start=np.zeros(chain.shape[1]),
@@ -103,6 +117,23 @@ class DragExpansion:
         change: Complex = np.array(moved) @ every
         jacobian: Complex = np.array(slopes).T @ every
         return change, jacobian
+
+    def _remainder(self, mode: int, here: complex, there: complex) -> tuple[Complex, Complex]:
+        """Linear torque of a mode beyond the first order in its pole, (K,), and its slopes, (2, K).
+
+        The slopes are by the real and the imaginary part.
+        """
+        s, torque = self.response.s, self.response.modal_torque(mode)
+        apart = there - here
+        before, mirror = 1 / (s - here), 1 / (s - here.conjugate())
+        after, after_mirror = 1 / (s - there), 1 / (s - there.conjugate())
+        grown = after * after_mirror / (before * mirror)
+        first = apart * before + apart.conjugate() * mirror
+        real = grown * (after + after_mirror) - (before + mirror)
+        imaginary = 1j * (grown * (after - after_mirror) - (before - mirror))
+        spectra = torque * np.array([grown - 1 - first, real, imaginary])
+        curved, *steeper = self.band(self.response.in_time(spectra))
+        return curved, np.array(steeper)
 
 
 _OF_DENSITY = ("density_over_stiffness", "bending_stiffness_n_m2")
