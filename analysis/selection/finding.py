@@ -9,6 +9,7 @@ Kind = Literal[
     "hum",
     "nonlinear stiffness",
     "nonlinear damping",
+    "air drag",
     "harmonics",
     "delay",
     "tool inertia",

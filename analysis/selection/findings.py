@@ -40,7 +40,7 @@ def findings(
         Modes that stand out of the noise. With fewer than two, what the file states is not
         doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
     """
-    found = (*_hum(field), *map(_force, forces), *_harmonics(multiples))
+    found = (*_hum(field), *_air(field), *map(_force, forces), *_harmonics(multiples))
     edges = tuple(at_edges(field))
     if edges:
         return (*found, *edges)
@@ -74,6 +74,30 @@ def _hum(field: Field) -> Iterator[Finding]:
             unit="N·m",
             remedy="Check shield and earth of the torque sensor's cable.",
         )
+
+
+def _air(field: Field) -> Iterator[Finding]:
+    drag = field.drag
+    if drag is None:
+        return
+    low, high = (1e3 * end for end in drag.interval_95_m)
+    falls = (
+        f"; its coefficient falls with the speed, this is at {drag.speed_m_s:.2g} m/s"
+        if drag.falls
+        else ""
+    )
+    yield Finding(
+        kind="air drag",
+        sentence=(
+            f"The air brakes the beam: C_D d = {1e3 * drag.value_m:.4g} mm ({low:.4g} to "
+            f"{high:.4g} mm; 95 %){falls}. The damping therefore grows with the amplitude; the "
+            "drag was fitted beside the beam, whose parameters are those without air."
+        ),
+        value=drag.value_m,
+        interval=drag.interval_95_m,
+        unit="m",
+        remedy="Sweep at a quarter of the amplitude, where drag all but vanishes, or in vacuum.",
+    )
 
 
 def _force(force: NonlinearForce) -> Finding:

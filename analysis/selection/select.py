@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from analysis.selection import sentences
 from analysis.selection.candidates import Field
+from analysis.selection.drag import with_air_drag
 from analysis.selection.experiments import experiments
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
@@ -59,7 +60,8 @@ def select(
 
     All structures are fitted under one spectrum of the noise, on a uniform beam, and those of
     integer internal order also with the modes' stiffness free; if one of those is the best, its
-    orders are freed as well. The lowest BIC is selected. If restoring forces that are not linear
+    orders are freed as well. The lowest BIC is selected. If drag of the air along the beam makes
+    the lowest lower, all are fitted with it. If restoring forces that are not linear
     save far more than chance would, all are fitted again with these beside the beam.
 
     Parameters
@@ -78,7 +80,7 @@ def select(
     """
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    field, forces = nonlinear_forces(linear, visible)
+    field, forces = nonlinear_forces(with_air_drag(linear), visible)
     if not field.best.uniform:
         field = field.with_orders_free()
     field, of_alpha, of_lambda = profiled(field)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     Complex = NDArray[np.complex128]
 
 MODES: Final = 5
-POINTS: Final = 12
+POINTS: Final = 16
 _OVERSAMPLING: Final = 3
 """The band ends at 0.4 of the rate: up to three times its end nothing folds back into it."""
 
@@ -77,7 +77,7 @@ class DragLaw:
 
     def at(self, speed_m_s: float) -> float:
         """C_D d in m at a speed."""
-        return self.constant_m + self.slowing * speed_m_s ** (_SLOWING - 1)
+        return float(self.constant_m + self.slowing * speed_m_s ** (_SLOWING - 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,8 +187,7 @@ class DragResponse:
                 direct.append(self.in_time(own * change))
         changed = self._perturbed(speed, law, sources)
         by = [self._torque(change) for change in changed]
-        for row, more in zip(by, direct, strict=False):
-            row += more
+        by[: len(direct)] = [row + more for row, more in zip(by, direct, strict=False)]
         torque = self._response(spectra)
         return DragTorque(
             law=law,
@@ -244,7 +243,7 @@ class DragResponse:
             add(state, later, state)
 
     def _perturbed(self, speed: Real, law: DragLaw, sources: list[tuple[int, Real]]) -> list[Real]:
-        """Changes of the forces, as `_modal` has them, by changes of a mode's speed and of the law.
+        """Change the forces, as `_modal` has them, by a mode's speed and by the law.
 
         Parameters
         ----------
@@ -349,7 +348,7 @@ class DragResponse:
         return modal
 
     def _spectra(self, forces: Real) -> Complex:
-        """Transforms of what `_modal` gives, shape (MODES + 1, bins)."""
+        """Transform what `_modal` gives, shape (MODES + 1, bins)."""
         every = np.fft.rfft(forces / self._growth, _OVERSAMPLING * self._length)
         spectra: Complex = every[:, : self.s.size] / _OVERSAMPLING
         return spectra
@@ -402,11 +401,12 @@ def _force(speed: Real, law: DragLaw) -> Real:
 
 def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
     """Poles of the modes, shape (MODES, 2), of which ``(k L)^4`` is given."""
-    return poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
+    pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
+    return pairs.astype(np.complex128)
 
 
 def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
-    """What forces at the end of a step and before it add to ``z' = p z + F``, (poles, 1 + _PAST).
+    """Integrate ``z' = p z + F`` over forces at the end of a step and before: (poles, 1 + _PAST).
 
     Between the instants the force is the polynomial through all of them.
     """

@@ -1,6 +1,7 @@
 """Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
 
-from rigd.beam.coupled import CoupledModel, couple, propagator
+from rigd.beam.air_drag import DragGrid
+from rigd.beam.coupled import CoupledModel, couple, held_inputs, propagator
 from rigd.beam.deflection import DeflectionFilter
 from rigd.beam.modes import (
     Mode,
@@ -22,12 +23,14 @@ __all__ = [
     "CoupledModel",
     "Damping",
     "DeflectionFilter",
+    "DragGrid",
     "Mode",
     "Realisation",
     "RealisationError",
     "TransferGrid",
     "clamped_free_eigenvalues",
     "couple",
+    "held_inputs",
     "mode_shape",
     "modes",
     "participation",

@@ -77,16 +77,3 @@ class DragGrid:
         """From force per metre at the points to its moment about the axis, shape (g,), in m²."""
         moment: Real = self.x_m * self.weight_m
         return moment
-
-
-def drag_per_metre(speed_m_s: Real, drag_m: float) -> Real:
-    """Force per metre on a beam that moves across still air, in N/m, of the shape of the speed.
-
-    Parameters
-    ----------
-    speed_m_s
-    drag_m
-        ``C_D d``.
-    """
-    force: Real = (-0.5 * AIR_DENSITY_KG_PER_M3 * drag_m) * np.abs(speed_m_s) * speed_m_s
-    return force
