@@ -15,10 +15,12 @@ from rigd.beam.modes import (
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.realisation import RealisationError, realise
 from rigd.beam.state_space import Realisation
+from rigd.beam.tip import SMALL_DEFLECTION, TipMotion, tip_motion, tip_response
 from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
 
 __all__ = [
     "PARAMETERS",
+    "SMALL_DEFLECTION",
     "Beam",
     "CoupledModel",
     "Damping",
@@ -27,6 +29,7 @@ __all__ = [
     "Mode",
     "Realisation",
     "RealisationError",
+    "TipMotion",
     "TransferGrid",
     "clamped_free_eigenvalues",
     "couple",
@@ -37,6 +40,8 @@ __all__ = [
     "poles",
     "propagator",
     "realise",
+    "tip_motion",
+    "tip_response",
     "transfer",
     "transfer_and_gradient",
     "undamped_frequencies_rad_s",
