@@ -76,7 +76,7 @@ class Simulation:
     offset: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """What the sensor shows without a load, N and N·m: what the tare has to take away."""
     seed: Annotated[int, Ge(0)] = 0
-    air_drag_m: NonNegative = 0.0
+    air_drag_m: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """Drag coefficient times diameter of the beam, C_D d, in air of 1.2 kg/m³; 0: no drag."""
 
 
