@@ -164,7 +164,9 @@ class Refit:
         at = self.objective.linearise(self.x)
         projected = self.objective.project(at, self.noise.weight)
         white = at.columns * self.noise.weight
-        everything = np.concatenate([projected.jacobian, white])
+        # As it was before the projection: that has made it orthogonal to the columns, whose
+        # amplitudes would then seem to have nothing in common with the unknowns.
+        everything = np.concatenate([at.jacobian * self.noise.weight, white])
         scale = np.sqrt(np.sum(np.abs(everything) ** 2, axis=1))
         scale[scale == 0] = 1.0
         everything = everything / scale[:, None]

@@ -253,6 +253,7 @@ class Comparison:
                 response=response,
                 band=band,
                 by_pole={mode: band(rows) for mode, rows in found.by_pole.items()},
+                by_external=band(found.by_external),
                 by_ln_density=band(found.by_ln_density),
                 by_delay=band(found.by_delay),
                 by_law=band(found.by_law),

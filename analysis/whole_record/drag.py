@@ -54,6 +54,9 @@ _PAST: Final = 3
 """Forces before the present one that the polynomial passes."""
 
 HALF_DENSITY: Final = 0.5 * AIR_DENSITY_KG_PER_M3
+_LOWEST: Final = [0, 1]
+"""Modes that external damping drives: it falls off against the inertia."""
+
 _CHUNK: Final = 4096
 _QUADRATURE: Final = 12
 _SLOWING: Final = 1 / 3
@@ -90,6 +93,8 @@ class DragTorque:
     torque_nm : ndarray, shape (m,)
     by_pole : dict of int to ndarray, shape (2, m)
         Of each mode: derivatives by the real and the imaginary part of its upper pole.
+    by_external : ndarray, shape (2, m)
+        By gamma and by lambda, the poles held: external damping also drives the modes.
     by_law : ndarray, shape (2, m)
         By the two numbers of the law.
     by_delay : ndarray, shape (m,)
@@ -102,6 +107,7 @@ class DragTorque:
     law: DragLaw
     torque_nm: Real
     by_pole: dict[int, Real]
+    by_external: Real
     by_law: Real
     by_delay: Real
     speed_m_s: float
@@ -177,14 +183,18 @@ class DragResponse:
         modes = [mode for mode in modes if self._pairs[mode - 1][0].imag > 0]
         spectra = self._spectra(forces)
         moved = self._driven + self._yield * spectra[:-1]
-        sources, direct = [], []
+        sources: list[tuple[list[int], Real]] = []
+        direct = []
+        carried = self._leverage[:, None] * self._follow * spectra[:-1]
         for mode in modes:
             pole = self._pairs[mode - 1][0]
             share, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
             for change in (share + mirror, 1j * (share - mirror)):
-                sources.append((mode - 1, self._fine(moved[mode - 1] * change)))
-                own = self._leverage[mode - 1] * self._follow[mode - 1] * spectra[mode - 1]
-                direct.append(self.in_time(own * change))
+                sources.append(([mode - 1], self._fine(moved[mode - 1 : mode] * change)))
+                direct.append(self.in_time(carried[mode - 1] * change))
+        for change in self._external():
+            sources.append((_LOWEST, self._fine(self._driven[_LOWEST] * change)))
+            direct.append(self.in_time(carried[_LOWEST].sum(axis=0) * change))
         changed = self._perturbed(speed, law, sources)
         by = [self._torque(change) for change in changed]
         by[: len(direct)] = [row + more for row, more in zip(by, direct, strict=False)]
@@ -193,11 +203,19 @@ class DragResponse:
             law=law,
             torque_nm=self.in_time(torque),
             by_pole={mode: np.array(by[2 * i : 2 * i + 2]) for i, mode in enumerate(modes)},
-            by_law=np.array(by[2 * len(modes) :]),
+            by_external=np.array(by[-4:-2]),
+            by_law=np.array(by[-2:]),
             by_delay=self.in_time(-self.s * torque),
             speed_m_s=self._mean_speed(speed),
             top_speed_m_s=float(np.abs(speed).max()),
         )
+
+    def _external(self) -> tuple[Complex, Complex]:
+        """Differentiate ``ln p`` by gamma and by lambda, shape (bins,) each."""
+        damping = self.plant.damping
+        log_s = np.log(self.s)
+        by_gamma = np.exp(damping.lambda_ * log_s) / self._inertial
+        return by_gamma, damping.gamma * log_s * by_gamma
 
     @property
     def _leverage(self) -> Real:
@@ -242,21 +260,21 @@ class DragResponse:
             of_force_dot(force, state)
             add(state, later, state)
 
-    def _perturbed(self, speed: Real, law: DragLaw, sources: list[tuple[int, Real]]) -> list[Real]:
+    def _perturbed(
+        self, speed: Real, law: DragLaw, sources: list[tuple[list[int], Real]]
+    ) -> list[Real]:
         """Change the forces, as `_modal` has them, by a mode's speed and by the law.
 
         Parameters
         ----------
         speed : ndarray, shape (3 m, POINTS)
             With drag.
-        sources : list of (int, ndarray of shape (3 m,))
-            Which mode (from 0) moves faster, and by how much.
+        sources : list of (list of int, ndarray of shape (modes, 3 m))
+            Which modes (from 0) move faster, and by how much.
         """
         step, of_force = self._stepping()
         of_force = of_force @ self._grid.to_modes
         runs = len(sources) + 2
-        shapes = self._grid.shapes[[mode for mode, _ in sources]].T  # (POINTS, sources)
-        faster = np.array([source for _, source in sources])
         weights = self._to_root
         changed = np.empty((len(speed), len(weights), runs))
         state, out = np.zeros((len(step) - POINTS, runs)), np.zeros((len(step), runs))
@@ -270,10 +288,9 @@ class DragResponse:
                 slope -= (1 + _SLOWING) * HALF_DENSITY * law.slowing * np.cbrt(magnitude)
             steep = slope[:, :, None]
             force = np.empty((len(slope), POINTS, runs))
-            if sources:
-                part = steep * shapes
-                part *= faster.T[chunk, None, :]
-                force[:, :, : len(sources)] = part
+            for run, (modes, faster) in enumerate(sources):
+                force[:, :, run] = faster[:, chunk].T @ self._grid.shapes[modes]
+            force[:, :, : len(sources)] *= steep
             force[:, :, len(sources)] = -HALF_DENSITY * magnitude * speed[chunk]
             force[:, :, -1] = -HALF_DENSITY * np.cbrt(magnitude) * speed[chunk]
             for at, now in zip(force, steep, strict=True):
@@ -383,9 +400,9 @@ class DragResponse:
         return torque
 
     def _fine(self, spectrum: Complex) -> Real:
-        """Values over the record at the multiple of the rate."""
+        """Values (..., 3 m) over the record at the multiple of the rate."""
         fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
-        values: Real = fine[: self._growth.size] * self._growth
+        values: Real = fine[..., : self._growth.size] * self._growth
         return values
 
 

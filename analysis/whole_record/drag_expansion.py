@@ -5,11 +5,12 @@ drag it is computed (`analysis.whole_record.drag`) and taken out of the measured
 changes by when beam or drag change is linear in
 
 * the poles of the modes, on which the motion near a resonance depends,
+* the external damping, which also drives the modes,
 * the logarithm of the mass per length, which the force has to move,
 * the delay between the channels,
 * the drag itself.
 
-The first three follow from a fit's unknowns, the last is free: its columns are projected out as
+The first four follow from a fit's unknowns, the last is free: its columns are projected out as
 those of a free decay are. A fit with drag repeats both steps until they agree.
 
 Without drag a peak grows as the damping falls, beyond all bounds; with it, it hardly grows. Where
@@ -54,6 +55,8 @@ class DragExpansion:
         Spectrum in the band of samples of the angle's times.
     by_pole : dict of int to ndarray of complex, shape (2, K)
         Of each mode: by the real and the imaginary part of its upper pole.
+    by_external : ndarray of complex, shape (2, K)
+        By gamma and lambda, the poles held.
     by_ln_density, by_delay : ndarray of complex, shape (K,)
     by_law : ndarray of complex, shape (2, K)
         By the two numbers of the law.
@@ -66,6 +69,7 @@ class DragExpansion:
     response: DragResponse
     band: Callable[[Real], Complex]
     by_pole: dict[int, Complex]
+    by_external: Complex
     by_ln_density: Complex
     by_delay: Complex
     by_law: Complex
@@ -109,6 +113,18 @@ class DragExpansion:
         here, there = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         moved.append(np.log(there / here))
         slopes.append(of_density)
+        before, after = self.plant.damping, plant.damping
+        if after.gamma > 0:
+            rows += list(self.by_external)
+            moved += [after.gamma - before.gamma, after.lambda_ - before.lambda_]
+            slopes += [
+                chain[names.index(name)] if name in names else np.zeros(chain.shape[1])
+                for name in ("gamma", "lambda")
+            ]
+        else:
+            rows.append(self.by_external[0])
+            moved.append(-before.gamma)
+            slopes.append(np.zeros(chain.shape[1]))
         rows.append(self.by_delay)
         moved.append(plant.delay_s - self.plant.delay_s)
         free = "delay_s" in names
