@@ -10,6 +10,7 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from analysis.report.html.amplitude_table import amplitude_tables
 from analysis.report.html.record_tables import modes_table, parameters_table
 from analysis.report.html.table import Number
 
@@ -42,6 +43,7 @@ def record_text(subject: Subject) -> RenderableType:
         "",
         _text_table(modes_table(subject)),
         "",
+        *(_text_table(table) for table in amplitude_tables(subject)),
     )
 
 

@@ -80,6 +80,8 @@ class DragEstimate:
         that counts most in it.
     law : DragLaw
         For all speeds.
+    covariance : tuple of tuple of float
+        Of the law's numbers that were free: of the first, or of both.
     falls : bool
         Whether the coefficient falls with the speed, beyond doubt.
     """
@@ -89,6 +91,7 @@ class DragEstimate:
     interval_95_m: tuple[float, float]
     speed_m_s: float
     law: DragLaw
+    covariance: tuple[tuple[float, ...], ...]
     falls: bool
 
 
@@ -326,5 +329,6 @@ def _estimate(field: Field) -> DragEstimate:
         interval_95_m=(max(value - _NORMAL_95 * std, 0.0), value + _NORMAL_95 * std),
         speed_m_s=speed,
         law=law,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
         falls=falls,
     )

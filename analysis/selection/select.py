@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analysis.selection import sentences
+from analysis.selection.amplitude import damping_with_amplitude
 from analysis.selection.candidates import Field
 from analysis.selection.drag import with_air_drag
 from analysis.selection.experiments import experiments
@@ -132,6 +133,7 @@ def select(
             harmonics=multiples,
             sentences=tuple(said),
             experiments=tuple(experiments(field, (alpha, lambda_), visible, found, close)),
+            damping_with_amplitude=damping_with_amplitude(field),
         ),
     )
 

@@ -67,3 +67,14 @@ def test_without_drag_nothing_is_fitted_for_it(sessions):
     field = Field.of(measured, (), (0.0, 50.0))
     assert with_air_drag(field) is field
     assert field.drag is None
+
+
+def test_damping_grows_with_the_amplitude(selection, plants, link):
+    rows = [at for at in selection.verdict.damping_with_amplitude if at.mode == 1]
+    ratios = [at.damping_ratio for at in rows]
+    assert ratios == sorted(ratios)
+    assert ratios[0] == selection.fit.modes[0].damping_ratio
+    # By 4/(3 pi) rho_air/2 C_D d A kappa / rho, with kappa = 0.739 of a clamped beam's first mode.
+    share = 4 / (3 * 3.14159) * 0.6 * DRAG_M * 0.739 / link.density_kg_per_m
+    wanted = rows[-1].tip_amplitude_m * share
+    assert ratios[-1] - ratios[0] == pytest.approx(wanted, abs=3 * rows[-1].std + 0.02 * wanted)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
     from analysis.record import Record
     from analysis.selection import OrderVerdict, Selection
+    from analysis.selection.amplitude import DampingAt
     from analysis.welch_route import WelchAnalysis
     from analysis.whole_record import RecordAnalysis, RecordFit, Setting
 
@@ -34,6 +35,8 @@ class Verdict:
         What is known of each order; may be empty.
     visible : tuple of int or None
         Modes that stand out of the noise; None if that was not asked.
+    damping_with_amplitude : tuple of DampingAt
+        Where the air brakes the beam; else empty.
     """
 
     selected: str
@@ -43,6 +46,7 @@ class Verdict:
     delta_bic: Mapping[str, float] = field(default_factory=dict)
     orders: tuple[OrderVerdict, ...] = ()
     visible: tuple[int, ...] | None = None
+    damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     @property
     def unsupported(self) -> frozenset[str]:
@@ -61,6 +65,7 @@ class Verdict:
             delta_bic={each.name: each.bic - best.bic for each in selection.candidates},
             orders=(said.alpha, said.lambda_),
             visible=said.visible_modes,
+            damping_with_amplitude=said.damping_with_amplitude,
         )
 
 
