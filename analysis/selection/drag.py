@@ -137,19 +137,21 @@ def _promising(field: Field) -> bool:
     for candidate in field.candidates:
         if candidate is not best and candidate.structure.name not in _SCORED:
             continue
-        refit = field.refit(candidate.structure, candidate.uniform, candidate.fit.plant, 1)
-        column = _first_order(field.comparison, candidate.fit.plant)
+        unknowns, plant = (
+            field.unknowns(candidate.structure, candidate.uniform),
+            candidate.fit.plant,
+        )
         beside = Refit.descend(
             field.comparison,
-            refit.objective.unknowns,
-            refit.x,
+            unknowns,
+            vector(unknowns, plant),
             field.noise,
-            np.concatenate([field.columns, column]),
+            np.concatenate([field.columns, _first_order(field.comparison, plant)]),
             max_evaluations=1,
         )
-        size, saved = _last_amplitude(beside)
-        cost = max(refit.cost - saved, 1e-3 * refit.cost)
-        gain = candidate.values * math.log(refit.cost / cost)
+        size, saved, before = _last_amplitude(beside)
+        cost = max(before - saved, 1e-3 * before)
+        gain = candidate.values * math.log(before / cost)
         if size > 0 and candidate.bic - gain + math.log(candidate.values) < best.bic + _PROMISE:
             return True
     return False
@@ -161,8 +163,8 @@ def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]
     return comparison.spectrum(response.first_order()[None, comparison.kept])
 
 
-def _last_amplitude(refit: Refit) -> tuple[float, float]:
-    """Amplitude of the last column, all else free, and the squares that it saves."""
+def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
+    """Amplitude of the last column, all else free, the squares that it saves, and those without."""
     at = refit.objective.linearise(refit.x)
     weight = refit.noise.weight
     without = replace(at, columns=at.columns[:-1])
@@ -180,9 +182,9 @@ def _last_amplitude(refit: Refit) -> tuple[float, float]:
     residual = projected.residual - of_residual @ known
     square = float(np.vdot(column, column).real)
     if square <= 0:
-        return 0.0, 0.0
+        return 0.0, 0.0, projected.cost
     along = float(np.vdot(column, residual).real)
-    return -along / square, along**2 / square
+    return -along / square, along**2 / square, projected.cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +208,7 @@ def _start(field: Field, lead: Candidate) -> _Point | None:
     """First order of the drag beside a fit without it; None if the air would have to push."""
     plant, structure = lead.fit.plant, lead.structure
     columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
-    size, _ = _last_amplitude(
+    size, *_ = _last_amplitude(
         Refit.descend(
             field.comparison,
             field.unknowns(structure, lead.uniform),

@@ -72,7 +72,9 @@ def test_without_drag_nothing_is_fitted_for_it(sessions):
 def test_damping_grows_with_the_amplitude(selection, plants, link):
     rows = [at for at in selection.verdict.damping_with_amplitude if at.mode == 1]
     ratios = [at.damping_ratio for at in rows]
-    assert ratios == sorted(ratios)
+    large = [at.damping_ratio for at in rows if at.tip_amplitude_m > 0.005]
+    assert large == sorted(large)
+    assert large[0] > ratios[0]
     assert ratios[0] == selection.fit.modes[0].damping_ratio
     # By 4/(3 pi) rho_air/2 C_D d A kappa / rho, with kappa = 0.739 of a clamped beam's first mode.
     share = 4 / (3 * 3.14159) * 0.6 * DRAG_M * 0.739 / link.density_kg_per_m
