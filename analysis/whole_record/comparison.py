@@ -57,6 +57,10 @@ class Comparison:
         The same at the ticks whose torque is unknown.
     hum : tuple of Hum
         What was taken out besides, as well as it was known; the rest of it is projected out.
+    rest_rad : ndarray, shape (m,), or float
+        Angle that followed no reference, 0 where all of it counts.
+    rest_nm, rest_at_unknown_nm : ndarray or float
+        Torque that was taken out for it, at the samples kept and at the ticks without torque.
     drag : DragExpansion, optional
         The torque by drag that was taken out, and what it changes by with the beam.
     """
@@ -74,6 +78,9 @@ class Comparison:
     apart_nm: NDArray[np.float64] | float = 0.0
     apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
+    rest_rad: NDArray[np.float64] | float = 0.0
+    rest_nm: NDArray[np.float64] | float = 0.0
+    rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
 
     @classmethod
@@ -185,19 +192,38 @@ class Comparison:
         followed = self.followed_rad()
         if followed is self.angle_rad:
             return self
-        rest = self.prediction.of_other(self.angle_rad - followed)
-        apart = rest.torque(plant)[0]
-        torque_nm = self.torque_nm.copy()
-        torque_nm[self.kept] -= apart
-        return replace(
+        split = replace(
             self,
             angle_rad=followed,
-            torque_nm=torque_nm,
             prediction=self.prediction.of_other(followed),
-            apart_nm=apart,
-            apart_at_unknown_nm=rest.torque_between(
-                plant, self.decimation.factor, self._places(~self.measurement.torque_known)
-            )[0],
+            rest_rad=self.angle_rad - followed,
+        )
+        return split.with_rest_of(plant)
+
+    def with_rest_of(self, plant: Plant) -> Comparison:
+        """Take out what a plant makes of the angle that followed no reference, in place of before.
+
+        Parameters
+        ----------
+        plant : Plant
+        """
+        if not isinstance(self.rest_rad, np.ndarray):
+            return self
+        rest = self.prediction.of_other(self.rest_rad)
+        rest_nm = rest.torque(plant)[0]
+        at_unknown_nm = rest.torque_between(
+            plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+        )[0]
+        torque_nm = self.torque_nm.copy()
+        torque_nm[self.kept] -= rest_nm - self.rest_nm
+        return replace(
+            self,
+            torque_nm=torque_nm,
+            apart_nm=self.apart_nm + (rest_nm - self.rest_nm),
+            apart_at_unknown_nm=self.apart_at_unknown_nm
+            + (at_unknown_nm - self.rest_at_unknown_nm),
+            rest_nm=rest_nm,
+            rest_at_unknown_nm=at_unknown_nm,
         )
 
     @property
@@ -231,7 +257,9 @@ class Comparison:
             The beam whose drag it is.
         law : DragLaw
         """
-        response = DragResponse(self.angle_rad, self.decimation.rate_hz, plant)
+        # All that moves is braked, whether or not it followed a reference.
+        moved_rad = self.angle_rad + self.rest_rad
+        response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
         found = response.torque(law, range(1, self.visible_modes + 1))
 
         def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
