@@ -172,6 +172,8 @@ def _tell_plan(tell: Tell, profile: Profile, excitation: Excitation, plan: Plan)
         f"speed {predicted.peak_velocity_rad_s:.3g} of {limits.velocity_rad_s:g} rad/s, "
         f"torque {predicted.peak_torque_nm:.3g} of {profile.rig.motor.peak_torque_nm:g} N·m."
     )
+    if plan.tip_in_words:
+        tell(plan.tip_in_words)
     for warning in plan.warnings:
         tell(f"Warning: {warning}")
 

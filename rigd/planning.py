@@ -1,5 +1,6 @@
 """What a session will do, before anything moves: stability of the loop, peaks, limits."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam
-from rigd.control import ClosedLoop, check_stability, close_loop
+from rigd.beam import SMALL_DEFLECTION, Beam, TipMotion, tip_motion
+from rigd.control import ClosedLoop, LoopResponse, check_stability, close_loop
 from rigd.excitation import Excitation
 from rigd.excitation.named import Value, make_excitation
 from rigd.profile import Profile
@@ -33,6 +34,8 @@ class Prediction:
     peak_torque_nm: float
     peak_tracking_error_rad: float
     peak_coupling_torque_nm: float
+    tip: TipMotion | None = None
+    """Of the beam's free end in a vacuum; None without a beam, or where it does not matter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +44,8 @@ class Plan:
 
     prediction: Prediction
     warnings: tuple[str, ...]
+    tip_in_words: str
+    """What the free end will do, and whether the linear model holds there."""
 
 
 class Foresight:
@@ -76,7 +81,8 @@ class Foresight:
         ControlDesignError
             If the loop is unstable and the response grows beyond all numbers.
         """
-        firm, forcible = _limited(self._profile, _predict(self._loop, reference_rad))
+        response = self._loop.simulate(reference_rad)
+        firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
         return max(channel.value / channel.limit for channel in firm + forcible)
 
 
@@ -120,7 +126,8 @@ def plan_session(profile: Profile, excitation: Excitation, *, force: bool = Fals
         ]
         raise RefusedError("\n".join(refusals))
     clipped = [f"{finding}: it will be clipped and flagged." for finding in forcible]
-    return Plan(prediction, tuple(([unstable] if unstable else []) + clipped))
+    warnings = tuple(([unstable] if unstable else []) + clipped)
+    return Plan(prediction, warnings, _tip_in_words(prediction, profile.rig.beam))
 
 
 def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
@@ -131,17 +138,41 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
     ControlDesignError
         If the loop is unstable and the response grows beyond all numbers.
     """
-    return _predict(loop, excitation.reference_rad)
+    response = loop.simulate(excitation.reference_rad)
+    model = loop.model
+    tip = None
+    if model.beam is not None:
+        tip = tip_motion(model.beam, model.damping, response.angle_rad, model.rate_hz)
+    return _peaks(excitation.reference_rad, response, tip)
 
 
-def _predict(loop: ClosedLoop, reference_rad: Real) -> Prediction:
-    response = loop.simulate(reference_rad)
+def _peaks(reference_rad: Real, response: LoopResponse, tip: TipMotion | None = None) -> Prediction:
     return Prediction(
         peak_angle_rad=_peak(response.angle_rad),
         peak_velocity_rad_s=_peak(response.velocity_rad_s),
         peak_torque_nm=_peak(response.torque_nm),
         peak_tracking_error_rad=_peak(reference_rad - response.angle_rad),
         peak_coupling_torque_nm=_peak(response.coupling_torque_nm),
+        tip=tip,
+    )
+
+
+def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
+    tip = predicted.tip
+    if tip is None:
+        return ""
+    share = tip.deflection_m / beam.length_m
+    motion = (
+        f"Predicted tip motion: {tip.deflection_m:.3g} m relative to the root "
+        f"({100 * share:.2g} % of the length), {tip.speed_m_s:.3g} m/s."
+    )
+    if not share > SMALL_DEFLECTION:
+        return motion
+    lower = math.floor(100 * SMALL_DEFLECTION / share) / 100
+    return (
+        f"{motion} Beyond {100 * SMALL_DEFLECTION:.0f} % the slopes are not small: the linear "
+        f"model leaves out about {100 * share**2:.0f} % of what bends and moves, and air drag may "
+        f"limit the motion; {lower:g} times the amplitude stays within."
     )
 
 

@@ -10,6 +10,7 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from analysis.report.html.amplitude_table import amplitude_tables
 from analysis.report.html.damping_sentences import damping_sentences
 from analysis.report.html.record_tables import modes_table, parameters_table, sizes_table
 from analysis.report.html.table import Number
@@ -41,8 +42,11 @@ def record_text(subject: Subject) -> RenderableType:
         "",
         *(
             part
-            for table in (modes_table, sizes_table, parameters_table)
-            for part in (_text_table(table(subject)), "")
+            for table in (
+                *(make(subject) for make in (modes_table, sizes_table, parameters_table)),
+                *amplitude_tables(subject),
+            )
+            for part in (_text_table(table), "")
         ),
     )
 

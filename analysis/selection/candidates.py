@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.selection.drag import DragEstimate
     from analysis.structures import Structure
     from analysis.whole_record import Measurement, Plant, RecordAnalysis, RecordFit, Setting
 
@@ -77,6 +78,8 @@ class Field:
         The lowest BIC first.
     columns : ndarray of complex, shape (c, K)
         What all were allowed beside the linear beam.
+    drag : DragEstimate, optional
+        Of the air, if the record calls for it; it is then in all candidates.
     """
 
     comparison: Comparison
@@ -84,6 +87,7 @@ class Field:
     free: tuple[Setting, ...]
     candidates: tuple[Candidate, ...]
     columns: NDArray[np.complex128]
+    drag: DragEstimate | None = None
 
     @classmethod
     def of(

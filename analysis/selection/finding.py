@@ -10,6 +10,7 @@ Kind = Literal[
     "hum",
     "nonlinear stiffness",
     "nonlinear damping",
+    "air drag",
     "harmonics",
     "delay",
     "tool inertia",

@@ -231,6 +231,10 @@ def headline(
         if each.profile.walked and each.order in freest.structure.free
     }
     told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
+    if field.drag is not None:
+        drag = field.drag
+        at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
+        told = replace(told, parameters={**told.parameters, "drag": at})
     simpler = _simpler(field) if adequate else None
     for other in field.other_kinds(STRONG):
         told = _doubted_by(told, other)

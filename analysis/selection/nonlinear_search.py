@@ -136,7 +136,9 @@ def _most_wanted(
     """Find the term that to first order saves most, and the cost with it."""
     projected = refit.objective.project(refit.objective.linearise(refit.x), field.noise.weight)
     forces = ModalForces(field.comparison, refit.plant)
-    terms = [Term(kind, mode) for kind in KINDS for mode in modes]
+    # Air that brakes the whole beam has been found already, and no mode is braked by itself.
+    kinds = KINDS if field.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+    terms = [Term(kind, mode) for kind in kinds for mode in modes]
     terms = [term for term in terms if term not in taken]
     if not terms:
         return None, projected.cost
@@ -170,13 +172,13 @@ def _with_terms(
     std = np.zeros(sizes.size)
     for _ in range(_ROUNDS):
         forces = ModalForces(field.comparison, refit.plant)
-        columns = np.array(
-            [forces.column(term, size) for term, size in zip(terms, sizes.tolist(), strict=True)]
-        )
+        of_terms = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
+        columns = np.concatenate([field.columns, of_terms])
         refit = Refit.descend(
             field.comparison, refit.objective.unknowns, refit.x, field.noise, columns
         )
-        before, (sizes, std) = sizes, refit.amplitudes()
+        before = sizes
+        sizes, std = (values[len(field.columns) :] for values in refit.amplitudes())
         if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SETTLED * np.abs(sizes))):
             break
     return refit, sizes, std

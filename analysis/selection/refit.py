@@ -156,17 +156,25 @@ class Refit:
 
         The deviations count the uncertainty of everything else that was fitted.
         """
+        values, covariance = self.amplitude_covariance()
+        return values, np.sqrt(np.diag(covariance))
+
+    def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Amplitudes of the further columns, shape (c,), and their covariance, shape (c, c)."""
         at = self.objective.linearise(self.x)
         projected = self.objective.project(at, self.noise.weight)
         white = at.columns * self.noise.weight
-        everything = np.concatenate([projected.jacobian, white])
+        # As it was before the projection: that has made it orthogonal to the columns, whose
+        # amplitudes would then seem to have nothing in common with the unknowns.
+        everything = np.concatenate([at.jacobian * self.noise.weight, white])
         scale = np.sqrt(np.sum(np.abs(everything) ** 2, axis=1))
         scale[scale == 0] = 1.0
         everything = everything / scale[:, None]
         gram = (everything.conj() @ everything.T).real + 1e-12 * np.eye(scale.size)
-        std = np.sqrt(np.diag(np.linalg.inv(gram))) / scale
-        first = projected.amplitudes.size - len(self.columns)
-        return projected.amplitudes[first:], std[std.size - len(self.columns) :]
+        first = scale.size - len(self.columns)
+        own = scale[first:]
+        covariance = np.linalg.inv(gram)[first:, first:] / np.outer(own, own)
+        return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
     def fit(self) -> RecordFit:
         """Everything that follows from this minimum."""

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.selection import sentences
 from analysis.selection.along_time import along_time, changing
+from analysis.selection.amplitude import damping_with_amplitude
 from analysis.selection.candidates import Field
+from analysis.selection.drag import with_air_drag
 from analysis.selection.experiments import experiments
 from analysis.selection.finding import doubted
 from analysis.selection.findings import findings, unexplained
@@ -72,8 +74,9 @@ def select(
     integer internal order also with the modes' stiffness free; if one of those is the best, its
     orders are freed as well. The lowest BIC decides on the kind of beam. What is told is of the
     freest structure on that beam, every order free, so that intervals hold whichever simpler one is
-    true. If restoring forces that are not linear save far more than chance would, all are fitted
-    again with these beside the beam.
+    true. If drag of the air along the beam makes the lowest lower, all are fitted with it. If
+    restoring forces that are not linear save far more than chance would, all are fitted again with
+    these beside the beam.
 
     Parameters
     ----------
@@ -92,7 +95,7 @@ def select(
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     misread = any(wrong_scale(linear.comparison))
-    field, forces = (linear, ()) if misread else nonlinear_forces(linear, visible)
+    field, forces = (linear, ()) if misread else nonlinear_forces(with_air_drag(linear), visible)
     field, changes = along_time(field.with_orders_free())
     if untold_reason(field, visible) is None:
         field, of_alpha, of_lambda = profiled(field)
@@ -150,6 +153,7 @@ def select(
                 *(each.sentence for each in found if each.kind not in _FIRST),
             ),
             experiments=tuple(experiments(field, orders, visible, found, close)),
+            damping_with_amplitude=damping_with_amplitude(told),
         ),
     )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from analysis.selection.amplitude import DampingAt
     from analysis.selection.finding import Finding
     from analysis.selection.harmonics import Harmonic
     from analysis.selection.orders import OrderVerdict
@@ -74,6 +75,8 @@ class Verdict:
         The verdict in words, the most important first.
     experiments : tuple of str
         What would tell more.
+    damping_with_amplitude : tuple of DampingAt
+        Of free vibration, where the air brakes the beam; else empty.
     """
 
     name: str
@@ -92,6 +95,7 @@ class Verdict:
     harmonics: tuple[Harmonic, ...]
     sentences: tuple[str, ...]
     experiments: tuple[str, ...]
+    damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     def as_json(self) -> dict[str, object]:
         """As `json.dumps` takes it; what is not finite becomes null."""

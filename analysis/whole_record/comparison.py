@@ -9,6 +9,8 @@ import numpy as np
 
 from analysis.settings import LARGEST_SHARE_OF_RATE
 from analysis.whole_record.decimation import Decimation, fast_length_below
+from analysis.whole_record.drag import DragResponse
+from analysis.whole_record.drag_expansion import DragExpansion
 from analysis.whole_record.feedback import following
 from analysis.whole_record.free_decay import DecaySpectra
 from analysis.whole_record.measurement import MeasurementError
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.whole_record.drag import DragLaw
     from analysis.whole_record.free_decay import Pole
     from analysis.whole_record.measurement import Measurement
     from analysis.whole_record.plant import Plant
@@ -55,6 +58,12 @@ class Comparison:
         The same at the ticks whose torque is unknown.
     hum : tuple of Hum
         What was taken out besides, as well as it was known; the rest of it is projected out.
+    rest_rad : ndarray, shape (m,), or float
+        Angle that followed no reference, 0 where all of it counts.
+    rest_nm, rest_at_unknown_nm : ndarray or float
+        Torque that was taken out for it, at the samples kept and at the ticks without torque.
+    drag : DragExpansion, optional
+        The torque by drag that was taken out, and what it changes by with the beam.
     """
 
     measurement: Measurement
@@ -70,6 +79,10 @@ class Comparison:
     apart_nm: NDArray[np.float64] | float = 0.0
     apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
+    rest_rad: NDArray[np.float64] | float = 0.0
+    rest_nm: NDArray[np.float64] | float = 0.0
+    rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    drag: DragExpansion | None = None
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -181,19 +194,38 @@ class Comparison:
         followed = self.followed_rad()
         if followed is self.angle_rad:
             return self
-        rest = self.prediction.of_other(self.angle_rad - followed)
-        apart = rest.torque(plant)[0]
-        torque_nm = self.torque_nm.copy()
-        torque_nm[self.kept] -= apart
-        return replace(
+        split = replace(
             self,
             angle_rad=followed,
-            torque_nm=torque_nm,
             prediction=self.prediction.of_other(followed),
-            apart_nm=apart,
-            apart_at_unknown_nm=rest.torque_between(
-                plant, self.decimation.factor, self._places(~self.measurement.torque_known)
-            )[0],
+            rest_rad=self.angle_rad - followed,
+        )
+        return split.with_rest_of(plant)
+
+    def with_rest_of(self, plant: Plant) -> Comparison:
+        """Take out what a plant makes of the angle that followed no reference, in place of before.
+
+        Parameters
+        ----------
+        plant : Plant
+        """
+        if not isinstance(self.rest_rad, np.ndarray):
+            return self
+        rest = self.prediction.of_other(self.rest_rad)
+        rest_nm = rest.torque(plant)[0]
+        at_unknown_nm = rest.torque_between(
+            plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+        )[0]
+        torque_nm = self.torque_nm.copy()
+        torque_nm[self.kept] -= rest_nm - self.rest_nm
+        return replace(
+            self,
+            torque_nm=torque_nm,
+            apart_nm=self.apart_nm + (rest_nm - self.rest_nm),
+            apart_at_unknown_nm=self.apart_at_unknown_nm
+            + (at_unknown_nm - self.rest_at_unknown_nm),
+            rest_nm=rest_nm,
+            rest_at_unknown_nm=at_unknown_nm,
         )
 
     @property
@@ -216,6 +248,48 @@ class Comparison:
             apart_nm=self.apart_nm + more,
             apart_at_unknown_nm=self.apart_at_unknown_nm
             + (other._hum_at(time_s) - self._hum_at(time_s)),
+        )
+
+    def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
+        """Take the torque by drag out, and tell what it changes by.
+
+        Parameters
+        ----------
+        plant : Plant
+            The beam whose drag it is.
+        law : DragLaw
+        """
+        # All that moves is braked, whether or not it followed a reference.
+        moved_rad = self.angle_rad + self.rest_rad
+        response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
+        found = response.torque(law, range(1, self.visible_modes + 1))
+
+        def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return self.spectrum(values[..., self.kept])
+
+        unknown = self._places(~self.measurement.torque_known)
+        between = np.fft.irfft(
+            self.decimation.factor * np.fft.rfft(found.torque_nm),
+            self.decimation.factor * found.torque_nm.size,
+        )
+        return replace(
+            self,
+            torque_nm=self.torque_nm - found.torque_nm,
+            apart_nm=self.apart_nm + found.torque_nm[self.kept],
+            apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
+            drag=DragExpansion(
+                plant=plant,
+                law=law,
+                response=response,
+                band=band,
+                by_pole={mode: band(rows) for mode, rows in found.by_pole.items()},
+                by_external=band(found.by_external),
+                by_ln_density=band(found.by_ln_density),
+                by_delay=band(found.by_delay),
+                by_law=band(found.by_law),
+                speed_m_s=found.speed_m_s,
+                top_speed_m_s=found.top_speed_m_s,
+            ),
         )
 
     def _hum_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:

@@ -104,9 +104,15 @@ class Objective:
             Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
             for pole in mode_poles(plant, comparison.visible_modes, names)
         )
+        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
+        jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)
+        if comparison.drag is not None:
+            change, slopes = comparison.drag.beside(plant, poles, unknowns.names, chain)
+            residual += change
+            jacobian += slopes
         return Linearisation(
-            residual=comparison.spectrum(torque - comparison.torque_nm[comparison.kept]),
-            jacobian=(chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128),
+            residual=residual,
+            jacobian=jacobian,
             poles=poles,
             columns=comparison.nuisance(poles),
         )

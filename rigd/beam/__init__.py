@@ -1,6 +1,7 @@
 """Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
 
-from rigd.beam.coupled import CoupledModel, couple, propagator, with_filter
+from rigd.beam.air_drag import DragGrid
+from rigd.beam.coupled import CoupledModel, couple, held_inputs, propagator, with_filter
 from rigd.beam.deflection import DeflectionFilter
 from rigd.beam.modes import (
     Mode,
@@ -14,23 +15,28 @@ from rigd.beam.modes import (
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.realisation import RealisationError, realise
 from rigd.beam.state_space import Realisation
+from rigd.beam.tip import SMALL_DEFLECTION, TipMotion, tip_motion, tip_response
 from rigd.beam.tip_mass import LoadedBeam, LoadedResponse, loaded_response
 from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
 
 __all__ = [
     "PARAMETERS",
+    "SMALL_DEFLECTION",
     "Beam",
     "CoupledModel",
     "Damping",
     "DeflectionFilter",
+    "DragGrid",
     "LoadedBeam",
     "LoadedResponse",
     "Mode",
     "Realisation",
     "RealisationError",
+    "TipMotion",
     "TransferGrid",
     "clamped_free_eigenvalues",
     "couple",
+    "held_inputs",
     "loaded_response",
     "mode_shape",
     "modes",
@@ -38,6 +44,8 @@ __all__ = [
     "poles",
     "propagator",
     "realise",
+    "tip_motion",
+    "tip_response",
     "transfer",
     "transfer_and_gradient",
     "undamped_frequencies_rad_s",

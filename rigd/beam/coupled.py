@@ -147,6 +147,23 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     return exponential[:n, :n], exponential[:n, n]
 
 
+def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
+    """State that inputs of 1, held over a duration, leave behind, shape (n, inputs).
+
+    Parameters
+    ----------
+    model
+    inputs
+        What each adds to the state's derivative, shape (n, inputs).
+    duration_s
+    """
+    n, m = inputs.shape
+    extended = np.zeros((n + m, n + m))
+    extended[:n, :n] = model.a * duration_s
+    extended[:n, n:] = inputs * duration_s
+    return expm(extended)[:n, n:]
+
+
 def expm(matrix: Real) -> Real:
     """Matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 

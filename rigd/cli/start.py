@@ -137,6 +137,8 @@ def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
         f"{plan['peak_torque_nm']:.3g} N·m.",
         err=err,
     )
+    if plan["tip_in_words"]:
+        typer.echo(plan["tip_in_words"], err=err)
     for warning in plan["warnings"]:
         typer.echo(f"Warning: {warning}", err=err)
 

@@ -94,6 +94,8 @@ class Simulation:
     )
     """By how much the torque's samples lie farther apart than the angle's; below 0 the torque grows
     older all the time, and it cannot grow younger than it is."""
+    air_drag_m: NonNegative = field(default=0.0, metadata=OPTIONAL)
+    """Drag coefficient times diameter of the beam, C_D d, in air of 1.2 kg/m³; 0: no drag."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,6 +96,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             "the shaft could not come to rest before it is stopped by force."
         )
     yield from _out_of_reach(values)
+    yield from _not_beside_air(values)
     warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
     if drift < warning:
         yield (
@@ -129,6 +130,18 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         )
     except ControlDesignError as error:
         yield str(error)
+
+
+def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the simulated rig cannot have together with drag of the air."""
+    if not values.get("simulation.air_drag_m"):
+        return
+    for name in ("clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz"):
+        if values.get(f"simulation.{name}"):
+            yield (
+                f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "
+                "one of them out, or make it 0."
+            )
 
 
 def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:

@@ -54,7 +54,12 @@ def peer_document(peer: Peer | None) -> Document | None:
 
 def plan_document(plan: Plan, record_s: float) -> Document:
     """Tell what a session is predicted to do."""
-    return {"record_s": record_s, **asdict(plan.prediction), "warnings": list(plan.warnings)}
+    return {
+        "record_s": record_s,
+        **asdict(plan.prediction),
+        "tip_in_words": plan.tip_in_words,
+        "warnings": list(plan.warnings),
+    }
 
 
 def transition_document(transition: Transition) -> Document:

@@ -10,8 +10,17 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import CoupledModel, couple, propagator, realise, with_filter
+from rigd.beam import (
+    CoupledModel,
+    Realisation,
+    couple,
+    held_inputs,
+    propagator,
+    realise,
+    with_filter,
+)
 from rigd.devices.parameters import RigParameters, Simulation
+from rigd.sim.air_brake import AirBrake
 from rigd.sim.other_clock import OtherClock
 
 Real = NDArray[np.float64]
@@ -62,10 +71,14 @@ class SimulatedPlant:
     """
 
     __slots__ = (
+        "_air",
         "_coulomb_nm",
+        "_direct_nm",
+        "_direct_share",
         "_free",
         "_friction_effects",
         "_friction_nm",
+        "_friction_speed",
         "_holding_beam_nm",
         "_jump_gain",
         "_locked",
@@ -76,6 +89,7 @@ class SimulatedPlant:
         "_share_before_switch",
         "_states",
         "_stuck",
+        "_torque_instant_share",
         "_torque_nm",
         "_torques",
         "_vectors",
@@ -116,6 +130,9 @@ class SimulatedPlant:
                 with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
                 for model in (free, locked)
             )
+        self._air = _air(parameters, beam)
+        if self._air is not None:
+            (free, on_free), (locked, on_locked) = map(self._air.attached, (free, locked))
         n = free.b.size
         step = _step(free, locked.sensor_torque, period, *instants)
         locked_step = _step(locked, locked.sensor_torque, period, *instants)
@@ -125,15 +142,31 @@ class SimulatedPlant:
         friction = -(step[:, n] + step[:, n + 1])
         self._friction_effects: list[float] = friction[n:].tolist()
         # A bound method of a matrix in column order: the quickest product of this size in numpy.
-        self._free = np.asfortranarray(np.column_stack([step, step[:, :n] @ friction[:n]])).dot
-        self._locked = np.asfortranarray(
-            np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
-        ).dot
+        step = np.column_stack([step, step[:, :n] @ friction[:n]])
+        locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
+        points = 0
+        if self._air is not None:
+            points = len(self._air.speed)
+            held = _held(free, on_free, locked.sensor_torque, period, *instants[1:])
+            locked_held = _held(locked, on_locked, locked.sensor_torque, period, *instants[1:])
+            step, locked_step = (
+                np.vstack([whole := np.column_stack(parts), self._air.speed @ whole[:n]])
+                for parts in ((step, held), (locked_step, locked_held))
+            )
+            self._friction_speed = self._air.speed @ friction[:n]
+            self._direct_nm = 0.0
+            self._direct_share = 1 - free.sensor_torque_per_torque
+            self._torque_instant_share = 1 - torque_age / period
+        self._free = np.asfortranarray(step).dot
+        self._locked = np.asfortranarray(locked_step).dot
 
-        # Two vectors, in turn the input [state, torque before and after the switch, friction] and
-        # the output [state, outputs] of a step; each with the views a step needs.
-        here, there = np.zeros((2, n + _OUTPUTS))
-        self._vectors = (here, here[: n + 3], here[n:]), (there, there[: n + 3], there[n:])
+        # Two vectors, in turn the input [state, torque before and after the switch, friction, force
+        # of the air] and the output [state, outputs, speeds in the air] of a step; each with the
+        # views a step needs.
+        here, there = np.zeros((2, n + _OUTPUTS + points))
+        self._vectors = tuple(
+            (vector, vector[: n + 3 + points], vector[n : n + _OUTPUTS]) for vector in (here, there)
+        )
         self._states = n
 
         self._coulomb_nm = parameters.motor.coulomb_nm
@@ -197,6 +230,8 @@ class SimulatedPlant:
             vector[n + 1] = after
             vector[n + 2] = self._friction_nm
             self._vectors = self._vectors[1], self._vectors[0]
+            if self._air is not None:
+                self._air.hold(input_[n + 3 :])
 
             share = self._share_before_switch
             load = share * before + (1 - share) * after - self._holding_beam_nm
@@ -204,7 +239,9 @@ class SimulatedPlant:
                 self._locked(input_, output)
                 angle, _, torque, holding, sensed_angle, sensed_torque = results.tolist()
                 self._friction_nm = velocity = 0.0
+                free = False
             else:
+                free = True
                 self._free(input_, output)
                 angle, velocity, torque, holding, sensed_angle, sensed_torque = results.tolist()
                 if self._jump_gain:
@@ -226,6 +263,10 @@ class SimulatedPlant:
                     holding += effects[3] * friction
                     sensed_angle += effects[4] * friction
                     sensed_torque += effects[5] * friction
+            if self._air is not None:
+                torque, holding, sensed_torque = self._braked(
+                    output, free, torque, holding, sensed_torque
+                )
             self._holding_beam_nm = holding
             self._sensed_angles.append(sensed_angle)
             self._sensed_torques.append(sensed_torque)
@@ -235,6 +276,27 @@ class SimulatedPlant:
             self.coupling_torque_nm = torque
             self.sensed_angle_rad = self._sensed_angles[0]
             self.sensed_torque_nm = self._sensed_torques[0]
+
+    def _braked(
+        self, output: Real, free: bool, torque: float, holding: float, sensed_torque: float
+    ) -> tuple[float, float, float]:
+        """Add what the force of the air does at once to the torques at the end of a step."""
+        assert self._air is not None
+        speed_m_s = output[self._states + _OUTPUTS :]
+        if free and self._friction_nm:
+            speed_m_s += self._friction_nm * self._friction_speed
+        before_nm = self._direct_nm
+        self._direct_nm = now_nm = self._air.feel(speed_m_s)
+        share = self._direct_share if free else 1.0
+        then_nm = before_nm + self._torque_instant_share * (now_nm - before_nm)
+        return torque + share * now_nm, holding + now_nm, sensed_torque + share * then_nm
+
+
+def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
+    simulation = parameters.simulation
+    if simulation is None or not simulation.air_drag_m:
+        return None
+    return AirBrake(parameters.beam, parameters.damping, beam, simulation.air_drag_m)
 
 
 def _split(delay_s: float, period_s: float) -> tuple[int, float]:
@@ -299,5 +361,46 @@ def _step(
             torque_at(torque_instant_s)
             if model.sensed_torque is None
             else model.sensed_torque @ state_at(torque_instant_s),
+        ]
+    )
+
+
+def _held(
+    model: CoupledModel,
+    of_force: Real,
+    holding_torque: Real,
+    period_s: float,
+    angle_instant_s: float,
+    torque_instant_s: float,
+) -> Real:
+    """One period under a held force of the air: what it adds to [next state, outputs].
+
+    Parameters
+    ----------
+    model
+        Motor and beam.
+    of_force
+        What the force adds to the state's derivative, (n, points).
+    holding_torque, period_s, angle_instant_s, torque_instant_s
+        As for `_step`.
+
+    Returns
+    -------
+    (n + 6, points)
+    """
+
+    def state_at(instant_s: float) -> Real:
+        return held_inputs(model, of_force, instant_s)
+
+    end = state_at(period_s)
+    return np.vstack(
+        [
+            end,
+            model.angle @ end,
+            model.velocity @ end,
+            model.sensor_torque @ end,
+            holding_torque @ end,
+            model.angle @ state_at(angle_instant_s),
+            model.sensor_torque @ state_at(torque_instant_s),
         ]
     )

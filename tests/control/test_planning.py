@@ -17,6 +17,22 @@ def test_the_papers_chirp_stays_within_the_shipped_limits(profile):
     assert plan.prediction.peak_angle_rad == pytest.approx(0.025, rel=0.01)
 
 
+def test_the_papers_chirp_is_no_small_deflection(profile):
+    """36 % of the length at mode 1; its tenth part is."""
+    plan = plan_session(profile, chirp(rate_hz=1000.0))
+    tip = plan.prediction.tip
+    assert tip is not None
+    assert tip.deflection_m == pytest.approx(0.36 * profile.rig.beam.length_m, rel=0.01)
+    assert tip.speed_m_s == pytest.approx(12.6, rel=0.01)
+    assert "36 % of the length" in plan.tip_in_words
+    assert "0.27 times the amplitude stays within" in plan.tip_in_words
+    small = plan_session(profile, chirp(rate_hz=1000.0, amplitude_rad=0.0025))
+    assert small.prediction.tip is not None
+    assert small.prediction.tip.deflection_m == pytest.approx(tip.deflection_m / 10, rel=1e-6)
+    assert "3.6 % of the length" in small.tip_in_words
+    assert "small" not in small.tip_in_words
+
+
 def test_ten_times_the_amplitude_saturates_and_may_be_forced(profile):
     excitation = chirp(rate_hz=1000.0, amplitude_rad=0.25)
     with pytest.raises(RefusedError, match=r"peak torque of 3\.8.* exceeds 0\.9 N·m .*--force"):

@@ -23,6 +23,12 @@ PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
     "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
     "delay_s": ("τ", "torque older than angle", "µs", 1e6),
     "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
+    "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
+    "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
+    "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
+    "second_order_filter_time_constant_s": ("T", "second-order filter of the torque", "ms", 1e3),
+    "clock_rate_difference": ("ε", "torque's clock against the angle's", "ppm", 1e6),
+    "drag": ("C_D d", "drag of the air", "mm", 1e3),
 }
 """Symbol, meaning, unit shown, and how many of that make one SI unit."""
 
@@ -171,7 +177,7 @@ def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Cell, ...
     shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
     if each.flag is not None:
         shown = (marked(shown[0]), *map(greyed, shown[1:]))
-    fixed = name not in told.fit.interval
+    fixed = name not in told.fit.interval and name != "drag"
     return (symbol, meaning, unit, *shown, "fixed" if fixed else each.flag or "")
 
 

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
     from analysis.record import Record
     from analysis.selection import Finding, Headline, OrderVerdict, Selection
+    from analysis.selection.amplitude import DampingAt
     from analysis.welch_route import WelchAnalysis
     from analysis.whole_record import RecordAnalysis, RecordFit, Setting
 
@@ -32,6 +33,8 @@ class Verdict:
         What is known of each order; may be empty.
     findings : tuple of Finding
         What else is in the record.
+    damping_with_amplitude : tuple of DampingAt
+        Where the air brakes the beam; else empty.
     """
 
     sentences: tuple[str, ...]
@@ -39,6 +42,7 @@ class Verdict:
     delta_bic: Mapping[str, float] = field(default_factory=dict)
     orders: tuple[OrderVerdict, ...] = ()
     findings: tuple[Finding, ...] = ()
+    damping_with_amplitude: tuple[DampingAt, ...] = ()
 
     @classmethod
     def of(cls, selection: Selection) -> Verdict:
@@ -50,6 +54,7 @@ class Verdict:
             delta_bic={each.name: each.bic - best.bic for each in selection.candidates},
             orders=(said.alpha, said.lambda_),
             findings=said.findings,
+            damping_with_amplitude=said.damping_with_amplitude,
         )
 
 

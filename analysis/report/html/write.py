@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
 from analysis.report.folder import OutputError, write_new
+from analysis.report.html.amplitude_table import amplitude_tables
 from analysis.report.html.drawing import drawing, photograph, svg_text
 from analysis.report.html.figures import NAMES, illustrations
 from analysis.report.html.page import page
@@ -95,6 +96,7 @@ def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Tab
         parameters_table(subject),
         *(() if condition is None else (condition,)),
         correlations_table(subject),
+        *amplitude_tables(subject),
         structures_table(subject),
     )
     welch = subject.welch

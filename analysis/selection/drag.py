@@ -1,0 +1,348 @@
+"""Whether the air brakes the beam, and how large C_D d is.
+
+Drag along the whole beam is one number, or two where the coefficient falls with the speed. Left
+out, it passes for a fractional order, a delay, modes of their own stiffness and another density:
+it damps each mode by as much as the mode is fast at the time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.selection.candidate import Candidate
+from analysis.selection.refit import Refit
+from analysis.selection.restart import adapted, vector
+from analysis.structures import STRUCTURES
+from analysis.whole_record.drag import DragLaw, DragResponse
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.selection.candidates import Field
+    from analysis.structures import Structure
+    from analysis.whole_record import Plant
+    from analysis.whole_record.comparison import Comparison
+    from analysis.whole_record.noise import Noise
+
+_SCORED: Final = ("III", "VI", "VII")
+"""Structures beside which drag is looked for: those that have either damping."""
+
+_PROMISE: Final = 6.0
+"""Deviance by which the first order may fail to foresee what drag saves."""
+
+_ROUNDS: Final = 15
+_FEW: Final = 12
+"""Evaluations of a descent before the drag is computed anew."""
+
+_MANY: Final = 40
+_SETTLED: Final = 0.5
+_ROUGHLY: Final = 20.0
+"""Squares that another step may save where the drag need not be computed anew."""
+
+_SHORT: Final = 0.3
+"""Step of the drag, in its standard deviations, that is none."""
+
+_LEAD: Final = "III"
+_FREEST: Final = "VI"
+
+_ONE_NUMBER: Final = 0.1
+"""Relative deviation of the drag above which one number has to do.
+
+A cylinder's coefficient falls with the speed. Taken for constant it is up to 7 % off on rods and
+wires between 0.2 and 2 mm, and makes up for the rest with external damping: what is known better
+has two numbers, whether or not the second differs from nought, or its interval would be too narrow.
+"""
+
+_FALLS: Final = 3.0
+"""Standard deviations of the second number from which the coefficient is said to fall."""
+
+_SLOWEST: Final = 0.02
+"""Of the highest speed: slower air tells nothing."""
+
+_NORMAL_95: Final = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True)
+class DragEstimate:
+    """Drag of the air as found.
+
+    Attributes
+    ----------
+    value_m : float
+        C_D d at `speed_m_s`; 1.2 kg/m³ is taken for the density of the air.
+    std_m : float
+    interval_95_m : tuple of float
+        Not below 0.
+    speed_m_s : float
+        The speed at which it is known best; where the record tells no more than a mean, the one
+        that counts most in it.
+    law : DragLaw
+        For all speeds.
+    covariance : tuple of tuple of float
+        Of the law's numbers that were free: of the first, or of both.
+    falls : bool
+        Whether the coefficient falls with the speed, beyond doubt.
+    """
+
+    value_m: float
+    std_m: float
+    interval_95_m: tuple[float, float]
+    speed_m_s: float
+    law: DragLaw
+    covariance: tuple[tuple[float, ...], ...]
+    falls: bool
+
+
+def with_air_drag(field: Field) -> Field:
+    """Fit all candidates anew with the air's drag, if that explains the record better.
+
+    To first order a column of known shape tells what drag could save beside each of a few
+    structures. Only if one of them could then be the best of all is anything fitted.
+
+    Parameters
+    ----------
+    field : Field
+        Without drag.
+
+    Returns
+    -------
+    Field
+        The one given, if there is no drag; else with `drag`, the lowest BIC first.
+    """
+    if not _promising(field):
+        return field
+    lead = next((c for c in field.candidates if c.uniform and c.structure.name == _LEAD), None)
+    start = None if lead is None else _start(field, lead)
+    if start is None:
+        return field
+    settled = _settled(field, start, STRUCTURES[_LEAD], uniform=True, tolerance=_ROUGHLY)
+    if settled is None:
+        return field
+    # Thence to the freest damping; without drag its fit may be that of no beam at all.
+    settled = _settled(field, _Point.of(settled), STRUCTURES[_FREEST], uniform=True) or settled
+    found = _all(field, settled)
+    if not found.best.uniform:
+        best = found.best
+        point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
+        settled = _settled(field, point, best.structure, uniform=False) or settled
+        found = _all(field, settled)
+    return found if found.bic < field.bic else field
+
+
+def _promising(field: Field) -> bool:
+    """Whether some structure with drag could be better than the best without."""
+    best = field.best
+    for candidate in field.candidates:
+        if candidate is not best and candidate.structure.name not in _SCORED:
+            continue
+        unknowns, plant = (
+            field.unknowns(candidate.structure, candidate.uniform),
+            candidate.fit.plant,
+        )
+        beside = Refit.descend(
+            field.comparison,
+            unknowns,
+            vector(unknowns, plant),
+            field.noise,
+            np.concatenate([field.columns, _first_order(field.comparison, plant)]),
+            max_evaluations=1,
+        )
+        size, saved, before = _last_amplitude(beside)
+        cost = max(before - saved, 1e-3 * before)
+        gain = candidate.values * math.log(before / cost)
+        if size > 0 and candidate.bic - gain + math.log(candidate.values) < best.bic + _PROMISE:
+            return True
+    return False
+
+
+def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+    """Spectrum of a small drag's torque, over C_D d, shape (1, K)."""
+    moved_rad = comparison.angle_rad + comparison.rest_rad
+    response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
+    return comparison.spectrum(response.first_order()[None, comparison.kept])
+
+
+def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
+    """Amplitude of the last column, all else free, the squares that it saves, and those without."""
+    at = refit.objective.linearise(refit.x)
+    weight = refit.noise.weight
+    without = replace(at, columns=at.columns[:-1])
+    projected = refit.objective.project(without, weight)
+    known = np.concatenate([projected.jacobian, without.columns * weight])
+    column = at.columns[-1] * weight
+    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
+    known, scale = known[scale > 0], scale[scale > 0]
+    known = known / scale[:, None]
+    gram = (known.conj() @ known.T).real + 1e-12 * np.eye(len(known))
+    # The residual has nothing left of the decays; of the unknowns it may have, at no minimum.
+    right = np.column_stack([known.conj() @ column, known.conj() @ projected.residual]).real
+    of_column, of_residual = np.linalg.solve(gram, right).T
+    column = column - of_column @ known
+    residual = projected.residual - of_residual @ known
+    square = float(np.vdot(column, column).real)
+    if square <= 0:
+        return 0.0, 0.0, projected.cost
+    along = float(np.vdot(column, residual).real)
+    return -along / square, along**2 / square, projected.cost
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """Where a search with drag stands."""
+
+    plant: Plant
+    structure: Structure
+    law: DragLaw
+    noise: Noise
+    two: bool = False
+
+    @classmethod
+    def of(cls, refit: Refit) -> _Point:
+        structure = refit.objective.unknowns.structure
+        two = len(refit.columns) > 1
+        return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
+
+
+def _start(field: Field, lead: Candidate) -> _Point | None:
+    """First order of the drag beside a fit without it; None if the air would have to push."""
+    plant, structure = lead.fit.plant, lead.structure
+    columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
+    size, *_ = _last_amplitude(
+        Refit.descend(
+            field.comparison,
+            field.unknowns(structure, lead.uniform),
+            vector(field.unknowns(structure, lead.uniform), plant),
+            field.noise,
+            columns,
+            max_evaluations=1,
+        )
+    )
+    return _Point(plant, structure, DragLaw(size), field.noise) if size > 0 else None
+
+
+def _settled(
+    field: Field,
+    point: _Point,
+    structure: Structure,
+    *,
+    uniform: bool,
+    tolerance: float = _SETTLED,
+) -> Refit | None:
+    """Fit one structure with drag.
+
+    Parameters
+    ----------
+    field : Field
+        Without drag.
+    point : _Point
+        Where to start.
+    structure : Structure
+    uniform : bool
+    tolerance : float
+        Squares that a further step may still save.
+
+    Returns
+    -------
+    Refit or None
+        None if the air would have to push, or nothing settles.
+    """
+    unknowns = field.unknowns(structure, uniform)
+    x = adapted(unknowns, point.plant, point.structure)
+    still = False
+    law, noise, two = point.law, point.noise, point.two
+    for _ in range(_ROUNDS):
+        plant = unknowns.plant(x)
+        # Without drag the beam seemed to be another, and so what the rest of the angle did.
+        comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+        assert comparison.drag is not None
+        descent = partial(Refit.descend, comparison, unknowns, x)
+        columns = comparison.drag.by_law[: 1 + two]
+        here = descent(noise, columns, max_evaluations=1)
+        if here.cost - here.promised_cost < tolerance or (two and still):
+            # With damping that is not the beam's, a second number would be its stopgap.
+            roughly = tolerance > _SETTLED
+            if two or roughly or _known_to(here) > _ONE_NUMBER:
+                return here
+            two, columns = True, comparison.drag.by_law
+        here = descent(noise, columns, max_evaluations=_FEW)
+        # Two numbers and external damping can make up for each other along a flat valley, where the
+        # steps are short long before the last of them.
+        step, std = here.amplitudes()
+        still = two and bool(np.all(np.abs(step) < _SHORT * std))
+        x, law, noise = here.x, _law_at(here), here.noise_here()
+        if law.at(comparison.drag.speed_m_s) <= 0:
+            return None
+    return None
+
+
+def _known_to(refit: Refit) -> float:
+    """Relative deviation of the drag, of one number."""
+    law, (_, std) = _law_at(refit), refit.amplitudes()
+    return float(std[0]) / max(law.constant_m, np.finfo(float).tiny)
+
+
+def _law_at(refit: Refit) -> DragLaw:
+    """Drag at a minimum: where it was computed, and the step from there."""
+    expansion = refit.objective.comparison.drag
+    assert expansion is not None
+    step = refit.amplitudes()[0].tolist()
+    slowing = expansion.law.slowing + (step[1] if len(step) > 1 else 0.0)
+    return DragLaw(expansion.law.constant_m + step[0], slowing)
+
+
+def _all(field: Field, settled: Refit) -> Field:
+    """Fit all candidates with the drag settled in one, and say how large it is."""
+    other = replace(
+        field,
+        comparison=settled.objective.comparison,
+        columns=settled.columns,
+        noise=settled.noise_here(),
+    )
+    of, plant = settled.objective.unknowns.structure, settled.plant
+    candidates = []
+    for before in field.candidates:
+        unknowns = other.unknowns(before.structure, before.uniform)
+        refit = other.descent(unknowns, adapted(unknowns, plant, of), _MANY)
+        candidates.append(
+            Candidate(before.structure, before.uniform, refit.fit(), len(other.columns))
+        )
+    ranked = tuple(sorted(candidates, key=lambda candidate: candidate.bic))
+    found = replace(other, candidates=ranked).cross_checked()
+    return replace(found, drag=_estimate(found))
+
+
+def _estimate(field: Field) -> DragEstimate:
+    """Drag with its deviation, beside all the damping that the best beam may have."""
+    best = field.best
+    freest = max(
+        (c for c in field.candidates if c.uniform == best.uniform),
+        key=lambda c: (len(c.structure.free), -c.bic),
+    )
+    refit = field.refit(freest.structure, freest.uniform, freest.fit.plant)
+    law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
+    covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
+    expansion = refit.objective.comparison.drag
+    assert expansion is not None
+    speed = expansion.speed_m_s
+    slope, falls = np.ones(1), False
+    if len(covariance) > 1:
+        falls = law.slowing > _FALLS * math.sqrt(covariance[1, 1])
+        pivot = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
+        top = expansion.top_speed_m_s
+        speed = min(max(float(pivot**-1.5), _SLOWEST * top), top)
+        slope = np.array([1.0, speed ** (-2 / 3)])
+    value, std = law.at(speed), math.sqrt(float(slope @ covariance @ slope))
+    return DragEstimate(
+        value_m=value,
+        std_m=std,
+        interval_95_m=(max(value - _NORMAL_95 * std, 0.0), value + _NORMAL_95 * std),
+        speed_m_s=speed,
+        law=law,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+        falls=falls,
+    )

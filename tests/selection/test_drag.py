@@ -1,0 +1,82 @@
+"""Drag of the air: found where it is, with nothing false beside it; not looked for elsewhere."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from analysis.selection import select
+from analysis.selection.candidates import Field
+from analysis.selection.drag import with_air_drag
+
+NOISE_NM = 5e-3
+DRAG_M = 2.3e-3
+
+
+@pytest.fixture(scope="module")
+def braked(sessions, plants, link):
+    """A session of type III in air, made by steps in time."""
+    path = Path(__file__).parents[1] / "whole_record" / "brake.py"
+    spec = importlib.util.spec_from_file_location("brake", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    still = sessions("III")
+    more = module.drag_torque(still.angle_rad, 1000.0, link, plants["III"], DRAG_M)
+    return replace(still, torque_nm=still.torque_nm + more)
+
+
+@pytest.fixture(scope="module")
+def selection(braked):
+    return select(braked.measured(noise_nm=NOISE_NM, seed=61))
+
+
+def test_drag_is_named_and_nothing_else(selection):
+    verdict = selection.verdict
+    assert (verdict.structure, verdict.uniform, verdict.adequate) == ("III", True, True)
+    assert {finding.kind for finding in verdict.findings} == {"air drag"}
+
+
+def test_drag_is_as_large_as_it_is(selection):
+    (found,) = selection.verdict.findings
+    low, high = found.interval
+    std = (high - low) / (2 * 1.96)
+    assert abs(found.value - DRAG_M) < 3 * std
+    assert std < 0.015 * DRAG_M
+    assert found.unit == "m"
+    assert "C_D d" in found.sentence
+
+
+def test_the_beam_beside_the_drag_is_that_without_air(selection, plants, link):
+    fit, damping = selection.fit, plants["III"]
+    truth = {
+        "zeta": damping.zeta,
+        "gamma": damping.gamma,
+        "density_over_stiffness": link.density_over_stiffness,
+        "bending_stiffness_n_m2": link.bending_stiffness_n_m2,
+        "delay_s": 0.0,
+    }
+    for name, value in truth.items():
+        low, high = fit.interval[name]
+        middle, half = (low + high) / 2, (high - low) / 2
+        assert abs(value - middle) < 3 / 1.96 * half, name
+
+
+def test_without_drag_nothing_is_fitted_for_it(sessions):
+    measured = sessions("VI").measured(noise_nm=NOISE_NM, seed=62)
+    field = Field.of(measured, (), (0.0, 50.0))
+    assert with_air_drag(field) is field
+    assert field.drag is None
+
+
+def test_damping_grows_with_the_amplitude(selection, plants, link):
+    rows = [at for at in selection.verdict.damping_with_amplitude if at.mode == 1]
+    ratios = [at.damping_ratio for at in rows]
+    large = [at.damping_ratio for at in rows if at.tip_amplitude_m > 0.005]
+    assert large == sorted(large)
+    assert large[0] > ratios[0]
+    assert ratios[0] == selection.fit.modes[0].damping_ratio
+    # By 4/(3 pi) rho_air/2 C_D d A kappa / rho, with kappa = 0.739 of a clamped beam's first mode.
+    share = 4 / (3 * 3.14159) * 0.6 * DRAG_M * 0.739 / link.density_kg_per_m
+    wanted = rows[-1].tip_amplitude_m * share
+    assert ratios[-1] - ratios[0] == pytest.approx(wanted, abs=3 * rows[-1].std + 0.02 * wanted)

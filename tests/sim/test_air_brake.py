@@ -1,0 +1,99 @@
+"""The simulated beam in air against the analyzer's model of the drag, which is no simulation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.whole_record import Measurement, Plant
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.drag import DragLaw, DragResponse
+from rigd.beam import Damping
+from rigd.profile import load_profile
+from rigd.sim.plant import SimulatedPlant
+
+DRAG_M = 2.3e-3
+RATE_HZ = 1000.0
+TICKS = 25_000
+
+
+def rig(drag_m, damping, coulomb_nm=0.0, delay_s=0.0):
+    parameters = load_profile("sim").rig
+    assert parameters.simulation is not None
+    return replace(
+        parameters,
+        damping=damping,
+        motor=replace(parameters.motor, coulomb_nm=coulomb_nm, peak_torque_nm=20.0),
+        actuation=replace(parameters.actuation, delay_s=1 / RATE_HZ),
+        encoder=replace(parameters.encoder, delay_s=0.0),
+        sensor=replace(parameters.sensor, delay_s=delay_s),
+        simulation=replace(parameters.simulation, air_drag_m=drag_m),
+    )
+
+
+def swept(parameters):
+    """Angle and the sensor's torque under a sweep to 20 Hz, the coupling torque fed forward."""
+    plant = SimulatedPlant(parameters)
+    plant.enable()
+    t = np.arange(TICKS) / RATE_HZ - 1
+    asked = np.where((t > 0) & (t < 20), 0.025 * np.sin(2 * np.pi * (0.05 + 0.5 * t) * t), 0.0)
+    stiffness, viscosity = 12.0, 0.35
+    rows, before = np.empty((TICKS, 2)), 0.0
+    for tick, angle in enumerate(asked.tolist()):
+        rows[tick] = plant.sensed_angle_rad, plant.sensed_torque_nm
+        speed = (angle - before) * RATE_HZ
+        before = angle
+        plant.command(
+            stiffness * (angle - plant.angle_rad)
+            + viscosity * (speed - plant.velocity_rad_s)
+            + plant.coupling_torque_nm
+        )
+        plant.advance()
+    return rows.T
+
+
+def unexplained(parameters, drag_m):
+    """Share of the simulated torque that the model with a drag leaves, and that of the drag."""
+    angle_rad, torque_nm = swept(parameters)
+    known = np.ones(TICKS, dtype=bool)
+    measured = Measurement(
+        "m", angle_rad, torque_nm, RATE_HZ, parameters.beam, known, known, 0.0,
+        tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
+        delay_s=parameters.sensor.delay_s,
+    )  # fmt: skip
+    compared = Comparison.of(measured, (0.0, 50.0))
+    plant = Plant(
+        parameters.beam, parameters.damping, measured.delay_s, measured.tool_inertia_kg_m2
+    )
+    linear = compared.prediction.torque(plant)[0]
+    response = DragResponse(compared.angle_rad, compared.decimation.rate_hz, plant)
+    drag = response.torque(DragLaw(drag_m)).torque_nm[compared.kept]
+    measured_nm = compared.torque_nm[compared.kept]
+    left, by_drag, whole = (
+        float(np.linalg.norm(compared.spectrum(values)))
+        for values in (linear + drag - measured_nm, drag, measured_nm)
+    )
+    return left / whole, by_drag / whole
+
+
+@pytest.mark.parametrize(
+    ("damping", "coulomb_nm", "delay_s"),
+    [
+        (Damping(5.4e-5, 1.0, 0.02, 1.0), 0.0, 0.0),
+        (Damping(7.1e-5, 0.996, 0.055, 0.594), 0.03, 0.0),
+        (Damping(7.1e-5, 0.996, 0.055, 0.594), 0.0, 0.4e-3),
+    ],
+    ids=["integer orders", "fractional, with friction", "a sensor between two ticks"],
+)
+def test_the_simulated_drag_is_that_of_the_exact_beam(damping, coulomb_nm, delay_s):
+    left, by_drag = unexplained(rig(DRAG_M, damping, coulomb_nm, delay_s), DRAG_M)
+    assert by_drag > 0.3
+    assert left < 2e-3
+
+
+def test_without_drag_there_is_none():
+    damping = Damping(7.1e-5, 0.996, 0.055, 0.594)
+    still, braked = (swept(rig(drag_m, damping)) for drag_m in (0.0, DRAG_M))
+    assert np.abs(still - braked).max() > 0.01
+    left, _ = unexplained(rig(0.0, damping), 0.0)
+    assert left < 1e-3

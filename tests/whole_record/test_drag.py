@@ -1,0 +1,153 @@
+"""Torque by drag of the air: against steps in time, its derivatives, and the published case."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.whole_record import Measurement, Plant
+from analysis.whole_record.comparison import Comparison
+from analysis.whole_record.drag import DragLaw, DragResponse
+from analysis.whole_record.free_decay import mode_poles
+from rigd.beam import Beam, Damping
+
+LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+RATE_HZ = 1000.0
+ROD_M = 2e-3
+AIR_M2_PER_S = 1.5e-5
+WHITE = DragLaw(ROD_M, 10 * ROD_M ** (1 / 3) * AIR_M2_PER_S ** (2 / 3))
+"""``C_D = 1 + 10 Re^(-2/3)`` of a rod of 2 mm."""
+
+
+@pytest.fixture(scope="module")
+def brake():
+    path = Path(__file__).with_name("brake.py")
+    spec = importlib.util.spec_from_file_location("brake", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def swept(duration_s, stop_hz, amplitude_rad=0.025, rest_s=1.0, after_s=3.0):
+    """Angle of a motor that follows a sweep through two poles at 80 rad/s."""
+    n = round((rest_s + duration_s + after_s) * RATE_HZ)
+    t = np.arange(n) / RATE_HZ - rest_s
+    phase = 2 * np.pi * (0.05 * t + (stop_hz - 0.05) * t**2 / (2 * duration_s))
+    asked = np.where((t >= 0) & (t < duration_s), amplitude_rad * np.sin(phase), 0.0)
+    decay = np.exp(-6 * np.arange(n) / n)
+    s = 6 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(2 * n, 1 / RATE_HZ)
+    return np.fft.irfft(np.fft.rfft(asked * decay, 2 * n) / (1 + s / 80) ** 2, 2 * n)[:n] / decay
+
+
+def compared(angle_rad):
+    known = np.ones(angle_rad.size, dtype=bool)
+    zero = np.zeros(angle_rad.size)
+    return Comparison.of(
+        Measurement("m", angle_rad, zero, RATE_HZ, LINK, known, known, 0.0), (0.0, 50.0)
+    )
+
+
+def response(comparison, plant):
+    return DragResponse(comparison.angle_rad, comparison.decimation.rate_hz, plant)
+
+
+def deviation(one, other):
+    return np.linalg.norm(one - other) / np.linalg.norm(other)
+
+
+@pytest.mark.parametrize("law", [DragLaw(2.3e-3), WHITE])
+def test_the_torque_is_that_of_steps_in_time(brake, law):
+    angle_rad = swept(16.0, 20.0)
+    damping = Damping(zeta=5.4e-5, alpha=1.0, gamma=0.02, lambda_=1.0)
+    comparison = compared(angle_rad)
+    found = response(comparison, Plant(LINK, damping)).torque(law).torque_nm[comparison.kept]
+    stepped = brake.drag_torque(angle_rad, RATE_HZ, LINK, damping, law.constant_m, law.slowing)
+    truth = comparison.decimation.apply(stepped)[comparison.kept]
+    assert np.abs(truth).max() > 0.03
+    spectra = comparison.spectrum(found), comparison.spectrum(truth)
+    assert deviation(*spectra) < 2e-3
+
+
+def test_a_rod_in_air_halves_the_peaks_of_the_papers_chirp():
+    """The rod that stiffness and density say, without other external damping."""
+    comparison = compared(swept(120.0, 50.0, after_s=15.0))
+    plant = Plant(LINK, Damping(zeta=5.4e-5, alpha=1.0, gamma=0.0, lambda_=1.0))
+    linear = comparison.prediction.torque(plant)[0]
+    braked = linear + response(comparison, plant).torque(WHITE).torque_nm[comparison.kept]
+    assert np.abs(linear).max() == pytest.approx(0.331, rel=0.03)
+    assert np.abs(braked).max() == pytest.approx(0.161, rel=0.03)
+
+
+@pytest.fixture(scope="module")
+def short():
+    return compared(swept(16.0, 20.0))
+
+
+def plant(zeta=5.4e-5, gamma=0.02, density=4.7e-3, offset=0.0, delay_s=0.0):
+    damping = Damping(zeta=zeta, alpha=1.0, gamma=gamma, lambda_=1.0)
+    beam = Beam(LINK.length_m, density, LINK.bending_stiffness_n_m2)
+    return Plant(beam, damping, delay_s, stiffness_offsets=(offset, 0.0))
+
+
+LAW = DragLaw(2e-3, 5e-4)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_derivatives_by_the_law(short, place):
+    numbers = np.array([LAW.constant_m, LAW.slowing])
+    step = 1e-3 * numbers * np.eye(2)[place]
+    beam = response(short, plant())
+    above, below = (beam.torque(DragLaw(*(numbers + sign * step))).torque_nm for sign in (1, -1))
+    exact = beam.torque(LAW).by_law[place]
+    assert deviation((above - below) / (2 * step[place]), exact) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "step", "tolerance"),
+    [
+        ("zeta", 5.4e-5, 2e-6, 5e-3),
+        ("gamma", 0.02, 1e-3, 5e-3),
+        ("density", 4.7e-3, 4.7e-8, 1e-3),
+        ("offset", 0.0, 1e-5, 1e-3),
+        ("delay_s", 0.0, 1e-5, 1e-4),
+    ],
+)
+def test_derivatives_by_the_beam_go_through_its_poles(short, name, value, step, tolerance):
+    plants = [plant(**{name: value + sign * step}) for sign in (1, -1)]
+    above, below = (response(short, p).torque(LAW).torque_nm for p in plants)
+    here = response(short, plant()).torque(LAW, (1, 2, 3))
+    poles = [mode_poles(p, 3, ()) for p in plants]
+    foreseen = np.zeros(above.size)
+    for one, other in zip(*poles, strict=True):
+        apart = one.at_rad_s - other.at_rad_s
+        foreseen += np.array([apart.real, apart.imag]) @ here.by_pole[one.mode]
+    if name == "gamma":
+        foreseen += 2 * step * here.by_external[0]
+    if name == "density":
+        foreseen += 2 * step / value * here.by_ln_density
+    if name == "delay_s":
+        foreseen += 2 * step * here.by_delay
+    assert deviation(foreseen, above - below) < tolerance
+
+
+def test_a_small_drag_is_the_first_order(short):
+    beam = response(short, plant())
+    assert deviation(beam.torque(DragLaw(1e-7)).torque_nm / 1e-7, beam.first_order()) < 1e-3
+
+
+def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short):
+    """A fit's residual with another beam than that of the drag, against drag computed anew."""
+    here, there = plant(), plant(gamma=0.0205, density=4.70015e-3, delay_s=5e-6)
+    torque_nm = short.prediction.torque(there)[0]
+    torque_nm = torque_nm + response(short, there).torque(LAW).torque_nm[short.kept]
+    with_drag = short.with_drag(here, LAW)
+    assert with_drag.drag is not None
+    names = ("gamma",)
+    poles = mode_poles(there, 3, names)
+    change, _ = with_drag.drag.beside(there, poles, names, np.eye(1))
+    linear = with_drag.spectrum(short.prediction.torque(there)[0])
+    taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.kept])
+    truth = short.spectrum(torque_nm)
+    moved = np.linalg.norm(truth - taken - short.spectrum(short.prediction.torque(here)[0]))
+    assert np.linalg.norm(linear + taken + change - truth) < 0.05 * moved
