@@ -66,12 +66,13 @@ def parameter_uncertainty(
     for name, spread in zip(determined, np.sqrt(np.diag(covariance)).tolist(), strict=True):
         std[name] = values[name] * spread if name in LOGARITHMIC else spread
         intervals[name] = interval(name, values[name], spread)
+    first, _second = unknowns.omega_rad_s
     return ParameterUncertainty(
         std=std,
         interval=intervals,
         determined=determined,
         covariance=covariance,
         at_bounds=tuple(name for name, is_held in zip(names, held, strict=True) if is_held),
-        internal=damping_size("zeta", "alpha", values, determined, covariance),
-        external=damping_size("gamma", "lambda", values, determined, covariance),
+        internal=damping_size("zeta", "alpha", values, determined, covariance, first),
+        external=damping_size("gamma", "lambda", values, determined, covariance, first),
     )

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DampingSize:
-    """Loss factor of a damping at the frequency where it is uncorrelated with its order.
+    """Loss factor of a damping at the frequency where it depends least on its order.
 
     Attributes
     ----------
     omega_rad_s : float or None
-        That frequency; None if the order is fixed or not determined.
+        That frequency, not below the first mode; None if the order is fixed or not determined.
     value, std : float
         ``zeta omega^alpha sin(alpha pi/2)`` of internal damping, of external damping
         ``gamma omega^lambda sin(lambda pi/2)`` over ``rho/EI omega²``: what is lost in a radian

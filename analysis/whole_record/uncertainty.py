@@ -89,8 +89,9 @@ def damping_size(
     values: dict[str, float],
     names: Sequence[str],
     covariance: NDArray[np.float64],
+    least_omega_rad_s: float,
 ) -> DampingSize | None:
-    """Loss factor that a damping causes, at the frequency where it is uncorrelated with its order.
+    """Loss factor that a damping causes, at the frequency where it depends least on its order.
 
     A record shows the loss. ``zeta omega^alpha`` alone is its size only to the first degree in the
     order: where that is uncertain by 0.15, it is off by 4 % more than the loss is.
@@ -104,6 +105,8 @@ def damping_size(
         Determined parameters.
     covariance : ndarray, shape (k, k)
         Theirs, coefficients as logarithms.
+    least_omega_rad_s : float
+        That of the first mode: below it nothing rings, and what is lost there is of no use.
     """
     if coefficient not in names:
         return None
@@ -119,11 +122,12 @@ def damping_size(
     if power and ratio in names:
         slope[list(names).index(ratio)] = -1.0
     # ln loss has no covariance with the order where its slope by the order is:
-    by_order = -float(slope @ covariance[:, j]) / covariance[j, j]
-    slope[j] = by_order
-    ln_omega = by_order - math.pi / 2 / math.tan(angle)
+    uncorrelated = -float(slope @ covariance[:, j]) / covariance[j, j]
+    turning = math.pi / 2 / math.tan(angle)
+    ln_omega = max(uncorrelated - turning, math.log(least_omega_rad_s))
     if abs(ln_omega) > _LARGEST_LN_OMEGA:
         return None  # an order all but unknown is uncorrelated nowhere
+    slope[j] = ln_omega + turning
     scale = values[ratio] if power else 1.0
     size = values[coefficient] / scale * math.sin(angle)
     size *= math.exp((values[order] - power) * ln_omega)
