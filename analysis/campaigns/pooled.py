@@ -14,7 +14,7 @@ from analysis.structures import STRUCTURES
 from analysis.whole_record import SETTINGS, Plant
 from analysis.whole_record.plant import LOGARITHMIC
 from analysis.whole_record.uncertainty import damping_size
-from rigd.beam import Beam
+from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -143,8 +143,10 @@ class PooledEstimate:
         """Sizes of the dampings that all sessions together determine."""
         names = tuple(each.name for each in self.parameters)
         t, found = t_quantile(0.95, self.sessions - 1), []
+        values = self.plant.parameters
+        first = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPINGS:
-            size = damping_size(coefficient, order, self.plant.parameters, names, self.covariance)
+            size = damping_size(coefficient, order, values, names, self.covariance, first)
             if size is not None:
                 factor = math.exp(t * size.std / size.value)
                 ends = size.value / factor, size.value * factor

@@ -1,7 +1,7 @@
 """A rig as whoever runs sessions on it sees it: connect, run, tare, zero, status, disconnect."""
 
-import gc
 import contextlib
+import gc
 import threading
 import time
 from collections.abc import Callable
@@ -161,13 +161,13 @@ class Rig:
             error.hardware = not self.simulated
             raise
         finally:
-            # Between sessions: what a session leaves behind would lie scattered among what stays,
-            # and a long series would take 4 kB more for each.
-            gc.collect()
             if self._view is not None:
                 self._view.finish(outcome, reason)
             if session.device_failed:
                 self._await_end()
+            # Between sessions: what a session leaves behind would lie scattered among what stays,
+            # and a long series would take 4 kB more for each.
+            gc.collect()
 
     def show(self, order: Order, stop: StopRequest) -> str:
         """Show a session that is about to be run in the live view.

@@ -338,7 +338,8 @@ def test_intervals_correlations_and_what_follows(all_seven, true_parameters):
         if coefficient == "gamma":
             expected /= truth["density_over_stiffness"] * omega**2
         assert abs(size.value - expected) < 4 * size.std
-        assert size.std / size.value < 0.5 * found.std[coefficient] / found.parameters[coefficient]
+        assert size.std / size.value < 0.7 * found.std[coefficient] / found.parameters[coefficient]
+        assert size.omega_rad_s >= 16.0  # not below the first mode
     assert all_seven["I"].internal.omega_rad_s is None
     assert all_seven["I"].external is None
 
