@@ -503,7 +503,10 @@ class _Copy:
             if self._decoder.is_of_topic(contents, channel):
                 kept = self._kept[self._read : self._read + count]
                 self._read += count
-                if not kept.all():
+                if count == 1:  # with channels in turn all are: nothing that costs a call each
+                    if not kept[0]:
+                        continue
+                elif not kept.all():
                     parts = [(start + size * first, n) for first, n in _stretches(kept)]
             if is_dropped or channel not in self._channels:
                 continue
