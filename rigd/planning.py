@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import SMALL_DEFLECTION, Beam, TipMotion, tip_motion
+from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, tip_motion
 from rigd.control import ClosedLoop, LoopResponse, check_stability, close_loop
 from rigd.excitation import Excitation
 from rigd.excitation.named import Value, make_excitation
@@ -163,16 +163,18 @@ def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
         return ""
     share = tip.deflection_m / beam.length_m
     motion = (
-        f"Predicted tip motion: {tip.deflection_m:.3g} m relative to the root "
-        f"({100 * share:.2g} % of the length), {tip.speed_m_s:.3g} m/s."
+        f"Predicted tip motion: {tip.deflection_m:.3g} m from the line of the root "
+        f"({100 * share:.2g} % of the length), {tip.speed_m_s:.3g} m/s through the air, slope "
+        f"{tip.slope_rad:.2g} rad."
     )
-    if not share > SMALL_DEFLECTION:
+    if not tip.slope_rad > SMALL_SLOPE_RAD:
         return motion
-    lower = math.floor(100 * SMALL_DEFLECTION / share) / 100
+    lower = math.floor(100 * SMALL_SLOPE_RAD / tip.slope_rad) / 100
+    within = f"; {lower:g} times the amplitude stays within" if lower > 0 else ""
     return (
-        f"{motion} Beyond {100 * SMALL_DEFLECTION:.0f} % the slopes are not small: the linear "
-        f"model leaves out about {100 * share**2:.0f} % of what bends and moves, and air drag may "
-        f"limit the motion; {lower:g} times the amplitude stays within."
+        f"{motion} Slopes beyond {SMALL_SLOPE_RAD:g} rad are not small: the linear model leaves "
+        f"out up to {100 * tip.slope_rad**2 / 3:.2g} % of what bends and moves, and air drag may "
+        f"limit the motion{within}."
     )
 
 

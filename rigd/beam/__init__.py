@@ -15,13 +15,13 @@ from rigd.beam.modes import (
 from rigd.beam.parameters import Beam, Damping
 from rigd.beam.realisation import RealisationError, realise
 from rigd.beam.state_space import Realisation
-from rigd.beam.tip import SMALL_DEFLECTION, TipMotion, tip_motion, tip_response
+from rigd.beam.tip import SMALL_SLOPE_RAD, TipMotion, tip_motion, tip_response
 from rigd.beam.tip_mass import LoadedBeam, LoadedResponse, loaded_response
 from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
 
 __all__ = [
     "PARAMETERS",
-    "SMALL_DEFLECTION",
+    "SMALL_SLOPE_RAD",
     "Beam",
     "CoupledModel",
     "Damping",

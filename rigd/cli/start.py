@@ -137,8 +137,9 @@ def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
         f"{plan['peak_torque_nm']:.3g} N·m.",
         err=err,
     )
-    if plan["tip_in_words"]:
-        typer.echo(plan["tip_in_words"], err=err)
+    # A daemon of before an update tells none; to fail here would leave its session without Ctrl-C.
+    if words := plan.get("tip_in_words"):
+        typer.echo(words, err=err)
     for warning in plan["warnings"]:
         typer.echo(f"Warning: {warning}", err=err)
 

@@ -130,11 +130,20 @@ class Allowance:
             raise McapError(f"has more than {MAX_ENTRIES} keys in its metadata{where}")
 
 
-def unpacked(compression: bytes, packed: memoryview, size: int, where: str) -> bytes:
+def zstd_decompressor() -> zstandard.ZstdDecompressor:
+    """Return one for the chunks of a file: to make one for each takes longer than a small chunk."""
+    return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
+
+
+def unpacked(
+    zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
+) -> bytes:
     """Decompress a chunk to exactly `size` bytes, never allocating more.
 
     Parameters
     ----------
+    zstd
+        Of :func:`zstd_decompressor`.
     compression
         As the chunk names it.
     packed
@@ -154,7 +163,7 @@ def unpacked(compression: bytes, packed: memoryview, size: int, where: str) -> b
             records = bytes(packed[: size + 1])
         elif compression == b"zstd":
             _check_zstd_size(packed, size, where)
-            records = _zstd().decompress(packed, max_output_size=size)
+            records = zstd.decompress(packed, max_output_size=size)
         elif compression == b"lz4":
             # One byte more than is right, so that what is too long is seen.
             records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
@@ -168,7 +177,7 @@ def unpacked(compression: bytes, packed: memoryview, size: int, where: str) -> b
 
 
 def unpacked_pieces(
-    compression: bytes, packed: memoryview, size: int, where: str
+    zstd: zstandard.ZstdDecompressor, compression: bytes, packed: memoryview, size: int, where: str
 ) -> Iterator[Buffer]:
     """Yield a chunk piece by piece, and at most one piece more than its `size`.
 
@@ -181,7 +190,7 @@ def unpacked_pieces(
                 yield packed[start : start + PIECE_BYTES]
         elif compression == b"zstd":
             _check_zstd_size(packed, size, where)
-            stream = _zstd().stream_reader(packed)
+            stream = zstd.stream_reader(packed)
             while done <= size and (piece := stream.read(PIECE_BYTES)):
                 done += len(piece)
                 yield piece
@@ -201,10 +210,6 @@ def unpacked_pieces(
             raise McapDamageError(f"uses the unknown compression {compression!r}{where}")
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError):
         raise McapDamageError(f"does not decompress{where}") from None
-
-
-def _zstd() -> zstandard.ZstdDecompressor:
-    return zstandard.ZstdDecompressor(max_window_size=_MAX_ZSTD_WINDOW)
 
 
 def _check_zstd_size(packed: memoryview, size: int, where: str) -> None:

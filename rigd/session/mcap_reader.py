@@ -41,6 +41,7 @@ from rigd.session.mcap_limits import (
     prefixed,
     unpacked,
     unpacked_pieces,
+    zstd_decompressor,
 )
 from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
 
@@ -240,6 +241,7 @@ class _Reader:
         self._take = take
         self._wanted: dict[int, bool] = {}  # channel → whether its messages are
         self._allowance = Allowance()
+        self._zstd = zstd_decompressor()
         self._skipped = 0
         self._unit = 0  # of messages without chunk: first byte, and how many go into it
         self._unit_room = 0
@@ -371,7 +373,7 @@ class _Reader:
         self._allowance.unpack(size, where)
         compression = bytes(name[:20])
         if size <= PIECE_BYTES:
-            records = unpacked(compression, packed, size, where)
+            records = unpacked(self._zstd, compression, packed, size, where)
             if crc not in (0, zlib.crc32(records)):
                 raise McapDamageError(f"has a wrong checksum{where}")
             end = self._read_records(records, 0, start, where)
@@ -380,7 +382,7 @@ class _Reader:
             return
         # Too long to be held: unpacked once to be checked, and once more to be read.
         found, found_crc = 0, 0
-        for piece in unpacked_pieces(compression, packed, size, where):
+        for piece in unpacked_pieces(self._zstd, compression, packed, size, where):
             found += len(piece)
             found_crc = zlib.crc32(piece, found_crc)
             self._let_go()
@@ -388,7 +390,9 @@ class _Reader:
             raise McapDamageError(f"decompresses to a wrong size{where}")
         if crc not in (0, found_crc):
             raise McapDamageError(f"has a wrong checksum{where}")
-        self._read_pieces(unpacked_pieces(compression, packed, size, where), start, where)
+        self._read_pieces(
+            unpacked_pieces(self._zstd, compression, packed, size, where), start, where
+        )
 
     def _read_pieces(self, pieces: Iterator[Buffer], unit: int, where: str) -> None:
         """Read records that begin in one piece and end in another, and skip what is not wanted."""

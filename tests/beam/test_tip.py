@@ -28,12 +28,52 @@ def test_the_closed_form_is_the_sum_of_the_modes(damping):
         leverage = 2 * BEAM.length_m * (-1.0) ** i / z**2
         total -= leverage * float(mode_shape(i + 1, 1.0)) * inertial / (load + inertial)
     # What the modes after the fortieth add grows with the square of the frequency.
-    assert np.abs(tip_response(BEAM, damping, s) - total).max() < 1e-3
+    assert np.abs(tip_response(BEAM, damping, s)[0] - total).max() < 1e-3
+
+
+@pytest.mark.parametrize("damping", [Damping(), VI])
+def test_displacement_and_slope_solve_the_boundary_value_problem(damping):
+    s = 0.05 + 2j * np.pi * np.geomspace(0.05, 200, 100)
+    inertial = BEAM.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
+    elastic = 1 + damping.zeta * s**damping.alpha
+    found = []
+    for wave_number in (-inertial / elastic) ** 0.25:
+        roots = wave_number * np.array([1, 1j, -1, -1j])
+        # Waves that grow are told by what they are at the tip.
+        at_root = np.exp(-np.maximum(roots.real, 0) * BEAM.length_m)
+        at_tip = np.exp(roots * BEAM.length_m) * at_root
+        matrix = np.array([at_root, roots * at_root, roots**2 * at_tip, roots**3 * at_tip])
+        scale = np.abs(matrix).max(axis=1)
+        waves = np.linalg.solve(matrix / scale[:, None], np.array([0, 1, 0, 0]) / scale) * at_tip
+        found.append((waves.sum(), (roots * waves).sum()))
+    displacement, slope = tip_response(BEAM, damping, s)
+    assert displacement == pytest.approx(np.array(found)[:, 0], rel=1e-9)
+    assert slope == pytest.approx(np.array(found)[:, 1], rel=1e-9)
 
 
 def test_a_standing_angle_turns_the_tip_and_does_not_bend_it():
-    near_rest = tip_response(BEAM, Damping(), np.array([1e-3 + 0j]))[0]
-    assert near_rest == pytest.approx(BEAM.length_m, rel=1e-6)
+    displacement, slope = tip_response(BEAM, Damping(), np.array([1e-3 + 0j]))
+    assert displacement[0] == pytest.approx(BEAM.length_m, rel=1e-6)
+    assert slope[0] == pytest.approx(1, rel=1e-6)
+
+
+def test_an_angle_that_stays_where_it_ends_shakes_nothing():
+    """A slow turn to 20 mrad, held to the last sample."""
+    rate_hz = 1000.0
+    x = np.clip(np.arange(6000) / (2 * rate_hz), 0, 1)
+    angle = 0.02 * (10 * x**3 - 15 * x**4 + 6 * x**5)
+    rigid_m_s = BEAM.length_m * rate_hz * np.diff(angle).max()
+    assert tip_motion(BEAM, VI, angle, rate_hz).speed_m_s == pytest.approx(rigid_m_s, rel=0.05)
+
+
+@pytest.mark.parametrize(("frequency_hz", "slope_of_share"), [(2.5536, 1.3765), (16.003, 4.781)])
+def test_the_same_deflection_slopes_more_in_a_higher_mode(frequency_hz, slope_of_share):
+    """Of the clamped beam's modes; the tip's slope over its deflection relative to the length."""
+    t = np.arange(8000) / 1000.0
+    angle = 1e-3 * np.minimum(t, 1) * np.sin(2 * np.pi * frequency_hz * t)
+    motion = tip_motion(BEAM, VI, angle, 1000.0)
+    share = motion.deflection_m / BEAM.length_m
+    assert motion.slope_rad == pytest.approx(slope_of_share * share, rel=0.02)
 
 
 def test_the_largest_deflection_is_that_of_the_shape_as_it_happens():

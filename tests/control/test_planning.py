@@ -18,19 +18,31 @@ def test_the_papers_chirp_stays_within_the_shipped_limits(profile):
 
 
 def test_the_papers_chirp_is_no_small_deflection(profile):
-    """36 % of the length at mode 1; its tenth part is."""
+    """36 % of the length at mode 1, and 0.6 rad at mode 2; a tenth of it is."""
     plan = plan_session(profile, chirp(rate_hz=1000.0))
     tip = plan.prediction.tip
     assert tip is not None
     assert tip.deflection_m == pytest.approx(0.36 * profile.rig.beam.length_m, rel=0.01)
     assert tip.speed_m_s == pytest.approx(12.6, rel=0.01)
     assert "36 % of the length" in plan.tip_in_words
-    assert "0.27 times the amplitude stays within" in plan.tip_in_words
+    assert tip.slope_rad == pytest.approx(0.603, rel=0.01)
+    assert "0.23 times the amplitude stays within" in plan.tip_in_words
     small = plan_session(profile, chirp(rate_hz=1000.0, amplitude_rad=0.0025))
     assert small.prediction.tip is not None
     assert small.prediction.tip.deflection_m == pytest.approx(tip.deflection_m / 10, rel=1e-6)
     assert "3.6 % of the length" in small.tip_in_words
     assert "small" not in small.tip_in_words
+
+
+def test_slopes_count_and_not_the_deflection_alone(profile):
+    """Above mode 1 the tip deflects by 6 % of the length, and slopes by 0.3 rad."""
+    excitation = chirp(rate_hz=1000.0, amplitude_rad=0.0125, start_hz=8.0)
+    plan = plan_session(profile, excitation)
+    tip = plan.prediction.tip
+    assert tip is not None
+    assert tip.deflection_m < 0.08 * profile.rig.beam.length_m
+    assert tip.slope_rad > 0.25
+    assert "rad are not small" in plan.tip_in_words
 
 
 def test_ten_times_the_amplitude_saturates_and_may_be_forced(profile):

@@ -11,6 +11,7 @@ import pytest
 from rigd.beam import Beam, Damping
 from rigd.control import check_stability, close_loop
 from rigd.profile import ProfileError, load_profile
+from rigd.profile.load import profile_of
 
 
 @pytest.fixture
@@ -334,6 +335,21 @@ def test_a_pole_too_slow_for_the_motor_is_refused(refuse):
 def test_simulated_devices_need_their_section(refuse, sim_toml):
     [line] = refuse((sim_toml[sim_toml.index("[simulation]") :], ""))
     assert "[simulation] is missing" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("clamp_compliance_rad_per_nm", 0.02), ("tip_mass_kg", 1e-4), ("torque_filter_hz", 100.0)],
+)
+def test_what_is_not_simulated_beside_drag_of_the_air_is_refused(refuse, sim_toml, name, value):
+    def with_extras(**extras):
+        more = [f'{key} = {{ value = {extras[key]}, source = "assumed" }}' for key in extras]
+        return sim_toml, "\n".join([sim_toml, *more, ""])
+
+    [line] = refuse(with_extras(air_drag_m=2.3e-3, **{name: value}))
+    assert line.startswith(f"simulation.{name} and simulation.air_drag_m cannot be simulated")
+    for one in ({name: value, "air_drag_m": 0.0}, {name: 0.0, "air_drag_m": 2.3e-3}):
+        profile_of(with_extras(**one)[1], Path("a.toml"))
 
 
 def test_a_projection_of_nothing_is_refused(refuse):
