@@ -58,3 +58,12 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
     at = {m: power[m * 80 - 2 : m * 80 + 3].sum() for m in (1, 2, 3)}
     made = {m for m, value in at.items() if value > 1e-4 * max(at.values())}
     assert made == multiples
+
+
+def test_a_force_too_large_to_substitute_has_no_column(forces):
+    """Without a warning: they are errors here."""
+    _, modal = forces
+    column = modal.column(MODE_1, 1e3)
+    assert column.shape == modal.column(MODE_1).shape
+    assert np.isnan(column).all()
+    assert np.isfinite(modal.column(MODE_1)).all()
