@@ -18,7 +18,7 @@ from analysis.selection.candidate import Candidate
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted, vector
 from analysis.structures import STRUCTURES
-from analysis.whole_record.drag import DragLaw, DragResponse
+from analysis.whole_record.drag import DragError, DragLaw, DragResponse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -253,7 +253,7 @@ def _settled(
     Returns
     -------
     Refit or None
-        None if the air would have to push, or nothing settles.
+        None if the air would have to push, the drag cannot be followed, or nothing settles.
     """
     unknowns = field.unknowns(structure, uniform)
     x = adapted(unknowns, point.plant, point.structure)
@@ -262,7 +262,10 @@ def _settled(
     for _ in range(_ROUNDS):
         plant = unknowns.plant(x)
         # Without drag the beam seemed to be another, and so what the rest of the angle did.
-        comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+        try:
+            comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+        except DragError:
+            return None
         assert comparison.drag is not None
         descent = partial(Refit.descend, comparison, unknowns, x)
         columns = comparison.drag.by_law[: 1 + two]

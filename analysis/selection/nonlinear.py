@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.whole_record.decimation import fast_length
+from analysis.whole_record.response import torque_channel
 from rigd.beam import clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class ModalForces:
                         break
         beam = self._plant.beam
         share = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
-        torque = -share * k * self._p / resists * force * np.exp(-self._plant.delay_s * self._s)
+        torque = -share * k * self._p / resists * force * torque_channel(self._plant, self._s)
         in_time = np.fft.irfft(torque, self._length)[: self._samples]
         in_time *= self._growth[::_OVERSAMPLING]
         spectrum: NDArray[np.complex128] = self._comparison.spectrum(in_time[self._comparison.kept])

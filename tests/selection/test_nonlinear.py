@@ -67,3 +67,11 @@ def test_a_force_too_large_to_substitute_has_no_column(forces):
     assert column.shape == modal.column(MODE_1).shape
     assert np.isnan(column).all()
     assert np.isfinite(modal.column(MODE_1)).all()
+
+
+def test_a_filter_of_the_torque_filters_the_column(forces, plants, link):
+    comparison, modal = forces
+    plant = Plant(link, plants["III"], filter_time_constant_s=3e-3)
+    filtered = ModalForces(comparison, plant).column(MODE_1)
+    divisor = 1 + 2j * np.pi * comparison.frequency_hz * 3e-3
+    assert deviation(filtered, modal.column(MODE_1) / divisor) < 1e-3
