@@ -170,12 +170,33 @@ class Field:
         within : float
             By how much the BIC may be above the lowest.
         """
-        lowest = min(candidate.bic for candidate in self.candidates)
         best: dict[Kind, Candidate] = {}
-        for candidate in sorted(self.candidates, key=lambda candidate: candidate.bic):
-            if candidate.bic < lowest + within:
-                best.setdefault(candidate.kind, candidate)
-        return tuple(each for kind, each in best.items() if kind != self.freest.kind)
+        for candidate in self.of_other_kinds(within):
+            best.setdefault(candidate.kind, candidate)
+        return tuple(best.values())
+
+    def of_other_kinds(self, within: float) -> tuple[Candidate, ...]:
+        """Return all candidates on other kinds of rig that explain the record as well.
+
+        A rig with nothing beside the beam is none of them where the freest structure has more: with
+        the same orders free that was far better. A simpler structure without it may yet have a low
+        BIC, for it saves on orders what it loses by the rig.
+
+        Parameters
+        ----------
+        within : float
+            By how much the BIC may be above the lowest.
+
+        Returns
+        -------
+        tuple of Candidate
+            The lowest BIC first.
+        """
+        beaten = {_PLAIN, self.freest.kind}
+        ranked = _ranked(self.candidates)
+        return tuple(
+            each for each in ranked if each.kind not in beaten and each.bic < ranked[0].bic + within
+        )
 
     @property
     def likeliest(self) -> RecordFit:
