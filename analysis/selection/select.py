@@ -31,12 +31,13 @@ if TYPE_CHECKING:
 
     from analysis.selection.along_time import Change
     from analysis.selection.candidate import Candidate
+    from analysis.selection.finding import Finding
     from analysis.whole_record import Measurement, RecordFit, Setting
 
 _CLIPPED: Final = "the torque is clipped"
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
-_FIRST: Final = ("sign", "unit")
-"""What makes every number wrong is said before any."""
+_OF_CHANNELS: Final = frozenset({"sign", "unit", "clipping", "stop"})
+"""Seen without a model: all that is said where the channels are misread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +118,14 @@ def select(
         band_hz,
     )
     explained = white.white and not related.related
-    followed = any(multiple.present for multiple in multiples)
-    beside = findings(told, forces, multiples, visible)
-    kinds = {finding.kind for finding in beside}
+    found = findings(told, forces, multiples, visible)
+    kinds = {finding.kind for finding in found}
     wrong = (
-        MISREAD if kinds & _MISREAD_KINDS else UNEXPLAINED if followed or not explained else None
+        MISREAD
+        if kinds & _MISREAD_KINDS
+        else UNEXPLAINED
+        if "harmonics" in kinds or not explained
+        else None
     )
     doubt = wrong or _doubt(changes, clipped="clipping" in kinds)
     orders = (
@@ -129,22 +133,24 @@ def select(
         order_verdict(field, of_lambda, visible, doubt=doubt),
     )
     close = rivals(field, EVEN)
-    along = tuple(changing(changes))
-    if doubt is not None:
-        # Harmonics are in what remains; where nothing else is, that is what they are.
-        beside = tuple(
-            each if each.kind == "harmonics" and explained else doubted(each, doubt)
-            for each in beside
-        )
-    if wrong is not None:
-        along = tuple(doubted(each, wrong) for each in along)
-    found = (*beside, *along)
-    if not explained:
-        found = (*found, unexplained(white, related, fit.modes))
+    if misread:
+        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    else:
+        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        if not explained:
+            found = (*found, unexplained(white, related, fit.modes))
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
     best = field.best
+    of_numbers = sentences.of_headline(
+        numbers, orders, alone=doubt is None and not field.other_kinds(STRONG)
+    )
+    advice = (
+        dict.fromkeys(each.remedy for each in found if each.remedy)
+        if misread
+        else experiments(field, orders, visible, found, close)
+    )
     return Selection(
         candidates=field.candidates,
         headline=numbers,
@@ -165,13 +171,10 @@ def select(
             input_relation=related,
             harmonics=multiples,
             sentences=(
-                *(each.sentence for each in found if each.kind in _FIRST),
-                *sentences.of_headline(
-                    numbers, orders, alone=doubt is None and not field.other_kinds(STRONG)
-                ),
-                *(each.sentence for each in found if each.kind not in _FIRST),
+                *(() if misread else of_numbers),
+                *(each.sentence for each in found),
             ),
-            experiments=tuple(experiments(field, orders, visible, found, close)),
+            experiments=tuple(advice),
             damping_with_amplitude=damping_with_amplitude(told),
         ),
     )
@@ -184,6 +187,35 @@ def _doubt(changes: tuple[Change, ...], *, clipped: bool) -> str | None:
     if len(changes) == 1 and changes[0].certain:
         return None
     return next((f"{change.name} would explain the record as well" for change in changes), None)
+
+
+def _as_sure(
+    beside: tuple[Finding, ...],
+    along: tuple[Finding, ...],
+    wrong: str | None,
+    doubt: str | None,
+    *,
+    explained: bool,
+) -> tuple[Finding, ...]:
+    """Tell as facts only what is sure.
+
+    Parameters
+    ----------
+    beside, along : tuple of Finding
+        Beside the beam, and what changes along the record, which says itself how sure it is.
+    wrong, doubt : str or None
+        Why the model is not to be believed, and why no number of it.
+    explained : bool
+        Whether harmonics are all that remains: then they are what they seem to be.
+    """
+    if doubt is not None:
+        beside = tuple(
+            each if each.kind == "harmonics" and explained else doubted(each, doubt)
+            for each in beside
+        )
+    if wrong is not None:
+        along = tuple(doubted(each, wrong) for each in along)
+    return (*beside, *along)
 
 
 def _analysis(field: Field) -> RecordAnalysis:
