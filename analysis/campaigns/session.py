@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from rigd.beam import Beam
 
 
+_MISREAD: Final = ("sign", "unit")
+"""Findings beside which no number is the specimen's."""
+
 _NO_RESPONSE: Final = FrequencyResponse(
     np.zeros(0), np.zeros(0, dtype=np.complex128), coherence=None, segments=0, estimator="h1"
 )
@@ -166,6 +169,8 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
     if task.structures:
         try:
             estimates, verdict, headline = _whole_record(record, task, measured)
+            if wrong := next((f.sentence for f in verdict.findings if f.kind in _MISREAD), None):
+                return SessionFailure(path, f"{path}: {wrong}", experiment)
         except failures as error:
             if welch is None:
                 return SessionFailure(path, str(error), experiment)

@@ -96,32 +96,39 @@ class Field:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> Field:
-        """Fit every structure.
+        """Fit every structure; the freest alone where a sign or a unit is wrong.
 
         Raises
         ------
         MeasurementError
             The record cannot be used.
         """
-        uniform = fit_record(measurement, fixed=fixed, band_hz=band_hz)
-        comparison = uniform.comparison
-        field = cls(
-            comparison=comparison,
-            noise=_noise(uniform, comparison),
-            free=tuple(name for name in SETTINGS if name not in fixed),
-            candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
-            columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
-        )._without_leakage()
-        if any(wrong_scale(comparison)):
-            return field.cross_checked()  # no beam explains such a record
+        if any(wrong_scale(Comparison.of(measurement, band_hz))):
+            # No beam explains such a record: one structure shows what remains as well as all.
+            found = fit_record(measurement, (_FREEST,), fixed=fixed, band_hz=band_hz)
+            return cls._uniform(found, fixed)
+        field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
+        field = field._without_leakage()
         likeliest = field.likeliest
-        if len(visible_modes(comparison, field.noise, likeliest)) > 1:
+        if len(visible_modes(field.comparison, field.noise, likeliest)) > 1:
             field = (
                 field._with_modes_free(likeliest)
                 if _all_but_white(field, likeliest)
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
         return with_extras(field.cross_checked())
+
+    @classmethod
+    def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> Field:
+        """Take over what was fitted with a uniform beam."""
+        comparison = uniform.comparison
+        return cls(
+            comparison=comparison,
+            noise=_noise(uniform, comparison),
+            free=tuple(name for name in SETTINGS if name not in fixed),
+            candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
+            columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
+        )
 
     @property
     def best(self) -> Candidate:
@@ -170,12 +177,33 @@ class Field:
         within : float
             By how much the BIC may be above the lowest.
         """
-        lowest = min(candidate.bic for candidate in self.candidates)
         best: dict[Kind, Candidate] = {}
-        for candidate in sorted(self.candidates, key=lambda candidate: candidate.bic):
-            if candidate.bic < lowest + within:
-                best.setdefault(candidate.kind, candidate)
-        return tuple(each for kind, each in best.items() if kind != self.freest.kind)
+        for candidate in self.of_other_kinds(within):
+            best.setdefault(candidate.kind, candidate)
+        return tuple(best.values())
+
+    def of_other_kinds(self, within: float) -> tuple[Candidate, ...]:
+        """Return all candidates on other kinds of rig that explain the record as well.
+
+        A rig with nothing beside the beam is none of them where the freest structure has more: with
+        the same orders free that was far better. A simpler structure without it may yet have a low
+        BIC, for it saves on orders what it loses by the rig.
+
+        Parameters
+        ----------
+        within : float
+            By how much the BIC may be above the lowest.
+
+        Returns
+        -------
+        tuple of Candidate
+            The lowest BIC first.
+        """
+        beaten = {_PLAIN, self.freest.kind}
+        ranked = _ranked(self.candidates)
+        return tuple(
+            each for each in ranked if each.kind not in beaten and each.bic < ranked[0].bic + within
+        )
 
     @property
     def likeliest(self) -> RecordFit:

@@ -18,7 +18,7 @@ from analysis.selection.candidate import Candidate
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted, vector
 from analysis.structures import STRUCTURES
-from analysis.whole_record.drag import DragLaw, DragResponse
+from analysis.whole_record.drag import DragError, DragLaw, DragResponse
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -116,7 +116,9 @@ def with_air_drag(field: Field) -> Field:
     """
     if not _promising(field):
         return field
-    lead = next((c for c in field.candidates if c.uniform and c.structure.name == _LEAD), None)
+    lead = next(
+        (c for c in _without_extras(field) if c.uniform and c.structure.name == _LEAD), None
+    )
     start = None if lead is None else _start(field, lead)
     if start is None:
         return field
@@ -134,16 +136,23 @@ def with_air_drag(field: Field) -> Field:
     return found if found.bic < field.bic else field
 
 
+def _without_extras(field: Field) -> tuple[Candidate, ...]:
+    """Candidates beside which drag may stand.
+
+    What has extras is compared with those, and goes with the drag: drag is computed for a bare beam
+    on a rigid clamp, and it shifts modes as extras do.
+    """
+    return tuple(candidate for candidate in field.candidates if not candidate.extras)
+
+
 def _promising(field: Field) -> bool:
     """Whether some structure with drag could be better than the best without."""
     best = field.best
-    for candidate in field.candidates:
+    for candidate in _without_extras(field):
         if candidate is not best and candidate.structure.name not in _SCORED:
             continue
-        unknowns, plant = (
-            field.unknowns(candidate.structure, candidate.uniform),
-            candidate.fit.plant,
-        )
+        unknowns = field.unknowns(candidate.structure, candidate.uniform)
+        plant = candidate.fit.plant
         beside = Refit.descend(
             field.comparison,
             unknowns,
@@ -212,15 +221,10 @@ def _start(field: Field, lead: Candidate) -> _Point | None:
     """First order of the drag beside a fit without it; None if the air would have to push."""
     plant, structure = lead.fit.plant, lead.structure
     columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
+    unknowns = field.unknowns(structure, lead.uniform)
+    here = vector(unknowns, plant)
     size, *_ = _last_amplitude(
-        Refit.descend(
-            field.comparison,
-            field.unknowns(structure, lead.uniform),
-            vector(field.unknowns(structure, lead.uniform), plant),
-            field.noise,
-            columns,
-            max_evaluations=1,
-        )
+        Refit.descend(field.comparison, unknowns, here, field.noise, columns, max_evaluations=1)
     )
     return _Point(plant, structure, DragLaw(size), field.noise) if size > 0 else None
 
@@ -249,7 +253,7 @@ def _settled(
     Returns
     -------
     Refit or None
-        None if the air would have to push, or nothing settles.
+        None if the air would have to push, the drag cannot be followed, or nothing settles.
     """
     unknowns = field.unknowns(structure, uniform)
     x = adapted(unknowns, point.plant, point.structure)
@@ -258,7 +262,10 @@ def _settled(
     for _ in range(_ROUNDS):
         plant = unknowns.plant(x)
         # Without drag the beam seemed to be another, and so what the rest of the angle did.
-        comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+        try:
+            comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+        except DragError:
+            return None
         assert comparison.drag is not None
         descent = partial(Refit.descend, comparison, unknowns, x)
         columns = comparison.drag.by_law[: 1 + two]
@@ -296,7 +303,7 @@ def _law_at(refit: Refit) -> DragLaw:
 
 
 def _all(field: Field, settled: Refit) -> Field:
-    """Fit all candidates with the drag settled in one, and say how large it is."""
+    """Fit all candidates without extras with the drag settled in one, and say how large it is."""
     other = replace(
         field,
         comparison=settled.objective.comparison,
@@ -305,7 +312,7 @@ def _all(field: Field, settled: Refit) -> Field:
     )
     of, plant = settled.objective.unknowns.structure, settled.plant
     candidates = []
-    for before in field.candidates:
+    for before in _without_extras(field):
         unknowns = other.unknowns(before.structure, before.uniform)
         refit = other.descent(unknowns, adapted(unknowns, plant, of), _MANY)
         candidates.append(
@@ -320,7 +327,7 @@ def _estimate(field: Field) -> DragEstimate:
     """Drag with its deviation, beside all the damping that the best beam may have."""
     best = field.best
     freest = max(
-        (c for c in field.candidates if c.uniform == best.uniform),
+        (c for c in field.candidates if c.kind == best.kind),
         key=lambda c: (len(c.structure.free), -c.bic),
     )
     refit = field.refit(freest.structure, freest.uniform, freest.fit.plant)

@@ -8,7 +8,7 @@ something.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -55,51 +55,6 @@ _QUIETER: Final = 0.98
 
 _DOUBTFUL: Final = 0.01
 """Probability of a residual's shape by chance, below which a search starts from several sizes."""
-
-
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """The best candidate of one kind of rig.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    behind : float
-        Its BIC above the lowest of all.
-    """
-
-    candidate: Candidate
-    behind: float
-
-    @property
-    def kind(self) -> str:
-        """One of `EXTRAS`, "modes free", or "" for the uniform beam and nothing beside it."""
-        return _kind(self.candidate)
-
-
-def explanations(field: Field, within: float) -> tuple[Explanation, ...]:
-    """Kinds of rig whose best candidate has a BIC less than so much above the lowest.
-
-    Parameters
-    ----------
-    field : Field
-    within : float
-
-    Returns
-    -------
-    tuple of Explanation
-        The best first.
-    """
-    best: dict[str, Explanation] = {}
-    for candidate in field.candidates:
-        behind = candidate.bic - field.best.bic
-        if behind < within:
-            best.setdefault(_kind(candidate), Explanation(candidate, behind))
-    return tuple(best.values())
-
-
-def _kind(candidate: Candidate) -> str:
-    return "".join(candidate.extras) or ("" if candidate.uniform else "modes free")
 
 
 def with_extras(field: Field) -> Field:

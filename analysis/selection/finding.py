@@ -70,12 +70,14 @@ SEEN: Final[frozenset[Kind]] = frozenset(
 _INTERVAL: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
 
 
-def doubted(finding: Finding) -> Finding:
-    """Tell as no fact what was found beside a model that does not explain the record.
+def doubted(finding: Finding, because: str) -> Finding:
+    """Tell as no fact what was found beside a model that is not to be believed.
 
     Parameters
     ----------
     finding : Finding
+    because : str
+        Why it is not.
 
     Returns
     -------
@@ -86,7 +88,7 @@ def doubted(finding: Finding) -> Finding:
     --------
     >>> delay = Finding("delay", "The torque comes 1 ms later (0.9 to 1.1 ms; 95 %).",
     ...                 1e-3, (9e-4, 1.1e-3), "s", "")
-    >>> doubted(delay).sentence
+    >>> doubted(delay, "part of the record is unexplained").sentence
     'No fact while part of the record is unexplained: the torque comes 1 ms later.'
     """
     if finding.kind in SEEN:
@@ -96,6 +98,6 @@ def doubted(finding: Finding) -> Finding:
         bare = bare[0].lower() + bare[1:]
     return replace(
         finding,
-        sentence=f"No fact while part of the record is unexplained: {bare}",
+        sentence=f"No fact while {because}: {bare}",
         interval=None,
     )

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 _NORMAL_95: Final = 1.959963984540054
 _COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
-_UNEXPLAINED: Final = "part of the record is unexplained"
+UNEXPLAINED: Final = "part of the record is unexplained"
+MISREAD: Final = "the record and its file do not fit each other"
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 _NOT_DETERMINED: Final = "the record does not determine it"
 _AT_EDGE: Final = "at the edge of what is searched"
@@ -206,7 +207,7 @@ def headline(
     orders: tuple[OrderVerdict, OrderVerdict],
     visible: tuple[int, ...],
     *,
-    adequate: bool,
+    unexplained: str | None,
 ) -> Headline:
     """Put together what is told first.
 
@@ -217,11 +218,11 @@ def headline(
         Alpha's and lambda's, judged in the freest structure.
     visible : tuple of int
         Modes that the record shows.
-    adequate : bool
-        Whether that structure leaves nothing but noise.
+    unexplained : str or None
+        Why nothing is to be believed; None if that structure leaves nothing but noise.
     """
     freest = field.freest
-    unexplained = None if adequate else _UNEXPLAINED
+    fractional = frozenset(each.order for each in orders if each.status == "fractional")
     reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
     }
@@ -235,12 +236,12 @@ def headline(
         drag = field.drag
         at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
         told = replace(told, parameters={**told.parameters, "drag": at})
-    simpler = _simpler(field) if adequate else None
+    simpler = _simpler(field, fractional) if unexplained is None else None
     for other in field.other_kinds(STRONG):
         told = _doubted_by(told, other)
     if len(visible) < _MODES_TO_TELL_DAMPINGS:
         told = replace(told, sizes=tuple(_flagged(each, ONE_MODE) for each in told.sizes))
-    return replace(told, structures=structures(field), simpler=simpler)
+    return replace(told, structures=structures(field, fractional), simpler=simpler)
 
 
 def of_fit(
@@ -294,23 +295,26 @@ def of_fit(
     )
 
 
-def structures(field: Field) -> tuple[tuple[str, StructureStatus], ...]:
+def structures(field: Field, fractional: frozenset[str]) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures a record excludes, and which would do.
 
     A special case of the freest structure on the same beam is excluded by the likelihood ratio;
     whatever is no special case of it, where its likelihood is as much lower, and its BIC is higher
     than the lowest by 10. One that explains the record with more than it takes is not excluded.
+    What fixes an order at 1 that the record excludes is excluded with it.
 
     Parameters
     ----------
     field : Field
         With the candidates ranked.
+    fractional : frozenset of str
+        Orders of which 1 is excluded.
     """
+    return tuple((each.name, _status(field, each, fractional)) for each in field.candidates)
+
+
+def _status(field: Field, candidate: Candidate, fractional: frozenset[str]) -> StructureStatus:
     freest = field.freest
-    return tuple((each.name, _status(field, each, freest)) for each in field.candidates)
-
-
-def _status(field: Field, candidate: Candidate, freest: Candidate) -> StructureStatus:
     if candidate is freest:
         return "selected"
     simpler = set(candidate.structure.free) < set(freest.structure.free)
@@ -318,12 +322,17 @@ def _status(field: Field, candidate: Candidate, freest: Candidate) -> StructureS
         behind = candidate.deviance - freest.deviance > EXCLUDED[0]
         worse = candidate.bic > field.best.bic + STRONG
         return "excluded" if behind and worse else "compatible"
+    if any(
+        candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
+        for order in fractional
+    ):
+        return "excluded"
     lacks = freest.parameters - candidate.parameters
     limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
-def _simpler(field: Field) -> Simpler | None:
+def _simpler(field: Field, fractional: frozenset[str]) -> Simpler | None:
     """Find the simplest structure that would do: of those compatible on the same beam."""
     freest = field.freest
     would_do = [
@@ -331,7 +340,7 @@ def _simpler(field: Field) -> Simpler | None:
         for each in field.candidates
         if each.kind == freest.kind
         and each.parameters < freest.parameters
-        and _status(field, each, freest) == "compatible"
+        and _status(field, each, fractional) == "compatible"
     ]
     if not would_do:
         return None

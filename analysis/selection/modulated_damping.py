@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.whole_record.decimation import fast_length
-from analysis.whole_record.response import eigenvalues
+from analysis.whole_record.response import eigenvalues, torque_channel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,7 +53,7 @@ def late_damping(
     internal = damping.zeta * s**damping.alpha
     external = damping.gamma * s**damping.lambda_
     inertial = beam.density_over_stiffness * s * s + external
-    angle = np.fft.rfft(comparison.angle_rad / growth, length) * np.exp(-plant.delay_s * s)
+    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
     total = np.zeros(n)
 
     def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.whole_record.decimation import fast_length
+from analysis.whole_record.response import torque_channel
 from rigd.beam import clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:
@@ -81,6 +82,8 @@ class ModalForces:
     def column(self, term: Term, size: float = 0.0) -> NDArray[np.complex128]:
         """Spectrum, shape (K,), of the torque by a force, divided by its `size`.
 
+        Not finite where the repeated substitution leads nowhere: so large a force is not known.
+
         Parameters
         ----------
         term : Term
@@ -94,16 +97,19 @@ class ModalForces:
         linear = -self._p / resists * np.fft.rfft(decayed, self._length)
         force = self._force(term.kind, linear, linear)
         if size:
-            for _ in range(_SUBSTITUTIONS):
-                moved = linear - size * k / resists * force
-                again = self._force(term.kind, moved, linear)
-                change = np.linalg.norm(again - force)
-                force = again
-                if change < _CONVERGED * np.linalg.norm(force):
-                    break
+            follows = -size * k / resists
+            with np.errstate(over="ignore", invalid="ignore"):
+                for _ in range(_SUBSTITUTIONS):
+                    again = self._force(term.kind, linear + follows * force, linear)
+                    change, most = np.linalg.norm(again - force), np.linalg.norm(again)
+                    force = again
+                    if not np.isfinite(most):
+                        return np.full(self._comparison.frequency_hz.size, np.nan + 0j)
+                    if change < _CONVERGED * most:
+                        break
         beam = self._plant.beam
         share = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
-        torque = -share * k * self._p / resists * force * np.exp(-self._plant.delay_s * self._s)
+        torque = -share * k * self._p / resists * force * torque_channel(self._plant, self._s)
         in_time = np.fft.irfft(torque, self._length)[: self._samples]
         in_time *= self._growth[::_OVERSAMPLING]
         spectrum: NDArray[np.complex128] = self._comparison.spectrum(in_time[self._comparison.kept])

@@ -113,11 +113,11 @@ def _added(
         behind = _gain(best, cost, best.fit.cost)
         if term is None or _gain(best, here.cost, cost) < _GAIN or behind > _HOPELESS:
             break
-        tried, more, more_std = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
-        if _gain(best, here.cost, tried.cost) < _GAIN:
+        tried = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
+        if tried is None or _gain(best, here.cost, tried[0].cost) < _GAIN:
             break
         terms.append(term)
-        here, sizes, std = tried, more, more_std
+        here, sizes, std = tried
     if not terms:
         return field, ()
     every = field.with_columns(here.columns, here.noise_here())
@@ -167,12 +167,17 @@ def _projection(
 
 def _with_terms(
     field: Field, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
-) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]]:
-    """Fit with the columns of these terms, at the sizes that they turn out to have."""
+) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
+    """Fit with the columns of these terms, at the sizes that they turn out to have.
+
+    None if these are larger than the columns are known for.
+    """
     std = np.zeros(sizes.size)
     for _ in range(_ROUNDS):
         forces = ModalForces(field.comparison, refit.plant)
         of_terms = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
+        if not np.isfinite(of_terms).all():
+            return None
         columns = np.concatenate([field.columns, of_terms])
         refit = Refit.descend(
             field.comparison, refit.objective.unknowns, refit.x, field.noise, columns

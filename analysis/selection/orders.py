@@ -57,7 +57,7 @@ class OrderVerdict:
 
 
 def order_verdict(
-    field: Field, profile: Profile, visible: tuple[int, ...], *, adequate: bool
+    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
 ) -> OrderVerdict:
     """Judge one order.
 
@@ -68,10 +68,10 @@ def order_verdict(
         Of the order, in the freest structure on the beam selected.
     visible : tuple of int
         Modes that the record shows.
-    adequate : bool
-        Whether that structure leaves nothing but noise.
+    doubt : str or None
+        Why nothing that rests on that structure is to be believed; None: it may be.
     """
-    status, reason = _judged(field, profile, visible, adequate=adequate)
+    status, reason = _judged(field, profile, visible, doubt=doubt)
     known = status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
@@ -84,7 +84,7 @@ def order_verdict(
 
 
 def _judged(
-    field: Field, profile: Profile, visible: tuple[int, ...], *, adequate: bool
+    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
     coefficient = "zeta" if order == "alpha" else "gamma"
@@ -95,10 +95,13 @@ def _judged(
         return "not identifiable", untold
     if not profile.identifiable:
         return "not identifiable", "the record does not tell the order"
-    if not adequate:
-        return "open", "part of the record is unexplained"
-    if any(_integer(rival, order) for rival in rivals(field, STRONG) if rival.kind != freest.kind):
-        return "open", "order 1 on another kind of beam explains the record about as well"
+    if doubt is not None:
+        return "open", doubt
+    for rival in field.of_other_kinds(STRONG):
+        if _integer(rival, order):
+            return "open", "order 1 on another kind of rig explains the record about as well"
+        if _elsewhere(rival, profile):
+            return "open", "another order on another kind of rig explains the record about as well"
     if profile.admits_one:
         return "compatible", None
     return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
@@ -137,6 +140,14 @@ def deviance_of_one(profile: Profile) -> float:
 def _integer(candidate: Candidate, order: Order) -> bool:
     """Whether a structure has this damping with an order of 1."""
     return candidate.structure.fixed.get(order) == 1.0
+
+
+def _elsewhere(candidate: Candidate, profile: Profile) -> bool:
+    """Whether a candidate with this damping has its order where the profile excludes it."""
+    low, high = profile.interval
+    coefficient = "zeta" if profile.order == "alpha" else "gamma"
+    here = low <= candidate.fit.parameters[profile.order] <= high
+    return coefficient in candidate.structure.free and not here
 
 
 def rivals(field: Field, within: float) -> tuple[Candidate, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.selection.extras import explanations
 from analysis.selection.finding import Finding
 from analysis.selection.orders import STRONG
 
@@ -22,28 +21,22 @@ _MODES_FREE: Final = "modes free"
 def of_rig(field: Field) -> Iterator[Finding]:
     """Find what shifts the modes, or the torque against the angle, as nothing uniform does.
 
-    What explains the record equally well is named in one sentence, without intervals.
+    Kinds of rig are compared as `Field.freest` does it: with every order free. What explains the
+    record equally well is named in one sentence, without intervals.
     """
-    close = explanations(field, STRONG)
-    kinds = [each.kind for each in close]
-    if not kinds[0]:
-        yield from _beside_a_uniform_beam(field)
+    freest = field.freest
+    others = field.other_kinds(STRONG)
+    if not _beside(freest):
+        yield from _beside_a_uniform_beam(others)
         return
-    if len(close) == 1:
-        yield _alone(close[0].candidate, kinds[0])
+    if not others:
+        yield _alone(freest)
         return
-    named = [_about(each.candidate, each.kind) for each in close if each.kind]
-    unsure = (
-        f", or chance (without it BIC is only {close[kinds.index('')].behind:.1f} higher)"
-        if "" in kinds
-        else ""
-    )
-    equally = " equally well" if len(named) > 1 else ""
     yield Finding(
         kind="rival explanations",
         sentence=(
             "The record is not that of a uniform beam on a rigid clamp with ideal channels; it is "
-            f"explained{equally} by {' or by '.join(named)}{unsure}."
+            f"explained equally well by {' or by '.join(map(_about, (freest, *others)))}."
         ),
         value=None,
         interval=None,
@@ -55,15 +48,16 @@ def of_rig(field: Field) -> Iterator[Finding]:
     )
 
 
-def _beside_a_uniform_beam(field: Field) -> Iterator[Finding]:
+def _beside(candidate: Candidate) -> str:
+    """One of the extras, "modes free", or "" for a uniform beam and nothing beside it."""
+    return "".join(candidate.extras) or ("" if candidate.uniform else _MODES_FREE)
+
+
+def _beside_a_uniform_beam(others: tuple[Candidate, ...]) -> Iterator[Finding]:
     """Name what explains the record as well as a uniform beam with its orders free does."""
-    others = field.other_kinds(STRONG)
     if not others:
         return
-    named = [
-        f"{_about(each, ''.join(each.extras) or _MODES_FREE)} (type {each.structure.name})"
-        for each in others
-    ]
+    named = [f"{_about(each)} (type {each.structure.name})" for each in others]
     yield Finding(
         kind="rival explanations",
         sentence=(
@@ -77,8 +71,9 @@ def _beside_a_uniform_beam(field: Field) -> Iterator[Finding]:
     )
 
 
-def _alone(candidate: Candidate, kind: str) -> Finding:
+def _alone(candidate: Candidate) -> Finding:
     """Name what alone explains the record."""
+    kind = _beside(candidate)
     if kind == _MODES_FREE:
         return _not_uniform(candidate)
     value = candidate.fit.parameters[kind]
@@ -86,8 +81,9 @@ def _alone(candidate: Candidate, kind: str) -> Finding:
     return _SAY[kind](value, interval)
 
 
-def _about(candidate: Candidate, kind: str) -> str:
+def _about(candidate: Candidate) -> str:
     """Name one of several explanations, with its size."""
+    kind = _beside(candidate)
     if kind == _MODES_FREE:
         return "modes that each have a stiffness of their own"
     value = candidate.fit.parameters[kind]

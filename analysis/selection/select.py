@@ -14,9 +14,9 @@ from analysis.selection.experiments import experiments
 from analysis.selection.finding import doubted
 from analysis.selection.findings import findings, unexplained
 from analysis.selection.harmonics import harmonics, in_time
-from analysis.selection.headline import Headline, headline
+from analysis.selection.headline import MISREAD, UNEXPLAINED, Headline, headline
 from analysis.selection.nonlinear_search import nonlinear_forces
-from analysis.selection.orders import EVEN, order_verdict, rivals, untold_reason
+from analysis.selection.orders import EVEN, STRONG, order_verdict, rivals, untold_reason
 from analysis.selection.profile import Profile
 from analysis.selection.profiles import profiled
 from analysis.selection.scale import wrong_scale
@@ -29,11 +29,15 @@ from analysis.whole_record.estimate import BAND_HZ
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from analysis.selection.along_time import Change
     from analysis.selection.candidate import Candidate
+    from analysis.selection.finding import Finding
     from analysis.whole_record import Measurement, RecordFit, Setting
 
-_FIRST: Final = ("sign", "unit")
-"""What makes every number wrong is said before any."""
+_CLIPPED: Final = "the torque is clipped"
+_MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
+_OF_CHANNELS: Final = frozenset({"sign", "unit", "clipping", "stop"})
+"""Seen without a model: all that is said where the channels are misread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,20 +118,39 @@ def select(
         band_hz,
     )
     explained = white.white and not related.related
-    adequate = explained and not any(h.present for h in multiples)
+    found = findings(told, forces, multiples, visible)
+    kinds = {finding.kind for finding in found}
+    wrong = (
+        MISREAD
+        if kinds & _MISREAD_KINDS
+        else UNEXPLAINED
+        if "harmonics" in kinds or not explained
+        else None
+    )
+    doubt = wrong or _doubt(changes, clipped="clipping" in kinds)
     orders = (
-        order_verdict(field, of_alpha, visible, adequate=adequate),
-        order_verdict(field, of_lambda, visible, adequate=adequate),
+        order_verdict(field, of_alpha, visible, doubt=doubt),
+        order_verdict(field, of_lambda, visible, doubt=doubt),
     )
     close = rivals(field, EVEN)
-    found = (*findings(told, forces, multiples, visible), *changing(changes))
-    if not explained:
-        found = (*map(doubted, found), unexplained(white, related, fit.modes))
-    numbers = headline(field, orders, visible, adequate=adequate)
-    for change in changes:
-        if not (change.certain and len(changes) == 1):
-            numbers = numbers.doubted(f"{change.name} would explain the record as well")
+    if misread:
+        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    else:
+        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        if not explained:
+            found = (*found, unexplained(white, related, fit.modes))
+    numbers = headline(field, orders, visible, unexplained=wrong)
+    if doubt is not None:
+        numbers = numbers.doubted(doubt)
     best = field.best
+    of_numbers = sentences.of_headline(
+        numbers, orders, alone=doubt is None and not field.other_kinds(STRONG)
+    )
+    advice = (
+        dict.fromkeys(each.remedy for each in found if each.remedy)
+        if misread
+        else experiments(field, orders, visible, found, close)
+    )
     return Selection(
         candidates=field.candidates,
         headline=numbers,
@@ -138,7 +161,7 @@ def select(
             uniform=best.uniform,
             rivals=tuple(c.name for c in close),
             parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
-            adequate=adequate,
+            adequate=wrong is None,
             alpha=orders[0],
             lambda_=orders[1],
             visible_modes=visible,
@@ -148,14 +171,51 @@ def select(
             input_relation=related,
             harmonics=multiples,
             sentences=(
-                *(each.sentence for each in found if each.kind in _FIRST),
-                *sentences.of_headline(numbers, orders, adequate=adequate),
-                *(each.sentence for each in found if each.kind not in _FIRST),
+                *(() if misread else of_numbers),
+                *(each.sentence for each in found),
             ),
-            experiments=tuple(experiments(field, orders, visible, found, close)),
+            experiments=tuple(advice),
             damping_with_amplitude=damping_with_amplitude(told),
         ),
     )
+
+
+def _doubt(changes: tuple[Change, ...], *, clipped: bool) -> str | None:
+    """Say why no number is to be believed though all of the record is explained; None: it may."""
+    if clipped:
+        return _CLIPPED
+    if len(changes) == 1 and changes[0].certain:
+        return None
+    return next((f"{change.name} would explain the record as well" for change in changes), None)
+
+
+def _as_sure(
+    beside: tuple[Finding, ...],
+    along: tuple[Finding, ...],
+    wrong: str | None,
+    doubt: str | None,
+    *,
+    explained: bool,
+) -> tuple[Finding, ...]:
+    """Tell as facts only what is sure.
+
+    Parameters
+    ----------
+    beside, along : tuple of Finding
+        Beside the beam, and what changes along the record, which says itself how sure it is.
+    wrong, doubt : str or None
+        Why the model is not to be believed, and why no number of it.
+    explained : bool
+        Whether harmonics are all that remains: then they are what they seem to be.
+    """
+    if doubt is not None:
+        beside = tuple(
+            each if each.kind == "harmonics" and explained else doubted(each, doubt)
+            for each in beside
+        )
+    if wrong is not None:
+        along = tuple(doubted(each, wrong) for each in along)
+    return (*beside, *along)
 
 
 def _analysis(field: Field) -> RecordAnalysis:

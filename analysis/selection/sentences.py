@@ -27,7 +27,7 @@ _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external
 
 
 def of_headline(
-    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, adequate: bool
+    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
 ) -> list[str]:
     """Say what the beam does, what is excluded, and what would do.
 
@@ -36,8 +36,8 @@ def of_headline(
     told : Headline
     orders : tuple of OrderVerdict
         Alpha's and lambda's.
-    adequate : bool
-        Whether nothing but noise remains.
+    alone : bool
+        Whether nothing else explains the record as well.
     """
     free = told.fit.structure
     kind = told.name.partition(", ")[2]
@@ -52,13 +52,17 @@ def of_headline(
             "free."
         ]
         excluded = told.with_status("excluded")
-        if adequate and excluded:
+        if told.explained and excluded:
             said.append(f"Excluded: {_types(excluded)}.")
         if told.simpler is not None and told.simpler.fixed:
             said.append(_condition(told.simpler))
     said += [order(each) for each in orders]
-    if adequate:
-        said.append("What it leaves is noise: nothing in the record asks for more.")
+    if told.explained:
+        said.append(
+            "What it leaves is noise: nothing in the record asks for more."
+            if alone
+            else "What it leaves is noise, but something else explains the record as well."
+        )
     return said
 
 

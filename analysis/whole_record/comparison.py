@@ -258,6 +258,11 @@ class Comparison:
         plant : Plant
             The beam whose drag it is.
         law : DragLaw
+
+        Raises
+        ------
+        DragError
+            The drag is too large to be followed.
         """
         # All that moves is braked, whether or not it followed a reference.
         moved_rad = self.angle_rad + self.rest_rad

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.whole_record.decimation import fast_length
-from analysis.whole_record.response import FIRST_OFFSET, eigenvalues
+from analysis.whole_record.response import FIRST_OFFSET, eigenvalues, torque_channel
 from rigd.beam.air_drag import AIR_DENSITY_KG_PER_M3, DragGrid
 from rigd.beam.modes import poles_for_eigenvalues
 
@@ -57,10 +57,17 @@ HALF_DENSITY: Final = 0.5 * AIR_DENSITY_KG_PER_M3
 _LOWEST: Final = [0, 1]
 """Modes that external damping drives: it falls off against the inertia."""
 
+_BEYOND_ALL: Final = 10.0
+"""Speed over the highest without drag that no braked beam reaches."""
+
 _CHUNK: Final = 4096
 _QUADRATURE: Final = 12
 _SLOWING: Final = 1 / 3
 """Power of the speed that is left where C_D falls as its power of -2/3."""
+
+
+class DragError(ArithmeticError):
+    """So much drag on so light a beam cannot be followed from sample to sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +165,7 @@ class DragResponse:
         self._follow = p / z  # (MODES, bins): what inertia makes of a force
         self._yield = s / z / beam.bending_stiffness_n_m2
         self._inertial = p
-        self._late = np.exp(-plant.delay_s * s)
+        self._late = torque_channel(plant, s)
         turned = np.fft.rfft(angle_rad / self._growth[::_OVERSAMPLING], self._length)
         self._driven = -self._grid.leverage_m[:, None] * (self._follow * s * turned)
         self._turning = s * turned
@@ -176,9 +183,19 @@ class DragResponse:
         law : DragLaw
         modes : sequence of int
             By whose poles the torque is to be differentiated.
+
+        Raises
+        ------
+        DragError
+            The speeds grow without end.
         """
         speed = self._linear_speed()
-        self._brake(speed, law)
+        highest = float(np.abs(speed).max())
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._brake(speed, law)
+            top = float(np.abs(speed).max())
+        if not top <= _BEYOND_ALL * highest:
+            raise DragError(f"drag of {law.constant_m:g} m cannot be followed.")
         forces = self._modal(_force(speed, law))
         modes = [mode for mode in modes if self._pairs[mode - 1][0].imag > 0]
         spectra = self._spectra(forces)
@@ -207,7 +224,7 @@ class DragResponse:
             by_law=np.array(by[-2:]),
             by_delay=self.in_time(-self.s * torque),
             speed_m_s=self._mean_speed(speed),
-            top_speed_m_s=float(np.abs(speed).max()),
+            top_speed_m_s=top,
         )
 
     def _external(self) -> tuple[Complex, Complex]:
@@ -379,7 +396,7 @@ class DragResponse:
         return self.in_time(self._response(self._spectra(forces)))
 
     def in_time(self, torque: Complex) -> Real:
-        """Values (..., m) of a torque, delayed, at the samples of the angle.
+        """Values (..., m) of a torque, as its channel shows it, at the samples of the angle.
 
         Parameters
         ----------

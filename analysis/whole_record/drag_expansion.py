@@ -129,9 +129,10 @@ class DragExpansion:
         moved.append(plant.delay_s - self.plant.delay_s)
         free = "delay_s" in names
         slopes.append(chain[names.index("delay_s")] if free else np.zeros(chain.shape[1]))
-        every = np.array(rows)
-        change: Complex = np.array(moved) @ every
-        jacobian: Complex = np.array(slopes).T @ every
+        # As real numbers: they are multiplied by real ones only.
+        every = np.array(rows).view(np.float64)
+        change: Complex = (np.array(moved) @ every).view(np.complex128)
+        jacobian: Complex = (np.array(slopes).T @ every).view(np.complex128)
         return change, jacobian
 
     def _remainder(self, mode: int, here: complex, there: complex) -> tuple[Complex, Complex]:

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 
 _HARDLY: Final = 1e-6
+_ASIDE: Final = 1e-8
+"""Relative distance from a pole: the root of what rounding leaves of G's size there."""
+
 _OF_ENDS: Final = frozenset({"tip_mass_kg", "root_compliance_rad_per_nm"})
 """Extras that move poles."""
 
@@ -82,7 +85,7 @@ def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, .
     """Compute the same with a tip mass or an elastic clamp, on a uniform beam.
 
     The derivatives are those of a root of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
-    is as large as rounding lets it be, but the ratios of its derivatives are as they should be.
+    is infinite, but next to it the ratios of its derivatives are already as they should be.
     """
     damping, ratio = plant.damping, plant.beam.density_over_stiffness
     loaded = LoadedBeam(plant.beam, damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm)
@@ -91,7 +94,7 @@ def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, .
         if np.isnan(pair).any():
             continue
         for pole in pair[: 1 if pair[0].imag else 2]:
-            s = np.array([pole])
+            s = np.array([pole if plant.root_compliance_rad_per_nm else pole * (1 - _ASIDE)])
             at, log_s = loaded.at(s), np.log(s)
             s_alpha, s_lambda = np.exp(damping.alpha * log_s), np.exp(damping.lambda_ * log_s)
             by: dict[str, NDArray[np.complex128]] = {

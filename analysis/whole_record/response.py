@@ -19,7 +19,7 @@ kappa is the clamp's compliance, between tool and beam; with a tip mass G is tha
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from analysis.whole_record.plant import Plant
 
+_FILTERS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")
 _BUTTERWORTH: Final = 2**0.5
 
 FIRST_OFFSET: Final = 2
@@ -52,6 +53,42 @@ def eigenvalues(count: int) -> NDArray[np.float64]:
     z = clamped_free_eigenvalues(count)
     z.flags.writeable = False
     return z
+
+
+def torque_channel(
+    plant: Plant, s: NDArray[np.complexfloating[Any, Any]]
+) -> NDArray[np.complex128]:
+    """Give what the torque's channel makes of a torque: delay and filters, of the shape of `s`.
+
+    Parameters
+    ----------
+    plant : Plant
+    s : ndarray of complex
+        In rad/s.
+    """
+    at = s.astype(np.complex128, copy=False)
+    through: NDArray[np.complex128] = np.exp(-plant.delay_s * at)
+    for name in _FILTERS:
+        constant_s = plant.extras[name]
+        if constant_s:
+            through /= _divisor(name, constant_s, at)
+    return through
+
+
+def _divisor(name: str, constant_s: float, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Denominator of a filter."""
+    if name == "filter_time_constant_s":
+        return 1 + constant_s * s
+    return 1 + constant_s * (_BUTTERWORTH * s + constant_s * s * s)
+
+
+def _divisor_slope(
+    name: str, constant_s: float, s: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Differentiate it by the constant."""
+    if name == "filter_time_constant_s":
+        return s
+    return _BUTTERWORTH * s + 2 * constant_s * s * s
 
 
 class ResponseGrid:
@@ -110,14 +147,13 @@ class ResponseGrid:
             rows["root_compliance_rad_per_nm"] = -response * response
         response += plant.tool_inertia_kg_m2 * self._s_squared
         rows["tool_inertia_kg_m2"] = self._s_squared
-        late = np.exp(-plant.delay_s * self._s) * angle
+        late = torque_channel(plant, self._s) * angle
         if "delay_s" in wrt:
             rows["delay_s"] = -self._s * response
-        for name, numerator, divisor in self._filters(plant):
+        for name in _FILTERS:
             if name in wrt:
-                rows[name] = -(numerator / divisor) * response
-            if plant.extras[name]:
-                late = late / divisor
+                at = plant.extras[name], self._s
+                rows[name] = -(_divisor_slope(name, *at) / _divisor(name, *at)) * response
         found = np.empty((1 + len(wrt), late.size), dtype=np.complex128)
         for out, row in zip(found, [response, *(rows[name] for name in wrt)], strict=True):
             np.multiply(row, late, out=out)
@@ -155,21 +191,6 @@ class ResponseGrid:
             "tip_mass_kg": lambda: found.by_mass,
         }
         return found.response, {name: slopes[name]() for name in wrt if name in slopes}
-
-    def _filters(
-        self, plant: Plant
-    ) -> tuple[tuple[str, NDArray[np.complex128], NDArray[np.complex128]], ...]:
-        """Denominators of the torque channel's filters, after their derivatives by the constant."""
-        s, first = self._s, plant.filter_time_constant_s
-        second = plant.second_order_filter_time_constant_s
-        return (
-            ("filter_time_constant_s", s, 1 + first * s),
-            (
-                "second_order_filter_time_constant_s",
-                _BUTTERWORTH * s + 2 * second * self._s_squared,
-                1 + second * (_BUTTERWORTH * s + second * self._s_squared),
-            ),
-        )
 
     def _offset_modes(
         self, plant: Plant, rows: dict[str, NDArray[np.complex128]]

@@ -1,6 +1,7 @@
 """A campaign of sessions that Welch's method does not suit: the whole records alone."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from analysis.campaigns import campaign
 from analysis.campaigns.campaign import _of_one_experiment
+from analysis.campaigns.session import SessionFailure, SessionTask, analyse_session
 from analysis.campaigns.tables import tables_text
 from analysis.campaigns.write import write_campaign
 from analysis.settings import WelchSettings
@@ -68,3 +70,16 @@ def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_se
     both, none = _of_one_experiment([sessions[0], odd])
     assert none == []
     assert [each.frequency_hz.size for each in both] == [0, 0]
+
+
+def test_a_session_with_a_wrong_unit_is_set_aside(make_file, tmp_path, settings):
+    """Its file states a beam 57.3 times too light and too soft."""
+    beam = {
+        "beam_density_kg_per_m": repr(4.7e-3 * math.pi / 180),
+        "beam_bending_stiffness_n_m2": repr(0.090275 * math.pi / 180),
+    }
+    path = make_file(tmp_path / "degrees.mcap", 7, **beam)
+    found = analyse_session(path, SessionTask(settings, ("III",), (), None))
+    assert isinstance(found, SessionFailure)
+    assert "degrees for radians" in found.message
+    assert found.experiment is not None

@@ -23,12 +23,12 @@ from analysis.selection.finding import SEEN, Finding, doubted
     ],
 )
 def test_a_doubted_finding_is_no_fact_and_has_no_interval(sentence, bare):
-    found = doubted(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."))
-    assert found.sentence == f"No fact while part of the record is unexplained: {bare}"
+    found = doubted(Finding("delay", sentence, 1.0, (0.9, 1.1), "s", "Look."), "it rains")
+    assert found.sentence == f"No fact while it rains: {bare}"
     assert (found.value, found.interval, found.remedy) == (1.0, None, "Look.")
 
 
 @pytest.mark.parametrize("kind", sorted(SEEN))
 def test_what_is_seen_in_the_record_stays_a_fact(kind):
     found = Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), "1", "")
-    assert doubted(found) is found
+    assert doubted(found, "it rains") is found

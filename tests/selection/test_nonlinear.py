@@ -58,3 +58,20 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
     at = {m: power[m * 80 - 2 : m * 80 + 3].sum() for m in (1, 2, 3)}
     made = {m for m, value in at.items() if value > 1e-4 * max(at.values())}
     assert made == multiples
+
+
+def test_a_force_too_large_to_substitute_has_no_column(forces):
+    """Without a warning: they are errors here."""
+    _, modal = forces
+    column = modal.column(MODE_1, 1e3)
+    assert column.shape == modal.column(MODE_1).shape
+    assert np.isnan(column).all()
+    assert np.isfinite(modal.column(MODE_1)).all()
+
+
+def test_a_filter_of_the_torque_filters_the_column(forces, plants, link):
+    comparison, modal = forces
+    plant = Plant(link, plants["III"], filter_time_constant_s=3e-3)
+    filtered = ModalForces(comparison, plant).column(MODE_1)
+    divisor = 1 + 2j * np.pi * comparison.frequency_hz * 3e-3
+    assert deviation(filtered, modal.column(MODE_1) / divisor) < 1e-3

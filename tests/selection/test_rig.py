@@ -6,10 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from analysis.report.html.damping_sentences import damping_sentences
 from analysis.selection import select
 from analysis.selection.candidates import Field
 from analysis.selection.channel_checks import clipping, stops
-from analysis.selection.extras import explanations
+from analysis.selection.headline import MISREAD
 from analysis.selection.hum import repeats_after_s
 from analysis.selection.scale import wrong_scale
 from analysis.whole_record import Measurement
@@ -84,7 +85,7 @@ def test_a_tip_mass_is_named_beside_what_explains_it_as_well():
     assert field.best.extras == ("tip_mass_kg",)
     assert field.best.fit.parameters["tip_mass_kg"] == pytest.approx(1.5e-4, rel=0.02)
     assert all(mode.damping_ratio_std > 0 for mode in field.best.fit.modes)
-    assert explanations(field, 10.0)[0].kind == "tip_mass_kg"
+    assert field.freest.extras == ("tip_mass_kg",)
 
 
 def test_a_plain_rig_carries_nothing():
@@ -103,9 +104,27 @@ def test_a_sign_and_a_unit_are_seen_at_once(factor, kinds):
 
 
 def test_a_wrong_sign_comes_first():
-    verdict = select(record(-1.0), band_hz=(0.0, 20.0)).verdict
-    assert verdict.findings[0].kind == "sign"
+    found = select(record(-1.0), band_hz=(0.0, 20.0))
+    verdict, told = found.verdict, found.headline
+    assert [finding.kind for finding in verdict.findings] == ["sign"]
+    assert verdict.sentences == (verdict.findings[0].sentence,)
+    assert verdict.experiments == (verdict.findings[0].remedy,)
     assert not verdict.adequate
+    quantities = [*told.parameters.values(), *(mode.frequency_hz for mode in told.modes)]
+    assert {each.flag for each in quantities} == {MISREAD}
+    assert damping_sentences(told) == ()
+
+
+def test_a_clipped_torque_leaves_no_number_without_a_flag():
+    """Even where so little is cut off that what remains is noise."""
+    made = record()
+    most = np.sort(np.abs(made.torque_nm))[-12]
+    clipped = replace(made, torque_nm=np.clip(made.torque_nm, -most, most))
+    found = select(clipped, band_hz=(0.0, 20.0))
+    assert "clipping" in {finding.kind for finding in found.verdict.findings}
+    assert all(each.flag for each in found.headline.parameters.values())
+    assert all(mode.damping_ratio.flag for mode in found.headline.modes)
+    assert not any("asks for more" in sentence for sentence in found.verdict.sentences)
 
 
 def test_a_torque_flat_at_its_extremes_is_clipped():

@@ -1,6 +1,7 @@
 """Torque by drag of the air: against steps in time, its derivatives, and the published case."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from analysis.whole_record import Measurement, Plant
 from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.drag import DragLaw, DragResponse
+from analysis.whole_record.drag import DragError, DragLaw, DragResponse
 from analysis.whole_record.free_decay import mode_poles
 from rigd.beam import Beam, Damping
 
@@ -151,3 +152,23 @@ def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short):
     truth = short.spectrum(torque_nm)
     moved = np.linalg.norm(truth - taken - short.spectrum(short.prediction.torque(here)[0]))
     assert np.linalg.norm(linear + taken + change - truth) < 0.05 * moved
+
+
+def test_a_filter_of_the_torque_filters_that_of_the_drag():
+    comparison = compared(swept(6.0, 20.0))
+    plant = Plant(LINK, Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=1.0))
+    law, constant_s = DragLaw(2.3e-3), 3e-3
+    bare, filtered = (
+        comparison.spectrum(response(comparison, each).torque(law).torque_nm[comparison.kept])
+        for each in (plant, replace(plant, filter_time_constant_s=constant_s))
+    )
+    divisor = 1 + 2j * np.pi * comparison.frequency_hz * constant_s
+    assert deviation(filtered, bare / divisor) < 2e-2
+
+
+def test_drag_that_cannot_be_followed_is_given_up():
+    """Without a warning: they are errors here."""
+    comparison = compared(swept(6.0, 20.0))
+    light = replace(LINK, density_kg_per_m=1e-7, bending_stiffness_n_m2=1e-6)
+    with pytest.raises(DragError):
+        response(comparison, Plant(light, Damping(zeta=7.1e-5))).torque(DragLaw(2.3e-3))

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from analysis.report.html.table import estimate
+from analysis.selection.headline import MISREAD
 
 if TYPE_CHECKING:
     from analysis.selection import Headline, Quantity, Size
@@ -23,8 +24,9 @@ _SYMBOLS: Final = {
 def damping_sentences(told: Headline) -> tuple[str, ...]:
     """Say how the modes are damped, and by which internal and external damping.
 
-    Of modes that the record does not show nothing is said. Where part of the record is unexplained
-    the numbers are named as what they would be, without intervals.
+    Of modes that the record does not show nothing is said, nor of any where no number is the
+    antenna's. Where part of the record is unexplained the numbers are named as what they would be,
+    without intervals.
 
     Parameters
     ----------
@@ -36,6 +38,8 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
         95 % intervals in brackets.
     """
     found = []
+    if any(mode.damping_ratio.flag == MISREAD for mode in told.modes):
+        return ()
     shown = [_mode(mode) for mode in told.modes if mode.shown]
     if not told.explained:
         if not shown:
