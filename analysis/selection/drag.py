@@ -133,7 +133,8 @@ def with_air_drag(field: Field) -> Field:
         point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
         settled = _settled(field, point, best.structure, uniform=False) or settled
         found = _all(field, settled)
-    return found if found.bic < field.bic else field
+    assert found.drag is not None
+    return found if found.drag.value_m > 0 and found.bic < field.bic else field
 
 
 def _without_extras(field: Field) -> tuple[Candidate, ...]:
