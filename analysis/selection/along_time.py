@@ -106,7 +106,7 @@ def along_time(field: Field) -> tuple[Field, tuple[Change, ...]]:
         sizes, std = refit.amplitudes()
         unit = _UNIT_PLAY_RAD if what == "play" else 1.0
         change = Change(what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic)
-        if change.behind < STRONG and not (what == "play" and change.size < 0):
+        if change.behind < STRONG and _possible(change):
             found.append((change, refit))
     found.sort(key=lambda pair: pair[0].behind)
     if not found:
@@ -116,6 +116,11 @@ def along_time(field: Field) -> tuple[Field, tuple[Change, ...]]:
     if not first.certain or len(changes) > 1:
         return field, changes
     return field.with_columns(refit.columns, refit.noise_here()), changes
+
+
+def _possible(change: Change) -> bool:
+    """Whether a size is one: play is positive, and nothing changes by more than it is."""
+    return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
 def _leads(field: Field) -> Iterator[Candidate]:

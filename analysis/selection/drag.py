@@ -40,6 +40,9 @@ _FEW: Final = 12
 """Evaluations of a descent before the drag is computed anew."""
 
 _MANY: Final = 40
+_HOPELESS: Final = 50.0
+"""Deviance behind the structure with drag from which another is not followed to its minimum."""
+
 _SETTLED: Final = 0.5
 _ROUGHLY: Final = 20.0
 """Squares that another step may save where the drag need not be computed anew."""
@@ -133,7 +136,8 @@ def with_air_drag(field: Field) -> Field:
         point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
         settled = _settled(field, point, best.structure, uniform=False) or settled
         found = _all(field, settled)
-    return found if found.bic < field.bic else field
+    assert found.drag is not None
+    return found if found.drag.value_m > 0 and found.bic < field.bic else field
 
 
 def _without_extras(field: Field) -> tuple[Candidate, ...]:
@@ -311,10 +315,13 @@ def _all(field: Field, settled: Refit) -> Field:
         noise=settled.noise_here(),
     )
     of, plant = settled.objective.unknowns.structure, settled.plant
+    least = other.descent(settled.objective.unknowns, settled.x, 1).cost
     candidates = []
     for before in _without_extras(field):
         unknowns = other.unknowns(before.structure, before.uniform)
-        refit = other.descent(unknowns, adapted(unknowns, plant, of), _MANY)
+        refit = other.descent(unknowns, adapted(unknowns, plant, of), _FEW)
+        if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
+            refit = other.descent(unknowns, refit.x, _MANY)
         candidates.append(
             Candidate(before.structure, before.uniform, refit.fit(), len(other.columns))
         )

@@ -37,7 +37,7 @@ def findings(
     multiples: tuple[Harmonic, ...],
     visible: tuple[int, ...],
 ) -> tuple[Finding, ...]:
-    """Name what is there.
+    """Name what is there: of a record with a wrong sign or unit, only what needs no model.
 
     Parameters
     ----------
@@ -51,10 +51,11 @@ def findings(
         doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
     """
     measurement = field.comparison.measurement
+    seen = (*wrong_scale(field.comparison), *clipping(measurement), *stops(measurement))
+    if any(finding.kind in ("sign", "unit") for finding in seen):
+        return seen
     found = (
-        *wrong_scale(field.comparison),
-        *clipping(measurement),
-        *stops(measurement),
+        *seen,
         *_hum(field),
         *_air(field),
         *map(_force, forces),

@@ -40,6 +40,9 @@ _NEAR: Final = math.log(1.1)
 _OFF: Final = math.log(2.0)
 """Below a factor of 2 it is the beam's data that are wrong."""
 
+_BEYOND: Final = math.log(5.0)
+"""Above a factor of 5 it is not: no fit searches for a stiffness so far from the file's."""
+
 
 def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     """Find a reversed sign, or a factor between units, in torque over angle."""
@@ -72,18 +75,26 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     factor = float(np.median(size))
     if not factor > 0 or abs(math.log(factor)) < _OFF:
         return
-    for ratio, words in _FACTORS:
-        if abs(abs(math.log(factor)) - abs(math.log(ratio))) < _NEAR:
-            yield Finding(
-                kind="unit",
-                sentence=(
-                    f"Torque over angle is {factor:.3g} times what the beam in the file gives, "
-                    f"which is the factor of {words}: a wrong unit. No number here is the "
-                    "antenna's."
-                ),
-                value=factor,
-                interval=None,
-                unit="1",
-                remedy="Check the units of angle and torque, and import the record again.",
-            )
-            return
+    named = [
+        words
+        for ratio, words in _FACTORS
+        if abs(abs(math.log(factor)) - abs(math.log(ratio))) < _NEAR
+    ]
+    if not named and abs(math.log(factor)) < _BEYOND:
+        return
+    which = (
+        f"which is the factor of {named[0]}: a wrong unit"
+        if named
+        else "more than any beam is off its data: a wrong unit or gain, or the data of another beam"
+    )
+    yield Finding(
+        kind="unit",
+        sentence=(
+            f"Torque over angle is {factor:.3g} times what the beam in the file gives, {which}. "
+            "No number here is the antenna's."
+        ),
+        value=factor,
+        interval=None,
+        unit="1",
+        remedy="Check the units of angle and torque, and import the record again.",
+    )

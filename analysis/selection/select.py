@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 _CLIPPED: Final = "the torque is clipped"
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
-_OF_CHANNELS: Final = frozenset({"sign", "unit", "clipping", "stop"})
-"""Seen without a model: all that is said where the channels are misread."""
+_OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
+"""All that is said where the record and its file do not fit each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ def select(
         order_verdict(field, of_lambda, visible, doubt=doubt),
     )
     close = rivals(field, EVEN)
-    if misread:
+    if wrong == MISREAD:
         found = tuple(each for each in found if each.kind in _OF_CHANNELS)
     else:
         found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
@@ -148,7 +148,7 @@ def select(
     )
     advice = (
         dict.fromkeys(each.remedy for each in found if each.remedy)
-        if misread
+        if wrong == MISREAD
         else experiments(field, orders, visible, found, close)
     )
     return Selection(
@@ -171,7 +171,7 @@ def select(
             input_relation=related,
             harmonics=multiples,
             sentences=(
-                *(() if misread else of_numbers),
+                *(() if wrong == MISREAD else of_numbers),
                 *(each.sentence for each in found),
             ),
             experiments=tuple(advice),

@@ -96,7 +96,15 @@ def test_a_plain_rig_carries_nothing():
 
 @pytest.mark.parametrize(
     ("factor", "kinds"),
-    [(-1.0, ["sign"]), (180 / np.pi, ["unit"]), (-1e-3, ["sign", "unit"]), (1.3, []), (0.8, [])],
+    [
+        (-1.0, ["sign"]),
+        (180 / np.pi, ["unit"]),
+        (-1e-3, ["sign", "unit"]),
+        (1e4, ["unit"]),
+        (3.5, []),
+        (1.3, []),
+        (0.8, []),
+    ],
 )
 def test_a_sign_and_a_unit_are_seen_at_once(factor, kinds):
     comparison = Comparison.of(record(factor), (0.0, 50.0))
