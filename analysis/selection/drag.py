@@ -61,9 +61,6 @@ wires between 0.2 and 2 mm, and makes up for the rest with external damping: wha
 has two numbers, whether or not the second differs from nought, or its interval would be too narrow.
 """
 
-_FALLS: Final = 3.0
-"""Standard deviations of the second number from which the coefficient is said to fall."""
-
 _SLOWEST: Final = 0.02
 """Of the highest speed: slower air tells nothing."""
 
@@ -88,8 +85,6 @@ class DragEstimate:
         For all speeds.
     covariance : tuple of tuple of float
         Of the law's numbers that were free: of the first, or of both.
-    falls : bool
-        Whether the coefficient falls with the speed, beyond doubt.
     """
 
     value_m: float
@@ -98,7 +93,6 @@ class DragEstimate:
     speed_m_s: float
     law: DragLaw
     covariance: tuple[tuple[float, ...], ...]
-    falls: bool
 
 
 def with_air_drag(field: Field) -> Field:
@@ -343,9 +337,8 @@ def _estimate(field: Field) -> DragEstimate:
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     speed = expansion.speed_m_s
-    slope, falls = np.ones(1), False
+    slope = np.ones(1)
     if len(covariance) > 1:
-        falls = law.slowing > _FALLS * math.sqrt(covariance[1, 1])
         pivot = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
         top = expansion.top_speed_m_s
         speed = min(max(float(pivot**-1.5), _SLOWEST * top), top)
@@ -358,5 +351,4 @@ def _estimate(field: Field) -> DragEstimate:
         speed_m_s=speed,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
-        falls=falls,
     )

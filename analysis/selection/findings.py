@@ -134,17 +134,13 @@ def _air(field: Field) -> Iterator[Finding]:
     if drag is None:
         return
     low, high = (1e3 * end for end in drag.interval_95_m)
-    falls = (
-        f"; its coefficient falls with the speed, this is at {drag.speed_m_s:.2g} m/s"
-        if drag.falls
-        else ""
-    )
     yield Finding(
         kind="air drag",
         sentence=(
             f"The air brakes the beam: C_D d = {1e3 * drag.value_m:.4g} mm ({low:.4g} to "
-            f"{high:.4g} mm; 95 %){falls}. The damping therefore grows with the amplitude; the "
-            "drag was fitted beside the beam, whose parameters are those without air."
+            f"{high:.4g} mm; 95 %) at {drag.speed_m_s:.2g} m/s. The damping therefore grows "
+            "with the amplitude; the drag was fitted beside the beam, whose parameters are those "
+            "without air."
         ),
         value=drag.value_m,
         interval=drag.interval_95_m,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from analysis.selection.orders import EXCLUDED, STRONG
+from analysis.selection.orders import BESIDE_DRAG, EXCLUDED, STRONG
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -235,7 +235,11 @@ def headline(
     if field.drag is not None:
         drag = field.drag
         at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
-        told = replace(told, parameters={**told.parameters, "drag": at})
+        sizes = (
+            _flagged(each, BESIDE_DRAG) if each.damping == "external" else each
+            for each in told.sizes
+        )
+        told = replace(told, parameters={**told.parameters, "drag": at}, sizes=tuple(sizes))
     simpler = _simpler(field, fractional) if unexplained is None else None
     for other in field.other_kinds(STRONG):
         told = _doubted_by(told, other)
