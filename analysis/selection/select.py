@@ -75,10 +75,10 @@ def select(
     """Choose the structure that a record supports, and say what is known.
 
     All structures are fitted under one spectrum of the noise, on a uniform beam, and those of
-    integer internal order also with the modes' stiffness free; if one of those is the best, its
-    orders are freed as well. The lowest BIC decides on the kind of beam. What is told is of the
-    freest structure on that beam, every order free, so that intervals hold whichever simpler one is
-    true. If drag of the air along the beam makes the lowest lower, all are fitted with it. If
+    integer internal order also with the modes' stiffness free; where it promises something, also
+    with an elastic clamp, a tip mass, a filter or another clock. On the kind of rig with the lowest
+    BIC the orders are freed as well, and kinds of rig are told apart by these freest structures.
+    The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of the air along the beam makes the lowest lower, all are fitted with it. If
     restoring forces that are not linear save far more than chance would, all are fitted again with
     these beside the beam.
 
