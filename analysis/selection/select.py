@@ -78,9 +78,10 @@ def select(
     integer internal order also with the modes' stiffness free; where it promises something, also
     with an elastic clamp, a tip mass, a filter or another clock. On the kind of rig with the lowest
     BIC the orders are freed as well, and kinds of rig are told apart by these freest structures.
-    The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of the air along the beam makes the lowest lower, all are fitted with it. If
-    restoring forces that are not linear save far more than chance would, all are fitted again with
-    these beside the beam.
+    The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of
+    the air along the beam makes the lowest lower, all are fitted with it. If restoring forces that
+    are not linear, or a change along the record, save far more than chance would, all are fitted
+    again with these beside the beam.
 
     Parameters
     ----------
