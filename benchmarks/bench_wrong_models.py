@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from wrong_models import DEFECTS, RIGS, Record
 
-from analysis.selection import Selection, select
+from analysis.selection import Quantity, Selection, select
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +45,20 @@ class Judged:
 
 
 def _errors(made: Record, selection: Selection) -> Iterator[tuple[str, float]]:
-    """Give by name the error of what is reported without a flag, in its standard deviations."""
-    verdict, fit = selection.verdict, selection.fit
-    if not verdict.adequate:
-        return
+    """Give by name the error of what the headline tells without a flag, in its deviations."""
+    told = selection.headline
     for name, true in made.rig.parameters.items():
-        std = fit.std.get(name)
-        if name in verdict.parameters and std:
-            yield name, (fit.parameters[name] - true) / std
-    for mode, true in zip(fit.modes, made.rig.damping_ratios.tolist(), strict=False):
-        yield f"xi{mode.number}", (mode.damping_ratio - true) / mode.damping_ratio_std
-    for mode, pole in zip(fit.modes, made.rig.poles().tolist(), strict=False):
-        error_hz = mode.frequency_hz - pole.imag / (2 * math.pi)
-        yield f"f{mode.number}", error_hz / mode.frequency_std_hz
+        if name in told.parameters:
+            yield from _error(name, told.parameters[name], true)
+    for mode, true in zip(told.modes, made.rig.damping_ratios.tolist(), strict=False):
+        yield from _error(f"xi{mode.number}", mode.damping_ratio, true)
+    for mode, pole in zip(told.modes, made.rig.poles().tolist(), strict=False):
+        yield from _error(f"f{mode.number}", mode.frequency_hz, pole.imag / (2 * math.pi))
+
+
+def _error(name: str, quantity: Quantity, true: float) -> Iterator[tuple[str, float]]:
+    if quantity.flag is None and quantity.std:
+        yield name, (quantity.value - true) / quantity.std
 
 
 def main() -> None:
@@ -69,7 +70,10 @@ def main() -> None:
     parser.add_argument("--rig", nargs="+", choices=list(RIGS), default=list(RIGS))
     parser.add_argument("--say", action="store_true", help="print every verdict")
     given = parser.parse_args()
-    print("| defect | only noise | named | worst error without a flag | CPU s |")
+    print(
+        "| defect | explained, nothing more asked for | named | worst error without a flag "
+        "| CPU s |"
+    )
     print("|---|---|---|---|---|")
     for defect, (rigs, make) in DEFECTS.items():
         if not any(text in defect for text in given.defect):
@@ -104,10 +108,12 @@ def _show(defect: str, judged: list[Judged]) -> None:
         for kind in dict.fromkeys(f.kind for f in one.selection.verdict.findings)
     )
     names = ", ".join(f"{kind} {count}" for kind, count in named.most_common()) or "nothing"
+    sure = sum("nothing in the record" in " ".join(o.selection.verdict.sentences) for o in judged)
     worst, what = max(one.worst for one in judged)
     cpu_s = max(one.cpu_s for one in judged)
     print(
-        f"| {defect} | {white}/{len(judged)} | {names} | {worst:.1f} ({what}) | {cpu_s:.1f} |",
+        f"| {defect} | {white}, {sure} of {len(judged)} | {names} | {worst:.1f} ({what}) "
+        f"| {cpu_s:.1f} |",
         flush=True,
     )
 
