@@ -38,6 +38,11 @@ ONE_MODE: Final = (
     "one mode alone does not tell damping of the material from that of the surroundings"
 )
 
+_LAW_ASSUMED: Final = (
+    "the stiffness depends on the deflection, by a law of which only the lowest power was fitted"
+)
+_OF_FREQUENCIES: Final = ("density_over_stiffness", "stiffness_offset")
+
 StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
 _NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
@@ -189,6 +194,23 @@ class Headline:
                     damping_ratio=doubt(each.damping_ratio),
                 )
                 for each in self.modes
+            ),
+        )
+
+    def with_law_assumed(self) -> Headline:
+        """Flag what rests on the law by which a stiffness was taken to depend on the deflection."""
+
+        def doubt(quantity: Quantity) -> Quantity:
+            return replace(quantity, flag=quantity.flag or _LAW_ASSUMED)
+
+        return replace(
+            self,
+            parameters={
+                name: doubt(each) if name.startswith(_OF_FREQUENCIES) else each
+                for name, each in self.parameters.items()
+            },
+            modes=tuple(
+                replace(each, frequency_hz=doubt(each.frequency_hz)) for each in self.modes
             ),
         )
 

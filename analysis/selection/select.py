@@ -143,6 +143,8 @@ def select(
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
+    if "nonlinear stiffness" in kinds:
+        numbers = numbers.with_law_assumed()
     best = field.best
     of_numbers = sentences.of_headline(
         numbers, orders, alone=doubt is None and not field.other_kinds(STRONG)

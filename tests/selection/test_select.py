@@ -215,7 +215,11 @@ def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, 
     hum = 0.03 * np.sin(2 * np.pi * 50.02 * t)  # beyond the band, and leaking into it
     torque = made.torque_nm + stiffening("III", 0.02) + hum
     spoilt = type(made)(made.angle_rad, torque)
-    verdict = select(spoilt.measured(noise_nm=NOISE_NM, seed=45)).verdict
+    selection = select(spoilt.measured(noise_nm=NOISE_NM, seed=45))
+    verdict, told = selection.verdict, selection.headline
+    assert all("depends on the deflection" in mode.frequency_hz.flag for mode in told.modes)
+    assert all(mode.damping_ratio.flag is None for mode in told.modes)
+    assert set(told.flags) == {"density_over_stiffness"}
     assert (verdict.structure, verdict.uniform, verdict.adequate) == ("III", True, True)
     assert kinds(verdict) == {"hum", "nonlinear stiffness"}
     line, force = verdict.findings
