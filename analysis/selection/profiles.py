@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING, Final
 from analysis.selection.profile import Profile, Profiled, profile
 
 if TYPE_CHECKING:
-    from analysis.selection.candidates import Field
+    from collections.abc import Mapping
 
+    from analysis.selection.candidates import Field
+    from analysis.selection.profile import Order
+
+_COEFFICIENTS: Final[Mapping[Order, str]] = {"alpha": "zeta", "lambda": "gamma"}
 _ROUNDS: Final = 3
 _MISSED: Final = 1e-5
 """Share of a sum of squares, which is some 1e4; BIC counts a parameter as 9."""
@@ -32,17 +36,26 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
     """
     for round_ in range(1, _ROUNDS + 1):
         freest = field.freest
-        alpha, lambda_ = profile(field, freest, "alpha"), profile(field, freest, "lambda")
+        # The order of a damping that does not show could be anything: no walk would tell more.
+        walks = {
+            order: profile(field, freest, order)
+            for order, coefficient in _COEFFICIENTS.items()
+            if coefficient in freest.structure.free
+        }
         before = [candidate.fit.cost for candidate in field.candidates]
         if round_ == _ROUNDS:
             break
-        for found in (alpha, lambda_):
+        for found in walks.values():
             if _news(field, found):
                 for plant in found.plants:
                     field = field.tried_from(plant, found.structure)
         if [candidate.fit.cost for candidate in field.candidates] == before:
             break
-    return field, alpha.profile, lambda_.profile
+    of_alpha, of_lambda = (
+        walks[order].profile if order in walks else Profile.unwalked(freest, order)
+        for order in _COEFFICIENTS
+    )
+    return field, of_alpha, of_lambda
 
 
 def _news(field: Field, found: Profiled) -> bool:
