@@ -15,6 +15,9 @@ from rigd.session import Status, read_session, read_timings
 CHIRP = ("--amplitude", "0.005", "--stop-hz", "5", "--duration", "1.5")
 LENGTHS = ("--rest", "0.2", "--ring-down", "0.3")
 
+ALONE = {"name": f'"alone_{os.getpid()}"'}
+"""A rig that no other test simulates at the same time."""
+
 
 def _recording(folder: Path) -> bool:
     """Whether a session is being recorded in a folder and has its first samples."""
@@ -122,7 +125,7 @@ def test_ctrl_c_stops_the_motor_over_the_wire(
 def test_without_hardware_and_simulator_the_message_says_what_to_do(
     quiet_profile, run_chirp, runtime_folder
 ):
-    done = run_chirp(quiet_profile("antenna_can"))
+    done = run_chirp(quiet_profile("antenna_can", ALONE))
     assert done.returncode == 1
     assert "rigd simulate" in done.stderr + done.stdout
     assert "Traceback" not in done.stderr
@@ -131,7 +134,7 @@ def test_without_hardware_and_simulator_the_message_says_what_to_do(
 def test_real_time_cannot_be_skipped_unless_in_lock_step(
     quiet_profile, start_simulator, refuse_chirp, runtime_folder
 ):
-    profile = quiet_profile("antenna_can")
+    profile = quiet_profile("antenna_can", ALONE)
     done = refuse_chirp(profile, "--fast")
     assert done.returncode == 2
     assert "--fast: the hardware of" in done.stderr
