@@ -13,6 +13,10 @@ from rigd.beam import Damping
 
 Parameter = Literal["zeta", "alpha", "gamma", "lambda"]
 PARAMETERS: Final[tuple[Parameter, ...]] = ("zeta", "alpha", "gamma", "lambda")
+COEFFICIENT_OF: Final[Mapping[str, Parameter]] = MappingProxyType(
+    {"alpha": "zeta", "lambda": "gamma"}
+)
+"""The coefficient that belongs to an order of the damping, and means nothing without it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +46,20 @@ class Structure:
     def external(self) -> bool:
         """Whether the structure has external damping (of the environment)."""
         return "gamma" in self.free
+
+    def has(self, name: str) -> bool:
+        """Whether a parameter means anything in the structure: of a beam or a rig any does.
+
+        Parameters
+        ----------
+        name : str
+            Of `PARAMETERS`, or of beam and rig.
+        """
+        if name in ("zeta", "alpha"):
+            return self.internal
+        if name in ("gamma", "lambda"):
+            return self.external
+        return True
 
     def damping(self, values: Mapping[Parameter, float]) -> Damping:
         """Complete the free parameters' `values` with the fixed ones."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.campaigns.random_effects import t_quantile
-from analysis.selection import Quantity
+from analysis.selection import Quantity, Size, headline_json
+from analysis.selection.headline import Mode, Numbers, Simpler
 from analysis.selection.orders import STRONG
-from analysis.structures import PARAMETERS, STRUCTURES
+from analysis.structures import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,8 +19,8 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.ranking import RankedStructure
     from analysis.campaigns.verdict import CampaignVerdict
+    from analysis.selection.headline import StructureStatus
 
-_COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
 _UNEXPLAINED: Final = "part of the records is unexplained"
 _MIXTURE: Final = "the mean of a mixture: sessions differ in it in kind"
 _ON_BOUND: Final = "the plain mean: it rests on its bound in some session"
@@ -49,48 +51,34 @@ def _shared(campaign: Campaign, pooled: PooledEstimate, verdict: CampaignVerdict
     orders = (verdict.alpha, verdict.lambda_)
     explained = verdict.adequate >= _ADEQUATE * verdict.sessions
     every = None if explained else _UNEXPLAINED
-    parameters = _parameters(campaign, pooled, orders, every)
+    told = Numbers(
+        name=pooled.name,
+        parameters=_parameters(campaign, pooled, orders, every),
+        sizes=_sizes(pooled, orders, every),
+        modes=_modes(campaign, pooled, every),
+        structures=tuple((each.name, _status(each, pooled)) for each in campaign.structures),
+        simpler=_simpler(campaign, pooled),
+    )
+    named = (
+        replace(each.example, sentence=each.sentence, interval=None) for each in verdict.findings
+    )
+    return headline_json(None, told, orders, named)
+
+
+def _simpler(campaign: Campaign, pooled: PooledEstimate) -> Simpler | None:
+    """Take what the lowest BIC gives, on condition that its orders are true."""
     conditional = campaign.pooled[0]
-    return {
-        "file": None,
-        "type": pooled.name,
-        "parameters": {name: each.as_json() for name, each in parameters.items()},
-        "sizes": _sizes(pooled, orders, every),
-        "modes": _modes(campaign, pooled, every),
-        "structures": [
-            {"type": each.name, "status": _status(each, pooled)} for each in campaign.structures
-        ],
-        "orders": {
-            each.order: {
-                "status": each.status,
-                "interval_95": None if each.interval is None else list(each.interval),
-            }
-            for each in orders
+    if conditional is pooled:
+        return None
+    fixed = STRUCTURES[conditional.structure].fixed
+    return Simpler(
+        name=conditional.name,
+        fixed={name: value for name, value in fixed.items() if name in COEFFICIENT_OF},
+        parameters={
+            each.name: Quantity(each.value, each.std, each.interval)
+            for each in conditional.parameters
         },
-        "conditional": None
-        if conditional is pooled
-        else {
-            "type": conditional.name,
-            "on": {
-                name: value
-                for name, value in STRUCTURES[conditional.structure].fixed.items()
-                if name in ("alpha", "lambda")
-            },
-            "parameters": {
-                each.name: Quantity(each.value, each.std, each.interval).as_json()
-                for each in conditional.parameters
-            },
-        },
-        "named": [
-            {
-                "what": each.example.kind,
-                "value": each.example.value,
-                "interval_95": None,
-                "sentence": each.sentence,
-            }
-            for each in verdict.findings
-        ],
-    }
+    )
 
 
 def _parameters(
@@ -123,48 +111,43 @@ def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
         name: each.reason
         for each in orders
         if each.reason is not None
-        for name in (each.order, _COEFFICIENTS[each.order])
+        for name in (each.order, COEFFICIENT_OF[each.order])
     }
 
 
 def _sizes(
     pooled: PooledEstimate, orders: tuple[PooledOrder, ...], every: str | None
-) -> list[dict[str, Any]]:
+) -> tuple[Size, ...]:
     flags = _flags(orders)
-    return [
-        {
-            "damping": each.damping,
-            "omega_rad_s": each.omega_rad_s,
-            **Quantity(
-                each.value, each.std, each.interval, every or flags.get(each.order)
-            ).as_json(),
-        }
+    return tuple(
+        Size(
+            each.damping,
+            each.omega_rad_s,
+            Quantity(each.value, each.std, each.interval, every or flags.get(each.order)),
+        )
         for each in pooled.sizes
-    ]
+    )
 
 
-def _modes(campaign: Campaign, pooled: PooledEstimate, every: str | None) -> list[dict[str, Any]]:
+def _modes(campaign: Campaign, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
     t, mixed = t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
-    def told(value: float, std: float, quantity: str) -> dict[str, Any]:
+    def told(value: float, std: float, quantity: str) -> Quantity:
         flag = every or (_MIXTURE if mixed(quantity) else None)
-        return Quantity(value, std, (value - t * std, value + t * std), flag).as_json()
+        return Quantity(value, std, (value - t * std, value + t * std), flag)
 
-    return [
-        {
-            "mode": mode.number,
-            "frequency_hz": told(
-                mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"
-            ),
-            "damping_ratio": told(
-                mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"
-            ),
-        }
+    return tuple(
+        Mode(
+            mode.number,
+            told(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
+            told(mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"),
+            shown=True,
+        )
         for mode in pooled.modes
-    ]
+    )
 
 
-def _status(each: RankedStructure, pooled: PooledEstimate) -> str:
+def _status(each: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
     if each.name == pooled.name:
         return "selected"
     above = each.bic_above_lowest

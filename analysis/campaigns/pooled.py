@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 
     from analysis.campaigns.estimates import RecordEstimate
     from analysis.campaigns.session import SessionResult
+    from analysis.selection.headline import Damping
     from analysis.selection.profile import Order
 
 _FEWEST: Final = 2
-_DAMPINGS: Final[tuple[tuple[str, str, Order], ...]] = (
+_DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (
     ("internal", "zeta", "alpha"),
     ("external", "gamma", "lambda"),
 )
@@ -69,7 +70,7 @@ class PooledParameter:
 
 @dataclass(frozen=True, slots=True)
 class PooledSize:
-    """Size of one damping over all sessions, where it does not depend on its order.
+    """Size of one damping over all sessions, where it depends least on its order.
 
     Attributes
     ----------
@@ -85,7 +86,7 @@ class PooledSize:
         95 %.
     """
 
-    damping: str
+    damping: Damping
     order: Order
     omega_rad_s: float | None
     value: float

@@ -118,7 +118,7 @@ def _judged(
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
     if not several_modes:
         return "not identifiable", _FEW_MODES
-    if ("zeta" if order == "alpha" else "gamma") not in structure.free:
+    if not structure.has(order):
         return "absent", "no such damping shows"
     free = freest.by_name.get(order)
     if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) == "compatible":

@@ -61,7 +61,7 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
 
 
 def sizes(freest: PooledEstimate) -> list[str]:
-    """Say how large each damping is where it does not depend on its order."""
+    """Say how large each damping is where it depends least on its order."""
     said = []
     for each in freest.sizes:
         if each.omega_rad_s is None:
@@ -71,7 +71,9 @@ def sizes(freest: PooledEstimate) -> list[str]:
             f"{each.value:.4g} by the {_SIZES[each.damping]} (95 %: {low:.4g} to {high:.4g}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
         )
-    return [f"Loss factors at the pivot frequencies: {'; '.join(said)}."] if said else []
+    return (
+        [f"Loss factors where they depend least on the orders: {'; '.join(said)}."] if said else []
+    )
 
 
 def selected(

@@ -19,8 +19,7 @@ from analysis.selection.chance import SURE
 from analysis.selection.finding import Finding
 from analysis.selection.modulated_damping import late_damping
 from analysis.selection.orders import STRONG
-from analysis.selection.refit import Refit
-from analysis.selection.scale import wrong_scale
+from analysis.selection.refit import Refit, unexplained_part
 from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
@@ -91,7 +90,7 @@ def along_time(field: Field) -> tuple[Field, tuple[Change, ...]]:
     changes : tuple of Change
         What explains the record best of all, or as well as the best candidate.
     """
-    if any(wrong_scale(field.comparison)):
+    if field.misread:
         return field, ()
     lag = _lag_of_play(field.comparison)
     tried: dict[What, tuple[float, Refit]] = {}
@@ -140,7 +139,7 @@ def _promising(
     projected = refit.objective.project(at, field.noise.weight)
     known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
     for what, column in _columns(field.comparison, lead.fit.plant, lag).items():
-        free = _without(column * field.noise.weight, known)
+        (free,) = unexplained_part((column * field.noise.weight)[None], known)
         saved = float(np.vdot(free, projected.residual).real) ** 2
         saved /= max(float(np.vdot(free, free).real), np.finfo(float).tiny)
         left = max(projected.cost - saved, 1e-3 * projected.cost)
@@ -233,19 +232,6 @@ def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
         hub.append(here)
     lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub) - shaft)
     return lag
-
-
-def _without(
-    column: NDArray[np.complex128], known: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Part of a column that nothing known explains."""
-    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
-    basis = known[scale > 0] / scale[scale > 0, None]
-    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
-    rest: NDArray[np.complex128] = (
-        column - np.linalg.solve(gram, (basis.conj() @ column).real) @ basis
-    )
-    return rest
 
 
 def changing(changes: tuple[Change, ...]) -> Iterator[Finding]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.selection.drag import DragEstimate
+    from analysis.selection.finding import Finding
     from analysis.structures import Structure
     from analysis.whole_record import Measurement, Plant, RecordAnalysis, RecordFit, Setting
 
@@ -80,6 +81,8 @@ class Field:
         What all were allowed beside the linear beam.
     drag : DragEstimate, optional
         Of the air, if the record calls for it; it is then in all candidates.
+    misread : tuple of Finding
+        A wrong sign or unit, which makes every number wrong; empty where there is none.
     """
 
     comparison: Comparison
@@ -88,6 +91,7 @@ class Field:
     candidates: tuple[Candidate, ...]
     columns: NDArray[np.complex128]
     drag: DragEstimate | None = None
+    misread: tuple[Finding, ...] = ()
 
     @classmethod
     def of(
@@ -103,10 +107,10 @@ class Field:
         MeasurementError
             The record cannot be used.
         """
-        if any(wrong_scale(Comparison.of(measurement, band_hz))):
+        if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
             # No beam explains such a record: one structure shows what remains as well as all.
             found = fit_record(measurement, (_FREEST,), fixed=fixed, band_hz=band_hz)
-            return cls._uniform(found, fixed)
+            return replace(cls._uniform(found, fixed), misread=misread)
         field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
         field = field._without_leakage()
         likeliest = field.likeliest

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.selection.candidate import Candidate
-from analysis.selection.refit import Refit
+from analysis.selection.refit import Refit, unexplained_part
 from analysis.selection.restart import adapted, vector
 from analysis.structures import STRUCTURES
 from analysis.whole_record.drag import DragError, DragLaw, DragResponse
@@ -181,16 +181,9 @@ def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
     without = replace(at, columns=at.columns[:-1])
     projected = refit.objective.project(without, weight)
     known = np.concatenate([projected.jacobian, without.columns * weight])
-    column = at.columns[-1] * weight
-    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
-    known, scale = known[scale > 0], scale[scale > 0]
-    known = known / scale[:, None]
-    gram = (known.conj() @ known.T).real + 1e-12 * np.eye(len(known))
     # The residual has nothing left of the decays; of the unknowns it may have, at no minimum.
-    right = np.column_stack([known.conj() @ column, known.conj() @ projected.residual]).real
-    of_column, of_residual = np.linalg.solve(gram, right).T
-    column = column - of_column @ known
-    residual = projected.residual - of_residual @ known
+    both = np.stack([at.columns[-1] * weight, projected.residual])
+    column, residual = unexplained_part(both, known)
     square = float(np.vdot(column, column).real)
     if square <= 0:
         return 0.0, 0.0, projected.cost

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Final
 from analysis.selection.channel_checks import clipping, stops
 from analysis.selection.finding import Finding
 from analysis.selection.hum import repeats_after_s
-from analysis.selection.scale import wrong_scale
 from analysis.selection.sensor_drift import drift_of_zero
 from analysis.selection.stated_otherwise import at_edges, of_settings
 
@@ -51,8 +50,8 @@ def findings(
         doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
     """
     measurement = field.comparison.measurement
-    seen = (*wrong_scale(field.comparison), *clipping(measurement), *stops(measurement))
-    if any(finding.kind in ("sign", "unit") for finding in seen):
+    seen = (*field.misread, *clipping(measurement), *stops(measurement))
+    if field.misread:
         return seen
     found = (
         *seen,

@@ -11,22 +11,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from analysis.selection.orders import BESIDE_DRAG, EXCLUDED, STRONG
+from analysis.structures import COEFFICIENT_OF
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Iterable, Mapping
 
     from analysis.selection.candidate import Candidate
     from analysis.selection.candidates import Field
     from analysis.selection.finding import Finding
     from analysis.selection.orders import OrderVerdict
-    from analysis.structures import Structure
     from analysis.whole_record import DampingSize, ModeEstimate, RecordFit
 
 _NORMAL_95: Final = 1.959963984540054
-_COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
 UNEXPLAINED: Final = "part of the record is unexplained"
 MISREAD: Final = "the record and its file do not fit each other"
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
@@ -75,6 +74,15 @@ class Quantity:
     interval_95: tuple[float, float] | None
     flag: str | None = None
 
+    def flagged(self, flag: str | None) -> Quantity:
+        """Give it a flag, unless it has one.
+
+        Parameters
+        ----------
+        flag : str or None
+        """
+        return replace(self, flag=self.flag or flag)
+
     def as_json(self) -> dict[str, Any]:
         """As `json.dumps` takes it."""
         ends = None if self.interval_95 is None else list(self.interval_95)
@@ -83,7 +91,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Loss factor of a damping at the frequency where it does not depend on its order.
+    """Loss factor of a damping at the frequency where it depends least on its order.
 
     Attributes
     ----------
@@ -98,6 +106,15 @@ class Size:
     damping: Damping
     omega_rad_s: float | None
     size: Quantity
+
+    def flagged(self, flag: str) -> Size:
+        """Give it a flag, unless it has one.
+
+        Parameters
+        ----------
+        flag : str
+        """
+        return replace(self, size=self.size.flagged(flag))
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,15 +147,13 @@ class Simpler:
 
 
 @dataclass(frozen=True, slots=True)
-class Headline:
-    """What a record says in numbers, whatever structure is the true one.
+class Numbers:
+    """What one record, or all of a campaign, says in numbers, whatever structure is the true one.
 
     Attributes
     ----------
     name : str
-        The freest structure that the record supports, as tables call it.
-    fit : RecordFit
-        Its fit.
+        The freest structure that the data support, as tables call it.
     parameters : mapping of str to Quantity
         What the structure has, by the names of `RecordFit`.
     sizes : tuple of Size
@@ -148,17 +163,29 @@ class Headline:
         numbers are of; "compatible"; "excluded".
     simpler : Simpler or None
         The simplest structure that would do, if it is not that one.
-    explained : bool
-        Whether it leaves nothing but noise; else every number carries a flag.
     """
 
     name: str
-    fit: RecordFit
     parameters: Mapping[str, Quantity]
     sizes: tuple[Size, ...]
     modes: tuple[Mode, ...]
     structures: tuple[tuple[str, StructureStatus], ...]
     simpler: Simpler | None
+
+
+@dataclass(frozen=True, slots=True)
+class Headline(Numbers):
+    """What one record says in numbers, and the fit that they are of.
+
+    Attributes
+    ----------
+    fit : RecordFit
+        Of the freest structure that the record supports.
+    explained : bool
+        Whether it leaves nothing but noise; else every number carries a flag.
+    """
+
+    fit: RecordFit
     explained: bool
 
     @property
@@ -179,19 +206,15 @@ class Headline:
         flag : str
             The reason.
         """
-
-        def doubt(quantity: Quantity) -> Quantity:
-            return replace(quantity, flag=quantity.flag or flag)
-
         return replace(
             self,
-            parameters={name: doubt(each) for name, each in self.parameters.items()},
-            sizes=tuple(_flagged(each, flag) for each in self.sizes),
+            parameters={name: each.flagged(flag) for name, each in self.parameters.items()},
+            sizes=tuple(each.flagged(flag) for each in self.sizes),
             modes=tuple(
                 replace(
                     each,
-                    frequency_hz=doubt(each.frequency_hz),
-                    damping_ratio=doubt(each.damping_ratio),
+                    frequency_hz=each.frequency_hz.flagged(flag),
+                    damping_ratio=each.damping_ratio.flagged(flag),
                 )
                 for each in self.modes
             ),
@@ -199,18 +222,15 @@ class Headline:
 
     def with_law_assumed(self) -> Headline:
         """Flag what rests on the law by which a stiffness was taken to depend on the deflection."""
-
-        def doubt(quantity: Quantity) -> Quantity:
-            return replace(quantity, flag=quantity.flag or _LAW_ASSUMED)
-
         return replace(
             self,
             parameters={
-                name: doubt(each) if name.startswith(_OF_FREQUENCIES) else each
+                name: each.flagged(_LAW_ASSUMED) if name.startswith(_OF_FREQUENCIES) else each
                 for name, each in self.parameters.items()
             },
             modes=tuple(
-                replace(each, frequency_hz=doubt(each.frequency_hz)) for each in self.modes
+                replace(each, frequency_hz=each.frequency_hz.flagged(_LAW_ASSUMED))
+                for each in self.modes
             ),
         )
 
@@ -258,15 +278,14 @@ def headline(
         drag = field.drag
         at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
         sizes = (
-            _flagged(each, BESIDE_DRAG) if each.damping == "external" else each
-            for each in told.sizes
+            each.flagged(BESIDE_DRAG) if each.damping == "external" else each for each in told.sizes
         )
         told = replace(told, parameters={**told.parameters, "drag": at}, sizes=tuple(sizes))
     simpler = _simpler(field, fractional) if unexplained is None else None
     for other in field.other_kinds(STRONG):
         told = _doubted_by(told, other)
     if len(visible) < _MODES_TO_TELL_DAMPINGS:
-        told = replace(told, sizes=tuple(_flagged(each, ONE_MODE) for each in told.sizes))
+        told = replace(told, sizes=tuple(each.flagged(ONE_MODE) for each in told.sizes))
     return replace(told, structures=structures(field, fractional), simpler=simpler)
 
 
@@ -294,15 +313,16 @@ def of_fit(
     unexplained : str, optional
         Why nothing is.
     """
-    shared = {_COEFFICIENTS[order]: reason for order, reason in reasons.items()}
-    flags = {**reasons, **shared}
+    flags: dict[str, str] = {
+        name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
+    }
     return Headline(
         name=name,
         fit=fit,
         parameters={
             each: _parameter(fit, each, unexplained or flags.get(each), intervals.get(each))
             for each in fit.parameters
-            if _has(fit.structure, each)
+            if fit.structure.has(each)
         },
         sizes=tuple(
             # A loss factor is known without its order; a coefficient alone belongs to it.
@@ -373,7 +393,7 @@ def _simpler(field: Field, fractional: frozenset[str]) -> Simpler | None:
     best = min(would_do, key=lambda each: each.bic)
     fixed = {
         order: best.structure.fixed[order]  # type: ignore[index]
-        for order, coefficient in _COEFFICIENTS.items()
+        for order, coefficient in COEFFICIENT_OF.items()
         if order in best.structure.fixed and coefficient in best.structure.free
     }
     return Simpler(
@@ -382,18 +402,9 @@ def _simpler(field: Field, fractional: frozenset[str]) -> Simpler | None:
         parameters={
             name: _parameter(best.fit, name, None, None)
             for name in best.fit.parameters
-            if _has(best.structure, name) and name not in fixed
+            if best.structure.has(name) and name not in fixed
         },
     )
-
-
-def _has(structure: Structure, name: str) -> bool:
-    """Whether a parameter means anything in a structure."""
-    if name in ("zeta", "alpha"):
-        return structure.internal
-    if name in ("gamma", "lambda"):
-        return structure.external
-    return True
 
 
 def _parameter(
@@ -425,20 +436,18 @@ def _doubted_by(told: Headline, other: Candidate) -> Headline:
         low, high = quantity.interval_95 or (-math.inf, math.inf)
         return not low <= value <= high
 
+    def moved(mine: Quantity, value: float) -> Quantity:
+        return mine.flagged(flag) if elsewhere(mine, value) else mine
+
     parameters = {
-        name: replace(each, flag=each.flag or flag)
-        if name in values and elsewhere(each, values[name])
-        else each
+        name: moved(each, values[name]) if name in values else each
         for name, each in told.parameters.items()
     }
     sizes = tuple(
-        _flagged(each, flag) if elsewhere(each.size, _loss(values, each)) else each
+        each.flagged(flag) if elsewhere(each.size, _loss(values, each)) else each
         for each in told.sizes
     )
     theirs = {mode.number: mode for mode in other.fit.modes}
-
-    def moved(mine: Quantity, value: float) -> Quantity:
-        return replace(mine, flag=mine.flag or flag) if elsewhere(mine, value) else mine
 
     modes = tuple(
         replace(
@@ -464,10 +473,6 @@ def _loss(values: Mapping[str, float], each: Size) -> float:
     return lost * math.sin(math.pi / 2 * values[order]) / stored
 
 
-def _flagged(each: Size, flag: str) -> Size:
-    return replace(each, size=replace(each.size, flag=each.size.flag or flag))
-
-
 def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:
     shown = mode.number in visible
     if reason is None and not shown:
@@ -485,11 +490,27 @@ def _symmetric(value: float, std: float, reason: str | None) -> Quantity:
     return Quantity(value, std, (value - half, value + half), reason)
 
 
+class JudgedOrder(Protocol):
+    """What is known of one order, from one record or from all of a campaign."""
+
+    @property
+    def order(self) -> str:
+        """Either "alpha" or "lambda"."""
+
+    @property
+    def status(self) -> str:
+        """As `OrderVerdict` has it."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """95 %."""
+
+
 def headline_json(
     file: str | None,
-    told: Headline,
-    orders: tuple[OrderVerdict, ...],
-    findings: tuple[Finding, ...],
+    told: Numbers,
+    orders: Iterable[JudgedOrder],
+    findings: Iterable[Finding],
 ) -> dict[str, Any]:
     """Write a headline as the JSON document has it.
 
@@ -497,9 +518,9 @@ def headline_json(
     ----------
     file : str or None
         None for the estimate of a whole campaign.
-    told : Headline
-    orders : tuple of OrderVerdict
-    findings : tuple of Finding
+    told : Numbers
+    orders : iterable of JudgedOrder
+    findings : iterable of Finding
 
     Returns
     -------

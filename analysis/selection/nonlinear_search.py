@@ -12,7 +12,7 @@ from analysis.selection.candidates import FREE_STIFFNESS
 from analysis.selection.chance import SURE
 from analysis.selection.nonlinear import KINDS, ModalForces, Term
 from analysis.selection.orders import STRONG
-from analysis.selection.refit import Refit
+from analysis.selection.refit import Refit, unexplained_part
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -145,24 +145,12 @@ def _most_wanted(
     at = refit.objective.linearise(refit.x)
     known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
     every = np.array([forces.column(term) for term in terms], dtype=np.complex128)
-    columns = every * field.noise.weight
-    columns = columns - _projection(columns, known)
+    columns = unexplained_part(every * field.noise.weight, known)
     squares = np.sum(np.abs(columns) ** 2, axis=1)
     along = (columns.conj() @ projected.residual).real
     saved = along**2 / np.maximum(squares, np.finfo(float).tiny)
     most = int(np.argmax(saved))
     return terms[most], max(projected.cost - float(saved[most]), 1e-3 * projected.cost)
-
-
-def _projection(
-    columns: NDArray[np.complex128], known: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Part of the columns that what is free already could explain."""
-    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
-    basis = known[scale > 0] / scale[scale > 0, None]
-    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
-    part: NDArray[np.complex128] = np.linalg.solve(gram, (basis.conj() @ columns.T).real).T @ basis
-    return part
 
 
 def _with_terms(

@@ -93,9 +93,8 @@ def _judged(
     field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
-    coefficient = "zeta" if order == "alpha" else "gamma"
     untold = untold_reason(field, visible)
-    if coefficient not in freest.structure.free and len(visible) >= _MODES_FOR_AN_ORDER:
+    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
         return "absent", "no such damping shows"
     if untold is not None:
         return "not identifiable", untold
@@ -153,9 +152,8 @@ def _integer(candidate: Candidate, order: Order) -> bool:
 def _elsewhere(candidate: Candidate, profile: Profile) -> bool:
     """Whether a candidate with this damping has its order where the profile excludes it."""
     low, high = profile.interval
-    coefficient = "zeta" if profile.order == "alpha" else "gamma"
     here = low <= candidate.fit.parameters[profile.order] <= high
-    return coefficient in candidate.structure.free and not here
+    return candidate.structure.has(profile.order) and not here
 
 
 def rivals(field: Field, within: float) -> tuple[Candidate, ...]:

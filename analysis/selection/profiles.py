@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Final
 from analysis.selection.profile import Profile, Profiled, profile
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from analysis.selection.candidates import Field
     from analysis.selection.profile import Order
 
-_COEFFICIENTS: Final[Mapping[Order, str]] = {"alpha": "zeta", "lambda": "gamma"}
+_ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
 _ROUNDS: Final = 3
 _MISSED: Final = 1e-5
 """Share of a sum of squares, which is some 1e4; BIC counts a parameter as 9."""
@@ -38,9 +36,7 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
         freest = field.freest
         # The order of a damping that does not show could be anything: no walk would tell more.
         walks = {
-            order: profile(field, freest, order)
-            for order, coefficient in _COEFFICIENTS.items()
-            if coefficient in freest.structure.free
+            order: profile(field, freest, order) for order in _ORDERS if freest.structure.has(order)
         }
         before = [candidate.fit.cost for candidate in field.candidates]
         if round_ == _ROUNDS:
@@ -53,7 +49,7 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
             break
     of_alpha, of_lambda = (
         walks[order].profile if order in walks else Profile.unwalked(freest, order)
-        for order in _COEFFICIENTS
+        for order in _ORDERS
     )
     return field, of_alpha, of_lambda
 

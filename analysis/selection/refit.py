@@ -56,6 +56,25 @@ class WithColumns(Objective):
         return replace(at, columns=np.concatenate([at.columns, self._further]))
 
 
+def unexplained_part(
+    columns: NDArray[np.complex128], known: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Part of whitened columns that nothing that is free already could explain, shape (c, K).
+
+    Parameters
+    ----------
+    columns : ndarray of complex, shape (c, K)
+    known : ndarray of complex, shape (k, K)
+        What the free parameters and amplitudes do to the torque, whitened.
+    """
+    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
+    basis = known[scale > 0] / scale[scale > 0, None]
+    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
+    shares = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
+    part: NDArray[np.complex128] = columns - shares.T @ basis
+    return part
+
+
 @dataclass(frozen=True, slots=True)
 class Refit:
     """A minimum: where, of which sum of squares, under which noise.

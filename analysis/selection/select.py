@@ -19,7 +19,6 @@ from analysis.selection.nonlinear_search import nonlinear_forces
 from analysis.selection.orders import EVEN, STRONG, order_verdict, rivals, untold_reason
 from analysis.selection.profile import Profile
 from analysis.selection.profiles import profiled
-from analysis.selection.scale import wrong_scale
 from analysis.selection.verdict import Row, Verdict
 from analysis.selection.visible import visible_modes
 from analysis.selection.whiteness import InputRelation, Whiteness, input_relation, whiteness
@@ -99,8 +98,9 @@ def select(
     """
     linear = Field.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    misread = any(wrong_scale(linear.comparison))
-    field, forces = (linear, ()) if misread else nonlinear_forces(with_air_drag(linear), visible)
+    field, forces = (
+        (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
+    )
     field, changes = along_time(field.with_orders_free())
     if untold_reason(field, visible) is None:
         field, of_alpha, of_lambda = profiled(field)

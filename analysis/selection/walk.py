@@ -11,7 +11,7 @@ import numpy as np
 from analysis.selection.refit import Refit
 from analysis.selection.restart import adapted
 from analysis.selection.valleys import CHI_SQUARE_95, RIDGE, admitted, crossing, dips, gaps
-from analysis.structures import PARAMETERS, Structure
+from analysis.structures import COEFFICIENT_OF, PARAMETERS, Structure
 from analysis.unknowns import ORDER_RANGE
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def with_order(structure: Structure, order: Order) -> Structure:
 
     Damping that the structure lacks comes in, its coefficient free.
     """
-    coefficient = "zeta" if order == "alpha" else "gamma"
+    coefficient = COEFFICIENT_OF[order]
     fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
     free = tuple(name for name in PARAMETERS if name not in fixed)
     return Structure(structure.name, free, MappingProxyType(fixed))

@@ -352,17 +352,18 @@ def _step(
     end = state_at(period_s)
     return np.vstack(
         [
-            end,
-            model.angle @ end,
-            model.velocity @ end,
-            torque_at(period_s),
-            holding_torque @ end,
+            *_told(model, end, torque_at(period_s), holding_torque),
             model.angle @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
             if model.sensed_torque is None
             else model.sensed_torque @ state_at(torque_instant_s),
         ]
     )
+
+
+def _told(model: CoupledModel, end: Real, torque: Real, holding_torque: Real) -> tuple[Real, ...]:
+    """Rows of the state at a period's end, and of what is told of it beside the sensors."""
+    return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
 
 
 def _held(
@@ -395,11 +396,7 @@ def _held(
     end = state_at(period_s)
     return np.vstack(
         [
-            end,
-            model.angle @ end,
-            model.velocity @ end,
-            model.sensor_torque @ end,
-            holding_torque @ end,
+            *_told(model, end, model.sensor_torque @ end, holding_torque),
             model.angle @ state_at(angle_instant_s),
             model.sensor_torque @ state_at(torque_instant_s),
         ]

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -173,6 +174,8 @@ def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
         stdout=subprocess.PIPE,
     )
     try:
+        while not Path(f"/proc/{control.pid}/cmdline").read_bytes():
+            time.sleep(0.001)  # its program is being loaded, and has no arguments yet
         said = what_is_left(ended, os.getuid())
         assert f"control process {control.pid} still runs" in said
         assert "STO" in said

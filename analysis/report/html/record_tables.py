@@ -98,7 +98,7 @@ def sizes_table(subject: Subject) -> Table:
     told = subject.headline
     return Table(
         "damping_sizes",
-        "Loss factor of either damping at the frequency where it does not depend on its order",
+        "Loss factor of either damping at the frequency where it depends least on its order",
         (
             Column("Damping", "damping", numeric=False),
             Column("Quantity", "quantity", numeric=False),
@@ -111,7 +111,8 @@ def sizes_table(subject: Subject) -> Table:
         ),
         tuple(_size_row(told, each) for each in told.sizes),
         (
-            "Coefficient and order are strongly correlated; these are not.",
+            "Coefficient and order are strongly correlated; a loss factor is known far better than "
+            "either.",
             *_reasons(each.size for each in told.sizes),
         ),
     )

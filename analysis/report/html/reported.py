@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from analysis.structures import COEFFICIENT_OF
+
 if TYPE_CHECKING:
     from collections.abc import Collection
 
@@ -13,17 +15,7 @@ if TYPE_CHECKING:
 
 MARK: Final = "†"
 
-_COEFFICIENTS: Final = {"alpha": "zeta", "lambda": "gamma"}
 _SYMBOLS: Final = {"alpha": "α", "lambda": "λ"}
-
-
-def has(structure: Structure, name: str) -> bool:
-    """Whether a parameter means anything in a structure."""
-    if name in ("zeta", "alpha"):
-        return structure.internal
-    if name in ("gamma", "lambda"):
-        return structure.external
-    return True
 
 
 def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str]:
@@ -43,7 +35,7 @@ def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str
         order only, as its very unit shows.
     """
     return frozenset(
-        name for order in withheld for name in (order, _COEFFICIENTS[order]) if has(structure, name)
+        name for order in withheld for name in (order, COEFFICIENT_OF[order]) if structure.has(name)
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from analysis.report.html.record_tables import PARAMETERS
-from analysis.report.html.reported import footnotes, greyed, has, marked, unreported
+from analysis.report.html.reported import footnotes, greyed, marked, unreported
 from analysis.report.html.table import ABSENT, Cell, Column, Number, Table, count, estimate, number
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def _damping(fit: RecordFit, withheld: Collection[str], *, excluded: bool) -> li
     doubtful = unreported(fit.structure, withheld)
     shown: list[Number] = []
     for name in _DAMPING:
-        if not has(fit.structure, name):
+        if not fit.structure.has(name):
             shown += [number(None), number(None)]
             continue
         std = fit.std[name]
