@@ -1,10 +1,10 @@
 """What the analyzer says of records of rigs that are not as it takes them to be.
 
 ``bench_wrong_models.py [--records N] [--defect TEXT ...] [--rig NAME ...]`` makes N records of each
-defect (those whose names hold one of the texts) and rig, judges them, and prints a line for each
-defect: in how many records nothing but noise is said to remain, what is named, and the worst error
-of what is reported without a flag, in its own standard deviations. ``--say`` prints all that is
-said of each record.
+defect (those whose names hold one of the texts) by turns on its rigs, at least one on each, judges
+them, and prints a line for each defect: in how many records nothing but noise is said to remain,
+what is named, and the worst error of what is reported without a flag, in its own standard
+deviations. ``--say`` prints all that is said of each record.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _error(name: str, quantity: Quantity, true: float) -> Iterator[tuple[str, fl
 def main() -> None:
     """Judge the records asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--records", type=int, default=1, help="of each defect and rig")
+    parser.add_argument("--records", type=int, default=1, help="of each defect")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
     parser.add_argument("--defect", nargs="+", default=[""], help="only those that hold this text")
     parser.add_argument("--rig", nargs="+", choices=list(RIGS), default=list(RIGS))
@@ -79,10 +79,10 @@ def main() -> None:
         if not any(text in defect for text in given.defect):
             continue
         judged = []
-        for name in rigs:
-            if name not in given.rig:
-                continue
-            for seed in range(given.first, given.first + given.records):
+        chosen = [name for name in rigs if name in given.rig]
+        for name in chosen:
+            share = math.ceil(given.records / len(chosen))
+            for seed in range(given.first, given.first + share):
                 one = Judged.of(make(RIGS[name], seed))
                 judged.append(one)
                 if given.say:
