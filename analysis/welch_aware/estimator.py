@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rigd.spectral import segment_count
-from rigd.spectral.windows import window_named
+from rigd.spectral.frf import window_named
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,8 +1,8 @@
 """Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
 
 from rigd.beam.air_drag import DragGrid
-from rigd.beam.coupled import CoupledModel, couple, held_inputs, propagator, with_filter
 from rigd.beam.deflection import DeflectionFilter
+from rigd.beam.model import PARAMETERS, Beam, Damping, TransferGrid, transfer, transfer_and_gradient
 from rigd.beam.modes import (
     Mode,
     clamped_free_eigenvalues,
@@ -12,12 +12,18 @@ from rigd.beam.modes import (
     poles,
     undamped_frequencies_rad_s,
 )
-from rigd.beam.parameters import Beam, Damping
-from rigd.beam.realisation import RealisationError, realise
-from rigd.beam.state_space import Realisation
+from rigd.beam.realisation import (
+    CoupledModel,
+    Realisation,
+    RealisationError,
+    couple,
+    held_inputs,
+    propagator,
+    realise,
+    with_filter,
+)
 from rigd.beam.tip import SMALL_SLOPE_RAD, TipMotion, tip_motion, tip_response
 from rigd.beam.tip_mass import LoadedBeam, LoadedResponse, loaded_response
-from rigd.beam.transfer_function import PARAMETERS, TransferGrid, transfer, transfer_and_gradient
 
 __all__ = [
     "PARAMETERS",

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam.model import Beam
 from rigd.beam.modes import clamped_free_eigenvalues, mode_shape
-from rigd.beam.parameters import Beam
 
 Real = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ the zero at standstill where it belongs: for a sinusoid of frequency omega that 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam.model import Beam, Damping
 from rigd.beam.modes import clamped_free_eigenvalues, mode_shape, poles_for_eigenvalues
-from rigd.beam.parameters import Beam, Damping
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigd.beam.parameters import Beam, Damping
+from rigd.beam.model import Beam, Damping
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

@@ -2,7 +2,7 @@
 
 Of the boundary value problem of the beam, clamped on the shaft and free at its tip, the tip's
 displacement and slope over the angle are, with ``z = beta L`` as in
-`rigd.beam.transfer_function`::
+`rigd.beam.model`::
 
     Y(L)  = L (sin z + sinh z) / (z (1 + cos z cosh z))
     Y'(L) = (cos z + cosh z) / (1 + cos z cosh z)
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam.parameters import Beam, Damping
+from rigd.beam.model import Beam, Damping
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]

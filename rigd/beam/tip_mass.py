@@ -5,7 +5,7 @@ share ``mu = m s² / (L EI p)``, the tip's condition ``EI c y''' = m s² y`` tur
 
     G = -(EI/L) c (F + mu U) / (1 - mu F),    U = 2 z² sin z sinh z / (1 + cos z cosh z)
 
-F as in `rigd.beam.transfer_function`. A clamp that turns by kappa for a torque on the beam's root
+F as in `rigd.beam.model`. A clamp that turns by kappa for a torque on the beam's root
 makes ``G / (1 + kappa G)`` of it.
 
 F and U are functions of q alone; ``q d/dq`` of them needs one more, ``B = z (cos z sinh z +
@@ -20,8 +20,8 @@ from math import factorial
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam.model import Beam, Damping
 from rigd.beam.modes import poles_for_eigenvalues
-from rigd.beam.parameters import Beam, Damping
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -7,8 +7,13 @@ from rigd.control.closed_loop import (
     check_stability,
     close_loop,
 )
-from rigd.control.design import ControlDesignError, ControlSettings, PidGains, design_pid
-from rigd.control.pid import PidController
+from rigd.control.pid import (
+    ControlDesignError,
+    ControlSettings,
+    PidController,
+    PidGains,
+    design_pid,
+)
 
 __all__ = [
     "ClosedLoop",

@@ -21,8 +21,13 @@ from rigd.beam import (
     realise,
     undamped_frequencies_rad_s,
 )
-from rigd.control.design import ControlDesignError, ControlSettings, design_pid
-from rigd.control.pid import derivative_coefficients, lowpass_coefficients
+from rigd.control.pid import (
+    ControlDesignError,
+    ControlSettings,
+    derivative_coefficients,
+    design_pid,
+    lowpass_coefficients,
+)
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

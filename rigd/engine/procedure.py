@@ -27,7 +27,7 @@ from rigd.engine.signals import StopRequest
 from rigd.engine.standstill import Standstill
 from rigd.profile import Profile
 from rigd.safety import LOOK_EVERY
-from rigd.safety.interlocks import BY_NAME, OVERLOADED
+from rigd.safety.limits import BY_NAME, OVERLOADED
 
 _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002

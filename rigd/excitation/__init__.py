@@ -4,11 +4,9 @@ A reference is relative to the angle at which the session starts. Every excitati
 three segments: rest (reference zero), sweep, ring-down (the sweep's last value held).
 """
 
-from rigd.excitation.csv_file import from_csv
+from rigd.excitation.from_file import from_csv
 from rigd.excitation.narrow_sweeps import modes
-from rigd.excitation.options import ExcitationError
-from rigd.excitation.record import Excitation
-from rigd.excitation.signals import chirp, hold, multisine, step
+from rigd.excitation.signals import Excitation, ExcitationError, chirp, hold, multisine, step
 
 __all__ = [
     "Excitation",

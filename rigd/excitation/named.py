@@ -4,11 +4,9 @@ import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from rigd.excitation.bands import Foresight
-from rigd.excitation.csv_file import from_csv
-from rigd.excitation.narrow_sweeps import modes
-from rigd.excitation.record import Excitation
-from rigd.excitation.signals import chirp, hold, multisine, step
+from rigd.excitation.from_file import from_csv
+from rigd.excitation.narrow_sweeps import Foresight, modes
+from rigd.excitation.signals import Excitation, chirp, hold, multisine, step
 
 Value = float | int | str | Path
 

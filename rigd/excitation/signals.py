@@ -1,23 +1,146 @@
-"""The excitations that are computed: chirp, hold, step, random-phase multisine."""
+"""Reference signals: angle, speed and acceleration by time."""
 
 from collections.abc import Mapping
-from math import pi
+from dataclasses import dataclass
+from math import isfinite, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.excitation.options import (
-    ExcitationError,
-    finite,
-    frequency,
-    not_negative,
-    positive,
-    whole_ticks,
-    within_a_turn,
-)
-from rigd.excitation.record import Excitation, assemble, lay_out_segments
+SAMPLES_PER_PERIOD = 4
+"""Fewest samples in a period of the reference: with less it is no sine any more."""
+
+
+class ExcitationError(ValueError):
+    """An option of an excitation is absurd; the message names option, value, unit and remedy."""
+
+
+def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
+    """Return a time as its number of ticks; refuse one that is no whole number of them."""
+    ticks = round(value_s * rate_hz)
+    if ticks < 2 or abs(ticks / rate_hz - value_s) > 1e-9 * value_s:
+        raise ExcitationError(
+            f"{option} = {value_s:g} s is not a whole number of ticks at {rate_hz:g} Hz; choose "
+            f"for example {max(ticks, 2) / rate_hz:g} s."
+        )
+    return ticks
+
+
+def finite(option: str, value: float, unit: str) -> None:
+    """Refuse what is not a finite number."""
+    if not isfinite(value):
+        raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
+
+
+def positive(option: str, value: float, unit: str) -> None:
+    """Refuse what is not a finite number above 0."""
+    finite(option, value, unit)
+    if value <= 0.0:
+        raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
+
+
+def not_negative(option: str, value: float) -> None:
+    """Refuse a time that is not finite or below 0 s."""
+    finite(option, value, "s")
+    if value < 0.0:
+        raise ExcitationError(f"{option} = {value:g} s must not be negative.")
+
+
+def within_a_turn(option: str, value_rad: float) -> None:
+    """Refuse an angle beyond a full turn to either side."""
+    if abs(value_rad) > 2.0 * pi:
+        raise ExcitationError(
+            f"{option} = {value_rad:g} rad is more than a full turn; give an angle in rad of at "
+            f"most {2.0 * pi:.3f}."
+        )
+
+
+def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool = False) -> None:
+    """Refuse a frequency that is not above 0, or has too few samples a period."""
+    finite(option, value, "Hz")
+    highest = rate_hz / SAMPLES_PER_PERIOD
+    if not (value > 0.0 or (zero_allowed and value == 0.0)):
+        bound = "must not be negative" if zero_allowed else "must be more than 0 Hz"
+        raise ExcitationError(f"{option} = {value:g} Hz {bound}.")
+    if value > highest:
+        raise ExcitationError(
+            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples a period at "
+            f"{rate_hz:g} Hz; choose at most {highest:g} Hz."
+        )
+
 
 FloatArray = NDArray[np.float64]
+
+MAX_TICKS = 7_200_000
+"""Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """A reference, tick by tick.
+
+    Attributes
+    ----------
+    kind
+        ``chirp``, ``hold``, ``step``, ``multisine``, ``file`` or ``modes``.
+    parameters
+        The options it was made from, and what follows from them, with units in the names.
+    rate_hz
+        Ticks a second.
+    reference_rad
+        Shape (n,), relative to the start angle; read-only.
+    segments
+        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive).
+    """
+
+    kind: str
+    parameters: Mapping[str, float | int | str]
+    rate_hz: float
+    reference_rad: FloatArray
+    segments: Mapping[str, tuple[int, int]]
+
+
+def lay_out_segments(
+    rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
+) -> dict[str, tuple[int, int]]:
+    """Return rest, sweep and ring-down in ticks; the ring-down absorbs what rounding leaves."""
+    not_negative("rest_s", rest_s)
+    positive("duration_s", duration_s, "s")
+    not_negative("ring_down_s", ring_down_s)
+    check_ticks("The session", (rest_s + duration_s + ring_down_s) * rate_hz, rate_hz)
+    first = round(rate_hz * rest_s)
+    end = first + round(rate_hz * duration_s)
+    last = max(end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
+    if end - first < 2:
+        raise ExcitationError(
+            f"duration_s = {duration_s:g} s is less than two ticks at {rate_hz:g} Hz; choose at "
+            f"least {2 / rate_hz:g} s."
+        )
+    return {"rest": (0, first), "sweep": (first, end), "ring_down": (end, last)}
+
+
+def check_ticks(what: str, ticks: float, rate_hz: float) -> None:
+    """Refuse what would take more than `MAX_TICKS` ticks."""
+    if ticks > MAX_TICKS:
+        raise ExcitationError(
+            f"{what} would take {ticks / rate_hz:g} s; {MAX_TICKS / rate_hz:g} s is the most at "
+            f"{rate_hz:g} Hz: shorten it or run several sessions."
+        )
+
+
+def assemble(
+    kind: str,
+    parameters: Mapping[str, float | int | str],
+    rate_hz: float,
+    segments: Mapping[str, tuple[int, int]],
+    sweep: FloatArray,
+) -> Excitation:
+    """Put a sweep (n,) between rest and ring-down."""
+    reference = np.zeros(segments["ring_down"][1])
+    reference[slice(*segments["sweep"])] = sweep
+    reference[slice(*segments["ring_down"])] = sweep[-1]
+    reference.flags.writeable = False
+    return Excitation(kind, parameters, rate_hz, reference, segments)
 
 
 def chirp(

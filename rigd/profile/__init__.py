@@ -7,7 +7,7 @@ and does not pay for the validation.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from rigd.profile.settings import Profile, RealtimeSettings, SessionSettings
+from rigd.profile.schema import Profile, RealtimeSettings, SessionSettings
 
 if TYPE_CHECKING:
     from rigd.profile.load import ProfileError, load_profile

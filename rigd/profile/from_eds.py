@@ -14,7 +14,7 @@ from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATC
 from rigd.devices.cia402.suitability import Finding, Grade, judge
 from rigd.devices.eds import Eds
 from rigd.profile.load import ProfileError, profile_of
-from rigd.profile.settings import Profile, keys
+from rigd.profile.schema import Profile, keys
 from rigd.profile.write import Setting, SettingValue, with_head, with_settings
 
 

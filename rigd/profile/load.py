@@ -15,8 +15,9 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd.devices.parameters import RigParameters
-from rigd.profile import complaints, wiring
-from rigd.profile.settings import (
+from rigd.profile import diagnostics as complaints
+from rigd.profile import diagnostics as wiring
+from rigd.profile.schema import (
     OPTIONAL_SECTIONS,
     SECTIONS,
     SOURCES,
@@ -80,7 +81,7 @@ def profile_of(text: str, path: Path) -> Profile:
     if not problems:
         problems.extend(_find_eds(path, values))
         problems.extend(complaints.contradictions(values))
-        problems.extend(wiring.contradictions(values))
+        problems.extend(wiring.wiring_contradictions(values))
     if problems:
         # An array that is too short is found once for each number it lacks.
         raise ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.profile.load import ProfileError
-from rigd.profile.settings import is_number, keys
+from rigd.profile.schema import is_number, keys
 
 SettingValue = bool | int | float | str | tuple[str, ...]
 

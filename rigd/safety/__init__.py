@@ -4,10 +4,8 @@ The software stops a session that leaves its limits; it is no safety function. T
 STO of the drive (docs/safety.md).
 """
 
-from rigd.safety.interlocks import INTERLOCKS, Action, Checked, Interlock
-from rigd.safety.limits import Limits
-from rigd.safety.violation import Violation
-from rigd.safety.watch import LOOK_EVERY, LimitWatch
+from rigd.safety.limits import INTERLOCKS, Action, Checked, Interlock, Limits, Violation
+from rigd.safety.monitor import LOOK_EVERY, LimitWatch
 
 __all__ = [
     "INTERLOCKS",

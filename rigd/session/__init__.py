@@ -8,8 +8,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rigd.session.errors import SessionError, SessionExistsError
-    from rigd.session.format import SAMPLE_DTYPE, SAMPLE_SIZE, Status
+    from rigd.session.format import (
+        SAMPLE_DTYPE,
+        SAMPLE_SIZE,
+        SessionError,
+        SessionExistsError,
+        Status,
+    )
     from rigd.session.info import SessionInfo, describe, readable_texts
     from rigd.session.reader import (
         Event,
@@ -19,8 +24,7 @@ if TYPE_CHECKING:
         read_session,
         read_timings,
     )
-    from rigd.session.recovery import Recovery, recover
-    from rigd.session.remedy import holds_samples
+    from rigd.session.recovery import Recovery, holds_samples, recover
     from rigd.session.writer import SessionWriter
 
 __all__ = [

@@ -1,4 +1,6 @@
-"""Byte layout of the messages of a session file: packing for the loop, decoding for the reader.
+"""What can go wrong with a session file, told to the user.
+
+Byte layout of the messages of a session file: packing for the loop, decoding for the reader.
 
 Every message of ``/rig/sample``, ``/rig/control`` and ``/rig/timing`` is protobuf of *fixed
 layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the order below,
@@ -16,6 +18,15 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+
+
+class SessionError(Exception):
+    """A session file cannot be read or written; the message names the file and the remedy."""
+
+
+class SessionExistsError(SessionError):
+    """The file to be written exists already, and nothing is ever overwritten."""
+
 
 Buffer = bytes | bytearray | memoryview
 

@@ -11,8 +11,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from rigd.printable import printable
-from rigd.session.errors import SessionError
-from rigd.session.format import Status
+from rigd.session.format import SessionError, Status
 from rigd.session.reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
 
 _RECOVERED: Final = "recovered_"

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session.errors import SessionError
 from rigd.session.format import (
     CONTROL_DTYPE,
     CONTROL_TYPES,
@@ -26,6 +25,7 @@ from rigd.session.format import (
     TIMING_TYPES,
     TIMING_WIRE_DTYPE,
     Buffer,
+    SessionError,
     is_fixed_layout,
     to_native,
 )

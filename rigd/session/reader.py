@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.session.durable import is_being_written
-from rigd.session.errors import SessionError
-from rigd.session.format import to_native
+from rigd.session.format import SessionError, to_native
 from rigd.session.mcap_limits import McapError, McapTooLargeError
 from rigd.session.mcap_reader import McapContents, Stretch, Taker, read_mcap
 from rigd.session.mcap_writer import MAGIC, MESSAGE_HEAD
@@ -31,6 +29,7 @@ from rigd.session.message_decoder import (
     quoted,
 )
 from rigd.session.schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
+from rigd.session.writer import is_being_written
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -440,7 +439,7 @@ def _foreign(path: Path, error: McapError) -> SessionError:
 
 
 def _damage_message(path: Path, contents: McapContents) -> str:
-    from rigd.session.remedy import remedy  # it reads files, too
+    from rigd.session.recovery import remedy  # it reads files, too
 
     if contents.complete:
         return f"{path} is damaged: it {contents.damage}{remedy(path, was_whole=True)}"

@@ -1,4 +1,6 @@
-"""What is left of a torn or damaged session file, made into a sound one.
+"""Recovery of damaged session files.
+
+What is left of a torn or damaged session file, made into a sound one.
 
 Nothing is taken that is not proven: messages, channels and schemas stand in chunks with a checksum
 each, the records ``session`` and ``segments`` are taken from the copy in such a chunk, attachments
@@ -10,6 +12,7 @@ import contextlib
 import hashlib
 import os
 import secrets
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +23,15 @@ import numpy.typing as npt
 from mcap.records import Channel
 
 import rigd
-from rigd.session.durable import copy_new, fsync_directory, is_being_written, rename_new
-from rigd.session.errors import SessionError, SessionExistsError
-from rigd.session.format import SAMPLE_DTYPE, SAMPLE_FIELDS, Status
-from rigd.session.mcap_reader import McapContents, Stretch, message_starts
+from rigd.session.format import (
+    SAMPLE_DTYPE,
+    SAMPLE_FIELDS,
+    SessionError,
+    SessionExistsError,
+    Status,
+)
+from rigd.session.mcap_limits import McapError
+from rigd.session.mcap_reader import McapContents, Stretch, message_starts, read_mcap
 from rigd.session.mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
 from rigd.session.message_decoder import SAMPLES, MessageDecoder
 from rigd.session.reader import (
@@ -35,7 +43,61 @@ from rigd.session.reader import (
     read_session,
 )
 from rigd.session.schema import OWN_TOPICS, SAMPLE_TOPIC, protected_metadata, unprotected_metadata
-from rigd.session.writer import PART_SUFFIX
+from rigd.session.writer import PART_SUFFIX, copy_new, fsync_directory, is_being_written, rename_new
+
+_BEGINNING_BYTES: Final = 1 << 20
+"""In which the first samples are, if there are any."""
+
+
+def holds_samples(path: Path) -> bool:
+    """Tell whether `recover` finds a sample in a file, as far as its beginning says.
+
+    That of a file that cannot be read is not known, and counts as if there were one.
+    """
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(_BEGINNING_BYTES)
+            longer = bool(file.read(1))
+    except OSError:
+        return True
+    try:
+        contents = read_mcap(memoryview(beginning), (), salvage=True)
+    except McapError:
+        return False
+    return longer or contents.count(SAMPLE_TOPIC) > 0
+
+
+def remedy(path: Path, *, was_whole: bool) -> str:
+    """Say how much of an incomplete or damaged file is intact, and how to save that.
+
+    Parameters
+    ----------
+    path : the file
+    was_whole : it was complete once, so that a sound one may be elsewhere
+
+    Returns
+    -------
+    What goes on behind what is wrong with it, from the mark after that on.
+    """
+    try:
+        count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
+    except SessionError:
+        count = 0
+    again = ". Copy it again from where it was recorded"
+    readable = f"; {count} complete samples are readable before that"
+    if not count:
+        nothing = ", so there is nothing to recover"
+        if was_whole:
+            return f"{readable}{nothing}{again}."
+        return f"{readable}{nothing}. Copy it again if there is a whole one, or record it again."
+    target = recovered_path(path)
+    command = f"`rigd recover {shlex.quote(str(path))}`"
+    if os.path.lexists(target):
+        command += f", once {target}, which may hold it already, is moved away"
+    if was_whole:
+        return f"{again}, or save what is intact with {command}."
+    return f"{readable}. Save them with {command}."
+
 
 RECOVERED_FROM: Final = "recovered_from"
 """Key of the record ``outcome`` that marks a recovered file: the name of the one it is from."""

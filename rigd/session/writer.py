@@ -1,6 +1,7 @@
-"""Recorder's side of a session file: blocks of packed messages in, a durable MCAP file out."""
+"""Writing a session file."""
 
 import contextlib
+import errno
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,8 +14,6 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 import rigd
-from rigd.session.durable import copy_new, fsync_directory, mark_as_written, rename_new
-from rigd.session.errors import SessionError, SessionExistsError
 from rigd.session.format import (
     CONTROL_SIZE,
     CONTROL_WIRE_DTYPE,
@@ -23,6 +22,8 @@ from rigd.session.format import (
     TIMING_SIZE,
     TIMING_WIRE_DTYPE,
     Buffer,
+    SessionError,
+    SessionExistsError,
 )
 from rigd.session.mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
 from rigd.session.schema import (
@@ -40,6 +41,84 @@ from rigd.session.schema import (
     protected_metadata,
     schema_data,
 )
+
+try:
+    import fcntl
+except ImportError:  # sessions are recorded on Linux, but read anywhere
+    fcntl = None  # type: ignore[assignment]
+
+
+_COPY_BYTES: Final = 1 << 20
+
+
+def fsync_directory(path: Path) -> None:
+    """Bring the names in a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def copy_new(descriptor: int, target: Path) -> None:
+    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
+    with target.open("xb") as copy:
+        try:
+            position = 0
+            while data := os.pread(descriptor, _COPY_BYTES, position):
+                copy.write(data)
+                position += len(data)
+            copy.flush()
+            os.fsync(copy.fileno())
+        except OSError:
+            target.unlink()
+            raise
+
+
+def rename_new(source: Path, target: Path) -> None:
+    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
+            raise
+        # A file system without hard links (FAT, some network shares): reserve the name, which
+        # fails if anybody has it, and replace the empty file that then is our own.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        source.replace(target)
+    else:
+        source.unlink()
+
+
+def mark_as_written(descriptor: int) -> None:
+    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
+
+    An advisory lock; a file system without locks goes without it.
+    """
+    if fcntl is not None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_being_written(path: Path) -> bool:
+    """Tell whether a living process holds the mark of `mark_as_written`."""
+    if fcntl is None:
+        return False
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    else:
+        return False
+    finally:
+        os.close(descriptor)
+
 
 PART_SUFFIX: Final = ".part"
 

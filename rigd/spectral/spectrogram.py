@@ -5,8 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigd.spectral.low_bins import bins_up_to
-from rigd.spectral.segments import LONGEST_GAP_S, Segments
+from rigd.spectral.running import LONGEST_GAP_S, Segments, bins_up_to
 
 LEAST_DB: Final = -200.0
 """Shown for what is silent, which has no level."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rigd.session.durable import rename_new
+from rigd.session.writer import rename_new
 from rigd.view import APPLICATION_ID
 from rigd.view.sdk import settle_sdk
 

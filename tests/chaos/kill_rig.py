@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from rigd.devices.simulator import find_simulator
-from rigd.safety.interlocks import OVERLOADED
+from rigd.safety.limits import OVERLOADED
 from rigd.session import Status, read_session
 from rigd.sim.wire.control import ask
 

@@ -11,7 +11,7 @@ from rigd.engine.jobs import SessionJob
 from rigd.engine.process import Child, ChildError, packed_object
 from rigd.engine.reference import map_reference, put_reference
 from rigd.engine.ring import shared_memory_fd
-from rigd.excitation.record import MAX_TICKS
+from rigd.excitation.signals import MAX_TICKS
 from rigd.profile import load_profile
 
 PIPE_BYTES = 65_536

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rigd.excitation import ExcitationError
-from rigd.excitation.mode_table import FoundMode, read_modes
+from rigd.excitation.narrow_sweeps import FoundMode, read_modes
 from rigd.service.messages import RequestError, parse_request
 from rigd.session import read_session
 

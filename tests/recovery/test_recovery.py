@@ -10,9 +10,9 @@ from mcap.writer import Writer
 
 from analysis.record import load_record
 from rigd.session import SessionError, SessionExistsError, describe, read_session, recover
-from rigd.session.durable import mark_as_written
 from rigd.session.format import decode_samples
 from rigd.session.schema import SAMPLE_SCHEMA, schema_data
+from rigd.session.writer import mark_as_written
 
 
 def test_damage_of_every_kind_gives_what_was_before_it_or_a_refusal(fuzz_recovery, original):

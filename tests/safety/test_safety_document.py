@@ -7,7 +7,7 @@ import pytest
 
 from rigd.checks.travel import travel_rows, worst_travel
 from rigd.profile import load_profile
-from rigd.profile.settings import keys
+from rigd.profile.schema import keys
 from rigd.safety import INTERLOCKS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "safety.md").read_text("utf-8")

@@ -1,15 +1,50 @@
-"""A reference from a CSV file."""
+"""Reference signals from files."""
 
 import csv
+import os
+import stat
 from math import isfinite
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 import numpy as np
 
-from rigd.excitation.files import open_plain_file
-from rigd.excitation.options import ExcitationError, within_a_turn
-from rigd.excitation.record import Excitation, assemble, check_ticks, lay_out_segments
+from rigd.excitation.signals import (
+    Excitation,
+    ExcitationError,
+    assemble,
+    check_ticks,
+    lay_out_segments,
+    within_a_turn,
+)
+
+
+def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
+    """Open a text file of limited size; a pipe that nobody writes to is not waited for.
+
+    Parameters
+    ----------
+    path
+        Its name.
+    most_bytes
+        The limit.
+    newline
+        As `open` has it.
+
+    Raises
+    ------
+    ExcitationError
+        If it is no such file.
+    OSError
+        If it cannot be opened.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
+        os.close(fd)
+        raise ExcitationError(f"{path}: is not a file of at most {most_bytes / 1e6:g} MB.")
+    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
+
 
 MOST_BYTES: Final = 256_000_000
 

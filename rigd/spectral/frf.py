@@ -1,0 +1,501 @@
+"""Frequency responses and their estimators: Welch, instrumental variable, whole record.
+
+Auto- and cross-spectra of two records, summed over segments, and what follows from the sums.
+
+H1, H2 and Hv: J. S. Bendat and A. G. Piersol, "Random Data".
+
+Welch's estimate of a frequency response, with the segmentation the paper used.
+
+P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans.
+Audio Electroacoust. 15 (1967) 70-73.
+
+Frequency response from one transform of the whole record.
+
+The empirical transfer function estimate of L. Ljung, "System Identification", section 6.3. The
+paper compares Welch's estimate with it.
+
+Frequency response within a control loop, with the loop's reference as instrument.
+
+A controller that feeds a measured output back lets the sensor's noise move the input. Noise and
+input are correlated then, and the estimates that average products of the two take that for
+response: H1 by the share that such motion has in the input's power. The reference owes nothing to
+the noise, so the cross-spectra with it have it averaged out: P. E. Wellstead, "Non-parametric
+methods of system identification", Automatica 17 (1981) 55-69.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Estimator = Literal["h1", "h2", "hv", "iv", "fft"]
+
+
+class SpectralError(ValueError):
+    """A record or a setting from which no frequency response can be estimated."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrequencyResponse:
+    """Estimated ratio of output to input, bin by bin.
+
+    Attributes
+    ----------
+    frequency_hz : ndarray of float, shape (n,)
+        Increasing.
+    response : ndarray of complex, shape (n,)
+        Output over input, in the unit of the one per unit of the other. An output that lags the
+        input has a negative phase. NaN in a bin where the input has no power at all.
+    coherence : ndarray of float, shape (n,), or None
+        Ordinary coherence, 0 to 1; None where fewer than two segments leave it without meaning.
+    segments : int
+        Number of segments that were averaged.
+    estimator : {"h1", "h2", "hv", "iv", "fft"}
+    """
+
+    frequency_hz: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    coherence: NDArray[np.float64] | None
+    segments: int
+    estimator: Estimator
+
+    def band(self, first_hz: float, last_hz: float) -> "FrequencyResponse":
+        """Bins from `first_hz` to `last_hz`, both included.
+
+        Raises
+        ------
+        SpectralError
+            If no bin lies in the band.
+        """
+        # A rounding error in the caller's arithmetic must not cost the bin at either end.
+        slack = 1e-9 * max(abs(first_hz), abs(last_hz))
+        first = int(np.searchsorted(self.frequency_hz, first_hz - slack, side="left"))
+        end = int(np.searchsorted(self.frequency_hz, last_hz + slack, side="right"))
+        if first >= end:
+            raise SpectralError(
+                f"The band {first_hz:g} to {last_hz:g} Hz holds no bin of a frequency response "
+                f"that runs from {self.frequency_hz[0]:g} to {self.frequency_hz[-1]:g} Hz; "
+                "choose a band inside it."
+            )
+        return replace(
+            self,
+            frequency_hz=self.frequency_hz[first:end],
+            response=self.response[first:end],
+            coherence=None if self.coherence is None else self.coherence[first:end],
+        )
+
+    def without_delays(self, *, input_delay_s: float, output_delay_s: float) -> "FrequencyResponse":
+        """Return the response between the quantities themselves, given the age of their samples.
+
+        Parameters
+        ----------
+        input_delay_s, output_delay_s : float
+            Age of a sample at the time it is stamped with, in s; positive: the value is older.
+
+        Notes
+        -----
+        The delays are pure shifts in time, so the response is multiplied by
+        ``exp(j omega (output_delay - input_delay))``.
+        """
+        advance_s = output_delay_s - input_delay_s
+        shift = np.exp(2j * np.pi * advance_s * self.frequency_hz)
+        return replace(self, response=self.response * shift)
+
+
+def checked_records(
+    input_: ArrayLike, output: ArrayLike, rate_hz: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both records as float arrays of one dimension, equal length and finite values.
+
+    Raises
+    ------
+    SpectralError
+        Naming which record is wrong, and how.
+    """
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise SpectralError(f"The sampling rate must be a positive number of Hz, not {rate_hz!r}.")
+    x = np.asarray(input_, dtype=np.float64)
+    y = np.asarray(output, dtype=np.float64)
+    if x.ndim != 1 or x.shape != y.shape:
+        raise SpectralError(
+            "Input and output must be two records of one dimension and equal length; "
+            f"their shapes are {x.shape} and {y.shape}."
+        )
+    for name, record in (("input", x), ("output", y)):
+        if not np.isfinite(record).all():
+            count = int(np.count_nonzero(~np.isfinite(record)))
+            raise SpectralError(
+                f"{count} of {record.size} samples of the {name} are NaN or infinite; "
+                "fill or cut them before estimating a frequency response."
+            )
+    if not x.any():
+        raise SpectralError(
+            f"The input is zero in all of its {x.size} samples: nothing was excited, "
+            "so there is no frequency response to estimate."
+        )
+    return x, y
+
+
+# All symmetric, as MATLAB's are by default; scipy's are periodic unless told otherwise.
+_WINDOWS: Final[dict[str, Callable[[int], NDArray[np.float64]]]] = {
+    "hamming": np.hamming,
+    "hann": np.hanning,
+    "rectangular": np.ones,
+}
+
+
+def window_named(name: str) -> Callable[[int], NDArray[np.float64]]:
+    """Return the function from a length n to the symmetric window (n,) of that name.
+
+    Raises
+    ------
+    SpectralError
+        If there is none.
+    """
+    if name not in _WINDOWS:
+        raise SpectralError(f"There is no window {name!r}; choose one of {', '.join(_WINDOWS)}.")
+    return _WINDOWS[name]
+
+
+PAPER_RATE_HZ: Final = 1000.0
+PAPER_SEGMENT_LENGTH: Final = 17266
+PAPER_OVERLAP: Final = 2590
+PAPER_NFFT: Final = 160_000
+PAPER_SEGMENTS: Final = 8
+PAPER_OVERLAP_FRACTION: Final = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Segmentation:
+    """Lengths of Welch's segments, their overlap and their transform, all in samples."""
+
+    segment_length: int = PAPER_SEGMENT_LENGTH
+    overlap: int = PAPER_OVERLAP
+    nfft: int = PAPER_NFFT
+
+
+def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
+    """Segments for a record of which nothing but the length is known.
+
+    They last as long as the paper's, whose transform they share. A record too short for one of
+    those is divided like the paper's, into eight with 15 % of overlap; one too short even for that
+    is a single segment.
+
+    Parameters
+    ----------
+    samples
+        Length of the record.
+    rate_hz
+        Sampling rate.
+    """
+    scale = rate_hz / PAPER_RATE_HZ
+    length, overlap = round(PAPER_SEGMENT_LENGTH * scale), round(PAPER_OVERLAP * scale)
+    if length < 2 or segment_count(samples, length, overlap) == 0:
+        try:
+            length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
+        except SpectralError:
+            length, overlap = max(samples, 2), 0
+    return Segmentation(length, overlap, max(round(PAPER_NFFT * scale), length))
+
+
+def segment_count(samples: int, segment_length: int, overlap: int) -> int:
+    """Whole segments that fit a record; what is left over at its end goes unused."""
+    return max(0, (samples - overlap) // (segment_length - overlap))
+
+
+def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tuple[int, int]:
+    """Longest segments that fit a record `segments` times, and their overlap in samples.
+
+    The overlap is rounded to the nearest sample. Rounding it down, as is usual, makes eight
+    segments of 15 % overlap miss a record of 120 000 samples by five: seven are then averaged
+    without a word, the record ends at 105.3 s and the third resonance of a 120 s chirp is lost.
+
+    Returns
+    -------
+    (segment_length, overlap) : tuple of int
+        ``segment_lengths(120_000, 8, 0.15) == (17266, 2590)``, the paper's.
+
+    Raises
+    ------
+    SpectralError
+        If the record is too short for that many segments.
+    """
+    if segments < 1 or not 0 <= overlap_fraction < 1:
+        raise SpectralError(
+            "Welch needs at least one segment and an overlap from 0 to below 1 (a fraction of the "
+            f"segment), not {segments} segments with an overlap of {overlap_fraction:g}."
+        )
+
+    def end_of_last(length: int) -> int:
+        return length + (segments - 1) * (length - round(overlap_fraction * length))
+
+    # The end grows with the length but for jumps of rounding, so start above and walk down.
+    length = int(samples / (1 + (segments - 1) * (1 - overlap_fraction))) + segments + 1
+    while length > 1 and end_of_last(length) > samples:
+        length -= 1
+    overlap = round(overlap_fraction * length)
+    if length < 2 or overlap >= length or end_of_last(length) > samples:
+        raise SpectralError(
+            f"A record of {samples} samples is too short for {segments} segments "
+            f"with an overlap of {overlap_fraction:.0%}; ask for fewer segments."
+        )
+    return length, overlap
+
+
+def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
+    """Refuse lengths that make no sense together.
+
+    Raises
+    ------
+    SpectralError
+        Naming which, and why.
+    """
+    if segment_length < 2 or not 0 <= overlap < segment_length:
+        raise SpectralError(
+            "A Welch segment needs at least 2 samples and an overlap from 0 to below its length, "
+            f"not a length of {segment_length} with an overlap of {overlap} samples."
+        )
+    if nfft < segment_length:
+        raise SpectralError(
+            f"nfft = {nfft} samples is shorter than a segment of {segment_length}: "
+            "segments are padded to nfft, never cut; choose it at least as long."
+        )
+
+
+@dataclass(slots=True)
+class CrossSpectra:
+    """Sums over segments, bin by bin.
+
+    Common factors of the densities (rate, power of the window, number of segments) cancel in every
+    ratio that is formed, so they are left out.
+
+    Attributes
+    ----------
+    sxx, syy : ndarray of float, shape (n,)
+        Of the input's and the output's squared magnitudes.
+    sxy : ndarray of complex, shape (n,)
+        Of the input's conjugate times the output.
+    segments : int
+        How many were added.
+    """
+
+    sxx: NDArray[np.float64]
+    syy: NDArray[np.float64]
+    sxy: NDArray[np.complex128]
+    segments: int = 0
+
+    @classmethod
+    def of_nothing(cls, bins: int) -> "CrossSpectra":
+        """Return sums to begin with."""
+        return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
+
+    def copy(self) -> "CrossSpectra":
+        """Return sums of the same segments, to be added to apart from these."""
+        return CrossSpectra(self.sxx.copy(), self.syy.copy(), self.sxy.copy(), self.segments)
+
+    def add(self, fx: NDArray[np.complex128], fy: NDArray[np.complex128]) -> None:
+        """Add a segment by the transforms (n,) of its input and its output."""
+        self.sxx += power(fx)
+        self.syy += power(fy)
+        self.sxy += fx.conj() * fy
+        self.segments += 1
+
+    def response(
+        self, frequency_hz: NDArray[np.float64], estimator: Literal["h1", "h2", "hv"]
+    ) -> FrequencyResponse:
+        """Return the response on the bins `frequency_hz` (n,); NaN where the input has no power."""
+        return FrequencyResponse(
+            frequency_hz=frequency_hz,
+            response=self._ratio(estimator),
+            coherence=self._coherence() if self.segments > 1 else None,
+            segments=self.segments,
+            estimator=estimator,
+        )
+
+    def _ratio(self, estimator: Literal["h1", "h2", "hv"]) -> NDArray[np.complex128]:
+        """Return output over input."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if estimator == "h1":
+                return self.sxy / self.sxx
+            if estimator == "h2":
+                # Syx, the conjugate of Sxy, is what leaves the phase as H1 has it.
+                return self.syy / self.sxy.conj()
+            return self.sxy / np.abs(self.sxy) * np.sqrt(self.syy / self.sxx)
+
+    def _coherence(self) -> NDArray[np.float64]:
+        """Return the ordinary coherence, 0 where either record has no power."""
+        both = self.sxx * self.syy
+        coherence = np.divide(power(self.sxy), both, out=np.zeros_like(both), where=both > 0)
+        return np.minimum(coherence, 1.0)  # Cauchy-Schwarz, up to rounding
+
+
+def power(transform: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return the squared magnitude."""
+    return transform.real**2 + transform.imag**2
+
+
+def welch_response(
+    input_: ArrayLike,
+    output: ArrayLike,
+    rate_hz: float,
+    *,
+    segment_length: int = PAPER_SEGMENT_LENGTH,
+    overlap: int = PAPER_OVERLAP,
+    nfft: int = PAPER_NFFT,
+    window: str = "hamming",
+    estimator: Literal["h1", "h2", "hv"] = "h1",
+) -> FrequencyResponse:
+    """Frequency response from averaged cross- and auto-spectra of windowed segments.
+
+    Parameters
+    ----------
+    input_, output : array_like, shape (n,)
+    rate_hz : float
+        Sampling rate.
+    segment_length, overlap : int
+        In samples. The defaults are the paper's: eight segments of a record of 120 000.
+    nfft : int
+        Length of the transform in samples, at least `segment_length`: segments are padded with
+        zeros, which puts bins closer together without resolving more.
+    window : {"hamming", "hann", "rectangular"}
+        Symmetric. No trend is removed from the segments.
+    estimator : {"h1", "h2", "hv"}
+        H1 = Sxy/Sxx is biased low by noise on the input, H2 = Syy/Syx high by noise on the
+        output. Hv, their geometric mean, has the phase of both and lies between them; unlike
+        the one from total least squares it does not depend on the units of the two records.
+
+    Returns
+    -------
+    FrequencyResponse
+        ``nfft // 2 + 1`` bins from 0 to half the rate.
+
+    Raises
+    ------
+    SpectralError
+        If the record is shorter than one segment, or a record or setting makes no sense.
+    """
+    x, y = checked_records(input_, output, rate_hz)
+    check_segmentation(segment_length, overlap, nfft)
+    if estimator not in ("h1", "h2", "hv"):
+        raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
+    taper = window_named(window)(segment_length)
+    count = segment_count(x.size, segment_length, overlap)
+    if count == 0:
+        raise SpectralError(
+            f"The record has {x.size} samples ({x.size / rate_hz:g} s), fewer than one Welch "
+            f"segment of {segment_length} ({segment_length / rate_hz:g} s); "
+            "record for longer or ask for shorter segments."
+        )
+    bins = nfft // 2 + 1
+    sums = CrossSpectra.of_nothing(bins)
+    # Held, because memory of this size is dear to get anew.
+    fx, fy = np.empty((2, bins), dtype=np.complex128)
+    # One segment at a time stays in the cache, which a whole batch does not.
+    for k in range(count):
+        segment = slice(start := k * (segment_length - overlap), start + segment_length)
+        np.fft.rfft(x[segment] * taper, nfft, out=fx)
+        np.fft.rfft(y[segment] * taper, nfft, out=fy)
+        sums.add(fx, fy)
+    return sums.response(np.arange(bins) * rate_hz / nfft, estimator)
+
+
+def fft_response(
+    input_: ArrayLike, output: ArrayLike, rate_hz: float, nfft: int | None = None
+) -> FrequencyResponse:
+    """Ratio of the Fourier transforms of output and input, no window, no averaging.
+
+    Nothing leaks if the system is at rest before the first sample and at rest again before the
+    last; then the estimate has no bias at all. It has no averaging against noise either.
+
+    Parameters
+    ----------
+    input_, output : array_like, shape (n,)
+    rate_hz : float
+    nfft : int, optional
+        Length of the transform, at least n; the record is padded with zeros. Default n.
+
+    Returns
+    -------
+    FrequencyResponse
+        ``nfft // 2 + 1`` bins, without coherence: one record has none.
+
+    Raises
+    ------
+    SpectralError
+        If a record holds values that are not finite, the input is zero, or `nfft` is too short.
+    """
+    x, y = checked_records(input_, output, rate_hz)
+    length = x.size if nfft is None else nfft
+    if length < x.size:
+        raise SpectralError(
+            f"nfft = {length} samples is shorter than the record of {x.size}: "
+            "the whole record is transformed, never cut; choose it at least as long."
+        )
+    fx = np.fft.rfft(x, length)
+    fy = np.fft.rfft(y, length)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        response = fy / fx
+    return FrequencyResponse(
+        frequency_hz=np.arange(fx.size) * rate_hz / length,
+        response=response,
+        coherence=None,
+        segments=1,
+        estimator="fft",
+    )
+
+
+def instrumental_response(
+    reference: ArrayLike,
+    input_: ArrayLike,
+    output: ArrayLike,
+    rate_hz: float,
+    *,
+    segment_length: int = PAPER_SEGMENT_LENGTH,
+    overlap: int = PAPER_OVERLAP,
+    nfft: int = PAPER_NFFT,
+    window: str = "hamming",
+) -> FrequencyResponse:
+    """Frequency response ``Hiv = Sry / Srx`` from input to output.
+
+    Parameters
+    ----------
+    reference : array_like, shape (n,)
+        What the loop was asked for, in any unit and with any delay: both cancel.
+    input_, output : array_like, shape (n,)
+    rate_hz, segment_length, overlap, nfft, window
+        See `rigd.spectral.welch_response`.
+
+    Returns
+    -------
+    FrequencyResponse
+        The coherence is that of reference and output.
+
+    Raises
+    ------
+    SpectralError
+        As `rigd.spectral.welch_response`, and if the reference is 0 throughout.
+    """
+    checked_records(input_, output, rate_hz)
+    if not np.any(reference):
+        raise SpectralError(
+            "The reference is zero throughout, so nothing followed it; choose another estimator."
+        )
+    of_input, of_output = (
+        welch_response(
+            reference, values, rate_hz,
+            segment_length=segment_length, overlap=overlap, nfft=nfft, window=window,
+        )
+        for values in (input_, output)
+    )  # fmt: skip
+    with np.errstate(divide="ignore", invalid="ignore"):
+        response = of_output.response / of_input.response
+    return FrequencyResponse(
+        frequency_hz=of_output.frequency_hz,
+        response=response,
+        coherence=of_output.coherence,
+        segments=of_output.segments,
+        estimator="iv",
+    )
