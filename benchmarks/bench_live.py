@@ -17,14 +17,13 @@ from pathlib import Path
 
 from rigd.bench import loops
 from rigd.bench.measure import Measurement, figures, measurement
-from rigd.engine.board import Phase
-from rigd.engine.process import SINGLE_THREADED
-from rigd.engine.processes import LIVE
-from rigd.engine.signals import StopRequest
+from rigd.engine.ipc import LIVE, SINGLE_THREADED
+from rigd.engine.shared_state import Phase
 from rigd.excitation.named import make_excitation
 from rigd.profile import load_profile
+from rigd.runner.request import Order
+from rigd.runtime.signals import StopRequest
 from rigd.session import read_session
-from rigd.supervisor.orders import Order
 
 RATE_HZ = 1000.0
 MOST_CPU_PERCENT = 6.0

@@ -17,8 +17,8 @@ from pathlib import Path
 from rigd.bench import cyclictest, loops
 from rigd.bench.measure import HELD, Figures, Measurement, figures
 from rigd.bench.program import HIGHEST_HZ, core_of, cores_beside
-from rigd.checks.rights import settings_granted
-from rigd.engine.process import SINGLE_THREADED
+from rigd.checks.machine import settings_granted
+from rigd.engine.ipc import SINGLE_THREADED
 from rigd.profile import load_profile
 
 RATE_HZ = 1000.0

@@ -30,8 +30,8 @@ from analysis.structures import STRUCTURES
 from analysis.whole_record import Measurement, Plant, RecordFit, fit_record
 from rigd.beam import transfer
 from rigd.excitation import chirp, modes
-from rigd.planning import Foresight
 from rigd.profile import Profile, load_profile
+from rigd.runner.planning import Foresight
 
 POLE_RAD_S = 80.0
 

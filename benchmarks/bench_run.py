@@ -15,10 +15,8 @@ from timing import least_s
 
 from rigd.control import PidController, design_pid
 from rigd.devices.registry import open_devices
-from rigd.engine.clocks import VirtualClock
-from rigd.engine.cycle import Cycle
-from rigd.engine.metronome import Metronome
-from rigd.engine.watch import make_watch
+from rigd.engine.cycle import Cycle, make_watch
+from rigd.engine.timing import Metronome, VirtualClock
 from rigd.profile import load_profile
 
 RIGD = Path(sys.executable).with_name("rigd")

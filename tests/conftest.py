@@ -183,14 +183,14 @@ class Done:
 def rigd_here(tmp_path, monkeypatch):
     """Run `rigd` in this process, as far as it comes without any other."""
     from rigd.cli.app import app
-    from rigd.engine.signals import StopRequest
+    from rigd.runtime.signals import StopRequest
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
     no_crew = StopRequest(), contextlib.nullcontext()
     for command in ("run", "identify"):
         monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
-    monkeypatch.setattr("rigd.engine.signals.ignore", lambda **_: None)  # of the test runner
+    monkeypatch.setattr("rigd.runtime.signals.ignore", lambda **_: None)  # of the test runner
 
     return partial(run_here, app)
 

@@ -11,7 +11,7 @@ from analysis.report import style
 from analysis.report.frf_figure import line_styles
 from analysis.settings import ESTIMATOR_WORDS
 from analysis.structures import STRUCTURES
-from rigd.view.response_charts import magnitude_db, phase_deg
+from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.view.chart import Axis, Chart, Key, decades, steps
-from rigd.view.palette import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
-from rigd.view.response_charts import magnitude_db, phase_deg
-from rigd.view.thinning import Thinning
+from rigd.view.chart import Axis, Chart, Key, Thinning, decades, steps
+from rigd.view.frequency_charts import magnitude_db, phase_deg
+from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

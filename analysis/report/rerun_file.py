@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
-from rigd.view.rrd_file import RrdFileError, check_new, new_rrd_file
+from rigd.view.recorded import RrdFileError, check_new, new_rrd_file
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from rigd.bench import cyclictest, loops
 from rigd.bench.measure import HELD, Measurement, figures, pooled
-from rigd.checks.rights import settings_granted
+from rigd.checks.machine import settings_granted
 from rigd.engine.realtime import REFUSED
 from rigd.profile import Profile
 

@@ -3,13 +3,9 @@
 from pathlib import Path
 
 from rigd.checks.devices import inspect_devices
-from rigd.checks.eds import eds_rows
-from rigd.checks.loop import loop_rows
-from rigd.checks.machine import machine_rows
-from rigd.checks.on_paper import profile_rows, wiring_rows
-from rigd.checks.rights import rights_rows
+from rigd.checks.machine import machine_rows, rights_rows
+from rigd.checks.on_paper import eds_rows, loop_rows, profile_rows, travel_rows, wiring_rows
 from rigd.checks.rows import Row, Verdict
-from rigd.checks.travel import travel_rows
 from rigd.profile import Profile
 
 

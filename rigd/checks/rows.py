@@ -1,8 +1,59 @@
-"""What a check finds: rows of one table, and the verdict over all of them."""
+"""What a check finds: rows of one table, as text, and the verdict over all of them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import isfinite
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+_UNITS = {
+    "_hz": (1.0, "Hz"),
+    "_s": (1e3, "ms"),
+    "_ns": (1e-6, "ms"),
+    "_us": (1e-3, "ms"),
+    "_n_nm": (1.0, "N, N·m"),
+    "_nm": (1.0, "N·m"),
+    "_n": (1.0, "N"),
+    "_rad": (1.0, "rad"),
+    "_rad_s": (1.0, "rad/s"),
+    "_percent": (1.0, "%"),
+}
+_ENDS = sorted(_UNITS, key=len, reverse=True)
+
+
+def name_of(key: str) -> str:
+    """Return a key as words, without its unit."""
+    end = _end(key)
+    return (key[: -len(end)] if end else key).replace("_", " ")
+
+
+def value_of(key: str, value: object) -> str:
+    """Return the value of a key with its unit; numbers to four digits."""
+    end = _end(key)
+    factor, unit = _UNITS[end] if end else (1.0, "")
+    if isinstance(value, list | tuple) and not all(_is_number(each) for each in value):
+        return "; ".join(map(str, value))
+    if isinstance(value, list | tuple):
+        text = ", ".join(f"{factor * each:.4g}" for each in value) or "none"
+    elif isinstance(value, float):
+        text = f"{factor * value:.4g}" if isfinite(value) else "none"
+    elif isinstance(value, int) and not isinstance(value, bool) and end:
+        text = f"{factor * value:.4g}"
+    else:
+        return str(value)
+    return f"{text} {unit}".rstrip()
+
+
+def _end(key: str) -> str:
+    return next((end for end in _ENDS if key.endswith(end)), "")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 class Verdict(Enum):
@@ -55,3 +106,64 @@ def grade(*, fail: bool, warn: bool = False) -> Verdict:
     if fail:
         return Verdict.FAIL
     return Verdict.WARNING if warn else Verdict.OK
+
+
+_STYLES = {
+    Verdict.OK: "green",
+    Verdict.WARNING: "yellow",
+    Verdict.FAIL: "bold red",
+    Verdict.SKIPPED: "dim",
+}
+
+
+OF_A_RIG = {
+    "failed": "no session may be run",
+    "warnings": "a session can be run",
+    "ok": "a session can be run",
+}
+"""What the verdict over all rows means to the operator."""
+OF_AN_EDS = {
+    "failed": "this drive cannot be used",
+    "warnings": "as far as its file tells, this drive can be used; read the warnings",
+    "ok": "as far as its file tells, this drive can be used",
+}
+
+
+def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG) -> None:
+    """Print the table, what is too long for it, and the verdict, to standard output."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), expand=False)
+    table.add_column("what", ratio=5, overflow="fold")
+    table.add_column("found", ratio=9, overflow="fold")
+    table.add_column("wanted", ratio=5, overflow="fold")
+    table.add_column("", no_wrap=True, width=7)
+    group = ""
+    for row in rows:
+        if row.group != group:
+            group = row.group
+            if table.row_count:
+                table.add_row()
+            table.add_row(Text(group, style="bold"))
+        style = _STYLES[row.verdict]
+        table.add_row(
+            Text(f"  {row.what}"),
+            Text(row.found),
+            Text(row.wanted),
+            Text(row.verdict.value, style=style),
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    for row in rows:
+        if row.detail:
+            console.print(Text(row.detail))
+            console.print()
+    console.print(Text(_verdict(rows, consequences), style="bold"))
+
+
+def _verdict(rows: Sequence[Row], consequences: Mapping[str, str]) -> str:
+    counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in Verdict}
+    text = (
+        f"failed: {counts[Verdict.FAIL]}, warnings: {counts[Verdict.WARNING]}, "
+        f"ok: {counts[Verdict.OK]}, skipped: {counts[Verdict.SKIPPED]}"
+    )
+    verdict = overall(rows)
+    return f"Verdict: {verdict} ({text}): {consequences[verdict]}."

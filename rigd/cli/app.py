@@ -6,24 +6,36 @@ import io
 import os
 import signal
 import sys
+from typing import Annotated
 
 import typer
 
-from rigd.cli.bench import bench
-from rigd.cli.check import check, reset
-from rigd.cli.daemon import status, stop, tare, zero
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED
+import rigd
+from rigd.cli.check import bench, check, reset
+from rigd.cli.daemon import serve, status, stop, tare, zero
+from rigd.cli.files import info, recover
 from rigd.cli.identify import identify_app
-from rigd.cli.info import info
-from rigd.cli.live import live
+from rigd.cli.live import live, replay
+from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.profiles import profiles_app
-from rigd.cli.recover import recover
-from rigd.cli.replay import replay
 from rigd.cli.run import run_app, start_app
-from rigd.cli.serve import serve
 from rigd.cli.simulate import inject, simulate
-from rigd.cli.version import before_a_command
-from rigd.interruption import raise_on
+from rigd.runtime.signals import raise_on
+
+
+def _tell(asked: bool) -> None:
+    if asked:
+        typer.echo(f"rigd {rigd.__version__}")
+        raise typer.Exit
+
+
+def before_a_command(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell, is_eager=True, help="Say which it is.")
+    ] = False,
+) -> None:
+    """Take the options that stand before a command; they have done their work by then."""
+
 
 app = typer.Typer(
     help="Run the rig: excite the antenna, record every sample, watch it live.\n\n"

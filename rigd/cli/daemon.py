@@ -1,6 +1,8 @@
-"""``rigd status``, ``stop``, ``tare`` and ``zero``: what is asked of a running daemon."""
+"""``rigd serve``, ``status``, ``stop``, ``tare``, ``zero``: the daemon, and requests to it."""
 
 import json
+import os
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -9,13 +11,66 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
-from rigd.cli.options import AsJson
+from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_WRONG_USE,
+    SESSIONS,
+    AsJson,
+    Fast,
+    Hardware,
+    Output,
+    ProfileName,
+    fail,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rigd.service.client import Client
+    from rigd.daemon.client import Client
+
+
+def serve(
+    profile: ProfileName,
+    output: Output = SESSIONS,
+    group: Annotated[
+        str | None,
+        typer.Option(
+            "--group", help="Let the members of this group command it too, over /run/rigd."
+        ),
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
+    ] = False,
+    fast: Fast = False,
+    hardware: Hardware = False,
+) -> None:
+    """Own a rig and run sessions for rigd start, until Ctrl-C or SIGTERM ends it safely.
+
+    Example: rigd serve --profile antenna_can --output /data/sessions
+    """
+    from rigd.engine.ipc import SINGLE_THREADED
+
+    os.environ.update(SINGLE_THREADED)
+    from rigd.daemon.address import AddressError, UnknownGroupError
+    from rigd.daemon.main import run_daemon
+    from rigd.devices.registry import UnknownDeviceError
+    from rigd.profile import ProfileError
+    from rigd.runner.planning import RefusedError
+    from rigd.runner.request import load_rig, make_folder
+    from rigd.runtime.locks import RigBusyError
+
+    try:
+        rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
+        make_folder(output)
+        number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
+    except (ProfileError, UnknownDeviceError, UnknownGroupError, RefusedError) as error:
+        fail(str(error), EXIT_WRONG_USE)
+    except (RigBusyError, AddressError) as error:
+        fail(str(error), EXIT_FAILED)
+    if number is not signal.SIGTERM:
+        raise typer.Exit(EXIT_INTERRUPTED)
+
 
 _LOOK_S = 0.5
 _END_PATIENCE_S = 10.0
@@ -29,7 +84,7 @@ DaemonOf = Annotated[
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
     """Connect to the daemon of a profile; whatever goes wrong with it ends the command."""
-    from rigd.service.client import Client
+    from rigd.daemon.client import Client
 
     with _failing_by_the_daemon(), Client(_socket_of(profile)) as client:
         yield client
@@ -38,8 +93,8 @@ def daemon_of(profile: str | None) -> "Iterator[Client]":
 @contextmanager
 def _failing_by_the_daemon() -> Iterator[None]:
     """End the command with what a daemon says, or with what is known of one that is gone."""
-    from rigd.service.address import AddressError
-    from rigd.service.client import DaemonGoneError, RefusedByDaemonError
+    from rigd.daemon.address import AddressError
+    from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError
 
     try:
         yield
@@ -52,7 +107,7 @@ def _failing_by_the_daemon() -> Iterator[None]:
 
 
 def _socket_of(profile: str | None) -> "Path":
-    from rigd.service.address import find
+    from rigd.daemon.address import find
 
     return find(rig_name(profile))
 
@@ -61,7 +116,7 @@ def rig_name(profile: str | None) -> str | None:
     """Return the name by which the daemon of a profile is found."""
     if profile is None:
         return None
-    from rigd.service.address import running, socket_path
+    from rigd.daemon.address import running, socket_path
 
     # Reading a profile takes a while, and is of no use where its daemon is known by that name.
     if any(path.name == socket_path(profile).name for path in running()):
@@ -114,7 +169,7 @@ def stop(
 
     Example: rigd stop
     """
-    from rigd.service.client import await_end, stop_session
+    from rigd.daemon.client import await_end, stop_session
 
     with _failing_by_the_daemon():
         path = _socket_of(profile)
@@ -186,7 +241,7 @@ def reset_by_daemon(profile: str | None) -> bool:
 
     A refusal or a failure ends the command.
     """
-    from rigd.service.address import running, socket_path
+    from rigd.daemon.address import running, socket_path
 
     sockets = running()
     if profile is None:
@@ -214,8 +269,8 @@ def _watch(profile: str | None) -> None:
     from rich.live import Live
 
     from rigd.cli.status_view import status_table
-    from rigd.service.address import AddressError, find
-    from rigd.service.client import Client, DaemonGoneError, RefusedByDaemonError
+    from rigd.daemon.address import AddressError, find
+    from rigd.daemon.client import Client, DaemonGoneError, RefusedByDaemonError
 
     name = rig_name(profile)
     with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:

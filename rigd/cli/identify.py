@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.crew import CrewGroup, start_crew
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_WRONG_USE,
     SESSIONS,
     AsJson,
     Fast,
@@ -16,14 +17,16 @@ from rigd.cli.options import (
     Output,
     ProfileName,
     Seed,
+    fail,
     profile_named,
 )
+from rigd.cli.start import CrewGroup, start_crew
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rigd.excitation import Excitation
-    from rigd.identification.motor_estimate import MotorEstimate
+    from rigd.identification.estimate import MotorEstimate
     from rigd.identification.proposal import Proposal
     from rigd.profile import Profile
 
@@ -121,10 +124,11 @@ def _run_sessions(
     Returns the files of the two: the trial's controller is too slow for its passes to count.
     """
     stop, crew = start_crew(live=False)
-    from rigd.engine.signals import ignore
-    from rigd.foreground import ForegroundError, run_in_foreground
-    from rigd.identification import experiments, tuning
-    from rigd.supervisor.crew import Crew
+    from rigd.identification import experiments
+    from rigd.identification import proposal as tuning
+    from rigd.runner.foreground import ForegroundError, run_in_foreground
+    from rigd.runner.process_group import Crew
+    from rigd.runtime.signals import ignore
 
     def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
         def build(profile: "Profile") -> "Excitation":
@@ -173,7 +177,7 @@ def _run_sessions(
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
-    from rigd.identification.motor_estimate import EstimateError, estimate_motor
+    from rigd.identification.estimate import EstimateError, estimate_motor
     from rigd.identification.proposal import propose
     from rigd.identification.records import read_recording
     from rigd.session import SessionError

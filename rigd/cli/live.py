@@ -1,16 +1,66 @@
-"""``rigd live``: the operator's window on a running rig."""
+"""``rigd live`` and ``rigd replay``: the operator's window on a rig, or on a recorded session."""
 
+import contextlib
+import os
+import platform
+import signal
+import tempfile
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.exits import EXIT_FAILED, fail
-from rigd.cli.viewing import ended_gently, has_screen, scratch_folder, tunnel_advice
+from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, progress
+from rigd.runtime.signals import raise_on
+from rigd.view.recorded import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
 
 if TYPE_CHECKING:
-    from rigd.live.address import LiveAddress
+    from rigd.live.server import LiveAddress
     from rigd.live.viewer import Viewer
+
+
+def has_screen() -> bool:
+    """Whether there is a screen for a window."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def tunnel_advice(view: "LiveAddress") -> str:
+    """Return what to type on another computer, to look on from there."""
+    page, grpc = view.page_port, view.grpc_port
+    return (
+        f"From another computer: ssh -L {page}:127.0.0.1:{page} -L {grpc}:127.0.0.1:{grpc} "
+        f"{platform.node()}, and open http://127.0.0.1:{page} there."
+    )
+
+
+@contextlib.contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Give a temporary folder: the viewer leaves files behind when it is ended."""
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="rigd-view-", ignore_cleanup_errors=True)
+    except OSError as error:
+        fail(
+            f"No temporary folder can be made ({error.strerror}); set TMPDIR to one with room.",
+            EXIT_FAILED,
+        )
+    with folder as name:
+        yield Path(name)
+
+
+@contextlib.contextmanager
+def ended_gently() -> Iterator[None]:
+    """Have every way of being asked to end mean Ctrl-C, so that temporary files go too."""
+    asked = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in asked]
+    raise_on(*asked)
+    try:
+        yield
+    finally:
+        for number, handler in zip(asked, before, strict=True):
+            signal.signal(number, handler)
+
 
 _LOOK_S = 0.5
 
@@ -60,7 +110,7 @@ def live(
 
 def _rig_name(profile: str) -> str:
     """Return the name of a profile's rig; a profile that cannot be used ends the command."""
-    from rigd.service.live_views import find_views
+    from rigd.daemon.client import find_views
 
     if find_views(profile):
         return profile
@@ -71,7 +121,7 @@ def _rig_name(profile: str) -> str:
 
 def _only_one(rig: str | None) -> "LiveAddress | None":
     """Return the live view of a rig, if there is one; several end the command."""
-    from rigd.service.live_views import find_views
+    from rigd.daemon.client import find_views
 
     views = find_views(rig)
     if len(views) > 1:
@@ -88,7 +138,7 @@ def _await(rig: str | None) -> "LiveAddress":
 
 
 def _how_to_start(profile: str | None) -> str:
-    from rigd.service.live_views import daemons
+    from rigd.daemon.client import daemons
 
     of_rig = "" if profile is None else f" of the rig {profile}"
     name = profile or "NAME"
@@ -112,7 +162,7 @@ def _how_to_start(profile: str | None) -> str:
 
 def _show(view: "LiveAddress") -> None:
     """Keep a window open, on the live view that there is, until it is closed."""
-    from rigd.live.program import RerunError
+    from rigd.live.server import RerunError
     from rigd.live.viewer import Viewer
 
     with ended_gently(), scratch_folder() as scratch:
@@ -144,7 +194,7 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
     int
         The viewer's exit code, once the window is closed.
     """
-    from rigd.service.live_views import find_views
+    from rigd.daemon.client import find_views
 
     there = True
     while (code := viewer.exit_code) is None:
@@ -163,3 +213,136 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
             )
         there = view is not None
     return code
+
+
+def replay(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            readable=False,
+            help="A session file (.mcap), or a recording of it for Rerun (.rrd).",
+        ),
+    ],
+    web: Annotated[
+        bool, typer.Option("--web", help="Print the address for a browser; open no window.")
+    ] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option(
+            "--save", metavar="OUT.rrd", help="Write a recording for Rerun's viewer; show nothing."
+        ),
+    ] = None,
+) -> None:
+    """Show a recorded session in the layout of the live view, played from its start.
+
+    docs/opening_sessions.md tells what else opens session files.
+
+    Example: rigd replay sessions/20261120-101500-chirp.mcap
+    """
+    if save is not None:
+        with ended_gently():
+            _save(path, save, web=web)
+        return
+    if not web and not has_screen():
+        _check_shown(path)  # what is no file for a window is none elsewhere, either
+        elsewhere = (
+            "the file can be looked at elsewhere as it is"
+            if path.suffix == SUFFIX
+            else f"--save OUT{SUFFIX} writes a file that can be looked at elsewhere"
+        )
+        fail(
+            "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
+            f"rigd replay {path} --web prints an address for a browser; {elsewhere}.",
+            EXIT_FAILED,
+        )
+    from rigd.live.server import RerunError
+
+    with ended_gently(), scratch_folder() as scratch:
+        recording = _as_recording(path, scratch)
+        try:
+            if web:
+                _serve(recording, scratch, path)
+            else:
+                _open_window(recording, scratch, path)
+        except RerunError as error:
+            fail(str(error), EXIT_FAILED)
+
+
+def _save(path: Path, out: Path, *, web: bool) -> None:
+    if web:
+        fail(
+            "--save writes a file and shows nothing, so it does not go with --web.", EXIT_WRONG_USE
+        )
+    if path.suffix == SUFFIX:
+        fail(f"{path} is a recording for Rerun already; copy it instead.", EXIT_WRONG_USE)
+    try:
+        check_new(out)
+    except RrdFileError as error:
+        fail(f"--save {error}", EXIT_WRONG_USE)
+    _convert(path, out)
+    typer.echo(f"{out}: open it with rigd replay {out}.", err=True)
+
+
+def _check_shown(path: Path) -> None:
+    """End the command if a file is not of a kind that is shown, as far as its beginning tells."""
+    from rigd.session import SessionError, check_beginning
+
+    try:
+        if path.suffix == SUFFIX:
+            check_rrd_file(path)
+        else:
+            check_beginning(path)
+    except (RrdFileError, SessionError) as error:
+        fail(str(error), EXIT_FAILED)
+
+
+def _convert(path: Path, out: Path) -> None:
+    """Write a session as a recording for Rerun; what keeps it from that ends the command."""
+    from rigd.session import SessionError, read_session, read_timings
+    from rigd.view.recorded import draw_session
+
+    try:
+        session, timings = read_session(path), read_timings(path)
+        with progress(path.name) as on_progress, new_rrd_file(out) as stream:
+            draw_session(stream, session, timings, on_progress=on_progress)
+    except (SessionError, RrdFileError) as error:
+        fail(str(error), EXIT_FAILED)
+
+
+def _as_recording(path: Path, scratch: Path) -> Path:
+    """Return a file that Rerun's viewer shows in our layout, made in a folder if need be."""
+    if path.suffix == SUFFIX:
+        try:
+            check_rrd_file(path)
+        except RrdFileError as error:
+            fail(str(error), EXIT_FAILED)
+        return path
+    recording = scratch / f"session{SUFFIX}"
+    _convert(path, recording)
+    return recording
+
+
+def _open_window(recording: Path, scratch: Path, path: Path) -> None:
+    from rigd.live.viewer import Window
+
+    with Window(recording, scratch) as window:
+        typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
+        if window.wait():
+            fail(
+                f"The window was closed by a fault ({window.program.last_words}). "
+                f"rigd replay {path} --web shows the same in a browser.",
+                EXIT_FAILED,
+            )
+
+
+def _serve(recording: Path, scratch: Path, path: Path) -> None:
+    from rigd.live.viewer import PageOfFile
+
+    with PageOfFile(recording, scratch) as page:
+        typer.echo(page.address.page_url)
+        typer.echo(
+            f"{path.name} is shown there until Ctrl-C. {tunnel_advice(page.address)}", err=True
+        )
+        page.wait()
+        fail(f"The Rerun server ended: {page.program.last_words}.", EXIT_FAILED)

@@ -6,8 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
-from rigd.cli.options import EdsFile, profile_named
+from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_WRONG_USE,
+    EdsFile,
+    fail,
+    profile_named,
+)
 
 if TYPE_CHECKING:
     from rigd.profile.from_eds import Draft

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rigd.cli.crew import CrewGroup, start_crew
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_WRONG_USE,
     SESSIONS,
     AsJson,
     Fast,
@@ -28,13 +29,14 @@ from rigd.cli.options import (
     Repeat,
     Seed,
     Specimen,
+    fail,
     session_notes,
 )
-from rigd.cli.start import start_sessions
+from rigd.cli.start import CrewGroup, start_crew, start_sessions
 
 if TYPE_CHECKING:
     from rigd.excitation.named import Value
-    from rigd.supervisor.session import SessionResult
+    from rigd.runner.session import SessionResult
 
 run_app = typer.Typer(
     name="run",
@@ -111,9 +113,9 @@ def run_sessions(
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note)
     stop, crew = start_crew(live=live)
-    from rigd.engine.signals import ignore
-    from rigd.foreground import ForegroundError, run_in_foreground
-    from rigd.planning import excitation_for
+    from rigd.runner.foreground import ForegroundError, run_in_foreground
+    from rigd.runner.planning import excitation_for
+    from rigd.runtime.signals import ignore
 
     try:
         results = run_in_foreground(

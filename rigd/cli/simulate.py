@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rigd.cli.exits import EXIT_FAILED, EXIT_WRONG_USE, fail
-from rigd.cli.options import ProfileName, profile_named
+from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, ProfileName, fail, profile_named
 
 
 def simulate(

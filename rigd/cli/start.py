@@ -1,6 +1,8 @@
-"""``rigd start``: sessions that the daemon runs, followed to their end or left to it."""
+"""``rigd start``: sessions that the daemon runs; and starting the processes of a rig."""
 
+import contextlib
 import json
+import os
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -9,14 +11,70 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from rigd.cli.daemon import DaemonOf, daemon_of
-from rigd.cli.exits import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
-from rigd.cli.options import AsJson, Force, Note, Operator, Repeat, Specimen, session_notes
+from rigd.cli.options import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_WRONG_USE,
+    AsJson,
+    Force,
+    Note,
+    Operator,
+    Repeat,
+    Specimen,
+    fail,
+    session_notes,
+)
 
 if TYPE_CHECKING:
+    from rigd.daemon.client import Client
     from rigd.excitation.named import Value
-    from rigd.service.client import Client
+    from rigd.runner.process_group import Crew
+    from rigd.runtime.signals import StopRequest
+
+
+class CrewGroup(TyperGroup):
+    """Commands that run sessions; Ctrl-C before they catch it themselves is told of.
+
+    From :func:`start_crew` on it is a stop of the session, which says so.
+    """
+
+    # Typer's click is its own in some versions and the package of that name in others.
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
+        """Run the command that was asked for."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            with contextlib.suppress(OSError):  # its terminal is gone
+                typer.echo("Stopped before anything began.", err=True)
+            raise
+
+
+def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
+    """Catch the operator's stop, and start the processes of the first session.
+
+    They import what they need while the command line imports the rest, and while it plans.
+    """
+    from rigd.engine.ipc import SINGLE_THREADED, ChildError
+    from rigd.runner.process_group import Crew
+    from rigd.runtime.signals import StopRequest
+
+    stop = StopRequest()
+    stop.catch()
+    os.environ.update(SINGLE_THREADED)
+    try:
+        return stop, Crew(live=live)
+    except OSError as error:
+        fail(
+            f"The processes of a session cannot be started ({error.strerror}); look at the limits "
+            "of open files (ulimit -n) and of shared memory (/dev/shm).",
+            EXIT_FAILED,
+        )
+    except ChildError as error:
+        fail(str(error), EXIT_FAILED)
+
 
 _POLL_S = 0.2
 
@@ -185,7 +243,7 @@ class _ProgressView:
 
     def update(self, progress: dict[str, Any]) -> None:
         """Show where the session is."""
-        from rigd.engine.board import Phase
+        from rigd.engine.shared_state import Phase
 
         number = f" {progress['session']}/{progress['repeat']}" if progress["repeat"] > 1 else ""
         left = progress["time_left_s"]

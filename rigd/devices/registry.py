@@ -95,8 +95,7 @@ def objections(rig: RigParameters) -> list[str]:
     """Say why the devices of a rig cannot share their bus, before anything is sent."""
     if rig.can is None:
         return []
-    from rigd.devices.canbus.identifiers import check_identifiers
-    from rigd.devices.canbus.load import MAX_LOAD, bus_load
+    from rigd.devices.canbus.budget import MAX_LOAD, bus_load, check_identifiers
 
     found = check_identifiers(rig)
     load = bus_load(rig).worst
@@ -111,7 +110,7 @@ def objections(rig: RigParameters) -> list[str]:
 
 def simulator() -> ModuleType:
     """Return the module that puts a simulated rig on the wire."""
-    return importlib.import_module("rigd.sim.wire.simulate")
+    return importlib.import_module("rigd.sim.wire.simulator")
 
 
 def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:

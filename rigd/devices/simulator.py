@@ -4,18 +4,16 @@ The simulated rig stands in for the hardware of one profile. Whoever opens that 
 looks here first, so that a motor never moves where a simulation was meant.
 """
 
-import contextlib
-import itertools
 import json
 import os
 import re
 import socket
-import stat
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from rigd.runtime.folder import runtime_folder
 
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters
@@ -56,14 +54,6 @@ def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
         for key, value in ours.items()
         if key in theirs and theirs[key] != value
     ]
-
-
-def runtime_folder() -> Path:
-    """Return the folder for sockets and addresses: of this user, gone after a restart."""
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    if base and Path(base).is_dir():
-        return Path(base) / "rigd"
-    return _own_folder(Path(tempfile.gettempdir()) / f"rigd-{os.getuid()}")
 
 
 def announce(rig_name: str, address: SimulatorAddress) -> Path:
@@ -129,20 +119,6 @@ def _flat(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, objec
 
 def _shown(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else json.dumps(value)
-
-
-def _own_folder(path: Path) -> Path:
-    """Make a folder where everybody may; a name that somebody else took is passed over."""
-    for number in itertools.count(1):
-        with contextlib.suppress(FileExistsError):
-            path.mkdir(mode=0o700)
-        status = path.lstat()
-        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid():
-            if status.st_mode & 0o077:
-                path.chmod(0o700)
-            return path
-        path = path.with_name(f"rigd-{os.getuid()}-{number}")
-    raise AssertionError("never reached")
 
 
 def _address_file(rig_name: str) -> Path:

@@ -1,13 +1,173 @@
-"""One tick: read the devices, check the limits, control, command."""
+"""One tick: read the devices, check the limits, control, command; and what is watched at rest.
 
+The encoder while the torque is off: a hand may turn the motor, but nothing makes it jump.
+
+The zero, and the limits with it, stand on the encoder's count. In a session the watch over the
+limits sees every reading; this sees those before, between and after.
+"""
+
+import json
+import time
 from collections import deque
-from math import inf
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from math import exp, inf, isfinite
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rigd.control import PidController
-from rigd.devices.contracts import Devices, Wrench
-from rigd.engine.standstill import Standstill
+from rigd.devices.contracts import DeviceError, Devices, Wrench
+from rigd.engine.timing import Metronome
+from rigd.profile import Profile
+from rigd.runtime.folder import runtime_folder
 from rigd.safety import LimitWatch, Violation
 from rigd.session.format import Status
+
+
+def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
+    """Return the watch for the rig of a profile; it stays for as long as the rig is connected.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    heat_nm2
+        How warm the motor is: mean square of its torque over its thermal time constant, (N·m)².
+    """
+    rig = profile.rig
+    watch = LimitWatch(
+        profile.limits,
+        rig.sensor.range,
+        rig.rate_hz,
+        resolution_rad=rig.encoder.resolution_rad,
+        peak_torque_nm=rig.motor.peak_torque_nm,
+        continuous_torque_nm=rig.motor.continuous_torque_nm,
+        thermal_time_constant_s=rig.motor.thermal_time_constant_s,
+        tare_warning_nm=profile.session.tare_drift_nm,
+    )
+    watch.heat_nm2 = heat_nm2
+    return watch
+
+
+def remember_heat(profile: Profile, heat_nm2: float) -> None:
+    """Write down how warm the motor is now, for the next connection of this user.
+
+    Without a place for it, the next one takes the motor for cold.
+    """
+    path = _heat_file(profile)
+    document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
+    with suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        fresh = path.with_suffix(".new")
+        fresh.write_text(json.dumps(document), encoding="utf-8")
+        fresh.replace(path)
+
+
+def recalled_heat_nm2(profile: Profile) -> float:
+    """Return how warm the motor is still after the last connection, in (N·m)²; 0.0: not known.
+
+    It has cooled down since by its thermal time constant.
+    """
+    try:
+        document = json.loads(_heat_file(profile).read_text("utf-8"))
+        heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return 0.0
+    passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
+    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # of before the computer was started anew
+        return 0.0
+    motor = profile.rig.motor
+    warmest_nm2 = motor.peak_torque_nm**2
+    return min(max(0.0, heat_nm2), warmest_nm2) * exp(-passed_s / motor.thermal_time_constant_s)
+
+
+def _heat_file(profile: Profile) -> Path:
+    plain = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
+    return runtime_folder() / f"heat-{plain}.json"
+
+
+REMEDY = (
+    "The zero of the angle is void, and the limits with it: look at encoder, its cable and shield, "
+    "then reset the rig and set the zero again."
+)
+
+
+class Standstill:
+    """Compares each angle that is read without torque with those before it.
+
+    From one tick to the next the speed may change by what ``limits.acceleration_rad_s2`` allows,
+    as in the loop; over ticks that were missed the motor may move as fast as
+    ``limits.velocity_rad_s``.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        rate_hz, limits = profile.rig.rate_hz, profile.limits
+        self._period_ns = 1e9 / rate_hz
+        # A difference of two movements has four readings in it, each half a step wrong.
+        self._steps_rad = 2.0 * profile.rig.encoder.resolution_rad
+        self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
+        self._per_tick_rad = limits.velocity_rad_s / rate_hz
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew with the next angle: the drive has been, or is being, controlled."""
+        self._angle_rad: float | None = None
+        self._due_ns = 0
+        self._moved: tuple[float, float] | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether place and movement are known, with which the next angle is compared."""
+        return self._moved is not None
+
+    def check(self, angle_rad: float, due_ns: int) -> None:
+        """Check an angle that is not stale.
+
+        Parameters
+        ----------
+        angle_rad
+            From any zero that stays where it is.
+        due_ns
+            When its tick was due.
+
+        Raises
+        ------
+        DeviceError
+            If nothing turns a motor like that.
+        """
+        before_rad, ticks = self._angle_rad, round((due_ns - self._due_ns) / self._period_ns)
+        self._angle_rad, self._due_ns = angle_rad, due_ns
+        if before_rad is None:
+            return
+        moved_rad = angle_rad - before_rad
+        moved, self._moved = self._moved, None
+        if ticks > 1:
+            possible_rad = self._per_tick_rad * ticks + self._steps_rad
+            jump_rad, key = moved_rad, "limits.velocity_rad_s"
+        else:
+            # Of the first movement nobody knows the one before it.
+            last_rad, before_that_rad = moved or (0.0, self._per_tick_rad)
+            # A latch may be late by most of a period, and the next one is not.
+            possible_rad = (
+                self._per_tick2_rad + self._steps_rad + abs(last_rad) + abs(before_that_rad)
+            )
+            jump_rad, key = moved_rad - last_rad, "limits.acceleration_rad_s2"
+            self._moved = moved_rad, last_rad
+        if not abs(jump_rad) <= possible_rad:
+            ticks_taken = f"{ticks} ticks" if ticks > 1 else "one tick"
+            raise DeviceError(
+                f"The encoder jumped by {jump_rad:.4g} rad within {ticks_taken} while the torque "
+                f"was off, and no more than {possible_rad:.2g} rad are possible ({key}). {REMEDY}"
+            )
+
 
 _ANGLE_STALE = int(Status.ANGLE_STALE)
 _WRENCH_STALE = int(Status.WRENCH_STALE)
@@ -243,3 +403,92 @@ class Cycle:
         """Switch off because a device failed: what was read last stands, and is marked so."""
         self.torque_off()
         self.flags |= _ANGLE_STALE | _WRENCH_STALE
+
+
+AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """Readings without torque.
+
+    Attributes
+    ----------
+    duration_s
+        For how long.
+    wrenches
+        Raw: not tared; N and N·m, shape (n, 6).
+    angles_rad
+        From the rig's zero; shape (n,).
+    torques_nm
+        Coupling torque of the raw wrenches; shape (n,).
+    """
+
+    duration_s: float
+    wrenches: NDArray[np.float64]
+    angles_rad: NDArray[np.float64]
+    torques_nm: NDArray[np.float64]
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Mean speed of the motor, from the angles' range."""
+        return float(np.ptp(self.angles_rad)) / self.duration_s
+
+    @property
+    def torque_spread_nm(self) -> float:
+        """Standard deviation of the coupling torque: noise, and a beam that swings."""
+        return float(self.torques_nm.std())
+
+    @property
+    def mean(self) -> Wrench:
+        """Mean of each axis, N and N·m."""
+        fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.mean(axis=0))
+        return fx, fy, fz, tx, ty, tz
+
+    @property
+    def spread(self) -> Wrench:
+        """Standard deviation of each axis, N and N·m."""
+        fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.std(axis=0, ddof=1))
+        return fx, fy, fz, tx, ty, tz
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return the tare as a session file states it."""
+        return {"tare_s": repr(self.duration_s)} | {
+            f"tare_{what}_{axis}": repr(value)
+            for what, values in (("mean", self.mean), ("std", self.spread))
+            for axis, value in zip(AXES, values, strict=True)
+        }
+
+
+def observe_rest(
+    cycle: Cycle,
+    metronome: Metronome,
+    *,
+    rate_hz: float,
+    duration_s: float,
+    projection: Wrench,
+    check: Callable[[], None],
+) -> Rest:
+    """Read angle and wrench for some time without touching the torque.
+
+    Parameters
+    ----------
+    cycle, metronome
+        Which devices, and when.
+    rate_hz, duration_s
+        How often and for how long.
+    projection
+        Coupling torque = projection · wrench.
+    check
+        Called after each reading; raises to end it.
+    """
+    wrenches: list[Wrench] = []
+    angles: list[float] = []
+    for _ in range(round(duration_s * rate_hz)):
+        metronome.wait()
+        cycle.observe(metronome.due_ns)
+        check()
+        wrenches.append(cycle.raw_wrench)
+        angles.append(cycle.angle_rad)
+    readings = np.array(wrenches)
+    return Rest(duration_s, readings, np.array(angles), readings @ np.array(projection))

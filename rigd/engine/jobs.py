@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from rigd.devices.registry import Reality
-from rigd.engine.channels import ChannelSpecs
-from rigd.engine.reference import ReferenceSpec
+from rigd.engine.ring import ReferenceSpec
+from rigd.engine.shared_state import ChannelSpecs
 from rigd.profile import Profile, RealtimeSettings
 
 

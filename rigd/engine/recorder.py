@@ -13,14 +13,24 @@ from collections.abc import Callable, Mapping
 from math import ceil
 from pathlib import Path
 
-from rigd.engine import signals
-from rigd.engine.board import Board, Phase, Word
-from rigd.engine.channels import Channels, attach_channels
-from rigd.engine.events import read_events
+from rigd.engine.ipc import Message, Parent
 from rigd.engine.jobs import RecorderJob
-from rigd.engine.process import Message, Parent
 from rigd.engine.realtime import Precedence
-from rigd.engine.topics import CONTROL, EVENT, SAMPLE, TIMING, TOPICS, Topic
+from rigd.engine.shared_state import (
+    CONTROL,
+    EVENT,
+    SAMPLE,
+    TIMING,
+    TOPICS,
+    Board,
+    Channels,
+    Phase,
+    Topic,
+    Word,
+    attach_channels,
+    read_events,
+)
+from rigd.runtime import signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter
 from rigd.session.format import SAMPLE_SIZE
 

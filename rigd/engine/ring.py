@@ -1,4 +1,6 @@
-"""Bounded hand-over of fixed-size records between processes, through shared memory.
+"""Shared memory between the processes: rings of fixed-size records, and a session's reference.
+
+Bounded hand-over of fixed-size records between processes, through shared memory.
 
 One producer (the control loop), one consumer that must get everything (the recorder), and any
 number of observers that may miss records but never slow anybody down (the live publisher).
@@ -10,14 +12,22 @@ The two counters in the header only ever grow and are written by one side each, 
 words: a record is in place before the counter that announces it. That order is what the processor
 keeps on x86-64; on a weaker memory model the interpreter's own work between the two stores is all
 that separates them, and a reader's own check of the record (tags, consecutive ticks) is the guard.
+
+The reference of a session, in shared memory: the control process must not pause to take it.
+
+However long a session is, a drive that watches over the loop's heartbeat waits no longer.
 """
 
 import mmap
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 HEADER_SIZE = 64
 _WRITTEN, _READ = 0, 1
@@ -180,3 +190,35 @@ def reserve(fd: int, size: int) -> None:
         os.posix_fallocate(fd, 0, size)
     else:
         os.ftruncate(fd, size)
+
+
+_SIZE = 8  # bytes of a double
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSpec:
+    """What the control process needs to find it: an inherited descriptor and its length."""
+
+    fd: int
+    ticks: int
+
+
+def put_reference(fd: int, reference_rad: NDArray[np.float64]) -> ReferenceSpec:
+    """Place a reference, shape (n,), in the memory of `fd`.
+
+    Raises
+    ------
+    OSError
+        If there is not enough shared memory.
+    """
+    size = _SIZE * reference_rad.size
+    reserve(fd, size)
+    with mmap.mmap(fd, size) as memory:
+        memory[:] = reference_rad.astype(np.float64).tobytes()
+    return ReferenceSpec(fd, reference_rad.size)
+
+
+def map_reference(spec: ReferenceSpec) -> Sequence[float]:
+    """Attach to a reference: one Python number a tick, read where it lies."""
+    memory = mmap.mmap(spec.fd, _SIZE * spec.ticks, access=mmap.ACCESS_READ)
+    return memoryview(memory).cast("d")

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rigd.identification.estimate import EstimateError, Timing, Window
 from rigd.identification.experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
-from rigd.identification.motor_estimate import EstimateError, Window
-from rigd.identification.motor_moments import Timing
 from rigd.session import Session, Status, read_session
 
 _USELESS = int(

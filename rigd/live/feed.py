@@ -10,13 +10,13 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.live.outlet import Outlet
+from rigd.live.server import Outlet
 from rigd.view import APPLICATION_ID
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-    from rigd.view.picture import Drawing
+    from rigd.view.scene import Drawing
 
 _PATIENCE_S: Final = 0.2
 _STALLED_PATIENCE_S: Final = 0.02

@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
-from rigd.devices.ati.stream import RECORD_BITS
+from rigd.devices.ati.serial_protocol import RECORD_BITS
 from rigd.devices.cia402.assignments import parse_assignment
 from rigd.devices.cia402.requirements import ACCEPTABLE
 from rigd.devices.parameters import AtiSerial

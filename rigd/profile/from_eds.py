@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from rigd.devices.cia402 import objects
+from rigd.devices.cia402 import protocol
 from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
 from rigd.devices.cia402.suitability import Finding, Grade, judge
 from rigd.devices.eds import Eds
@@ -158,7 +158,7 @@ class Draft:
     def questions(self) -> list[Question]:
         """Return what has to be asked for this drive."""
         more = (_OWN_WATCHDOG,) if WATCHDOG in self._lacks() else ()
-        absent = set() if self._eds.get(objects.RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
+        absent = set() if self._eds.get(protocol.RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
         return [each for each in (*QUESTIONS, *more) if each.key not in absent]
 
     def unanswered(self) -> list[Question]:
@@ -244,9 +244,13 @@ class Draft:
     def _absent(self) -> Iterator[Setting]:
         lacks = self._lacks()
         for missing, key, why in (
-            (not self._eds.get(objects.MAX_SPEED_RPM), "max_speed_rad_s", "6080 (max motor speed)"),
             (
-                not self._eds.get(objects.RATED_TORQUE),
+                not self._eds.get(protocol.MAX_SPEED_RPM),
+                "max_speed_rad_s",
+                "6080 (max motor speed)",
+            ),
+            (
+                not self._eds.get(protocol.RATED_TORQUE),
                 "rated_torque_unit_nm",
                 "6076 (rated torque)",
             ),

@@ -49,8 +49,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "errors": ("SessionError", "SessionExistsError"),
-    "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "Status"),
+    "format": ("SAMPLE_DTYPE", "SAMPLE_SIZE", "SessionError", "SessionExistsError", "Status"),
     "info": ("SessionInfo", "describe", "readable_texts"),
     "reader": (
         "Event",
@@ -60,8 +59,7 @@ _HOMES = {
         "read_session",
         "read_timings",
     ),
-    "recovery": ("Recovery", "recover"),
-    "remedy": ("holds_samples",),
+    "recovery": ("Recovery", "holds_samples", "recover"),
     "writer": ("SessionWriter",),
 }
 

@@ -21,7 +21,7 @@ from rigd.beam import (
 )
 from rigd.devices.parameters import RigParameters, Simulation
 from rigd.sim.air_brake import AirBrake
-from rigd.sim.other_clock import OtherClock
+from rigd.sim.devices import OtherClock
 
 Real = NDArray[np.float64]
 

@@ -17,15 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, DeflectionFilter, undamped_frequencies_rad_s
-from rigd.view.palette import GREY, ORANGE, SKY_BLUE, Color
-from rigd.view.plots import TIMELINE
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
 
-    from rigd.view.picture import Drawing
-    from rigd.view.subject import Subject
+    from rigd.view.scene import Drawing
+    from rigd.view.session_info import Subject
 
 Records = npt.NDArray[Any]
 Real = npt.NDArray[np.float64]

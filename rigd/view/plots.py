@@ -1,4 +1,10 @@
-"""What is plotted over time: which curves, in which units, and how each is drawn."""
+"""What is plotted over time: which curves, in which units and colours.
+
+Colours of what is shown, as red, green and blue from 0 to 255.
+
+Those of Okabe and Ito (2008) are told apart with any colour vision. Here are the ones of them that
+stand out from Rerun's dark background and from its light one.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,10 +14,19 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.view.palette import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
-
 if TYPE_CHECKING:
     from rerun import ComponentColumn, RecordingStream
+
+Color = tuple[int, int, int]
+
+ORANGE: Color = (230, 159, 0)
+SKY_BLUE: Color = (86, 180, 233)
+GREEN: Color = (0, 158, 115)
+VERMILION: Color = (213, 94, 0)
+PURPLE: Color = (204, 121, 167)
+GREY: Color = (130, 130, 130)
+"""Of frames, grids and tick labels, and of a curve that is beside the point."""
+
 
 Records = npt.NDArray[Any]
 """Structured array (n,) with a field ``t_ns``."""

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from rigd.bench.loops import LoopError
 from rigd.bench.program import Results
 from rigd.cli.app import app
-from rigd.supervisor.lock import RigLock
+from rigd.runtime.locks import RigLock
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ import numpy as np
 from rigd.devices.simulator import find_simulator
 from rigd.safety.limits import OVERLOADED
 from rigd.session import Status, read_session
-from rigd.sim.wire.control import ask
+from rigd.sim.wire.simulator import ask
 
 BIN = Path(sys.executable).parent
 PROFILES = Path(__file__).parents[2] / "hw_profiles"
@@ -69,7 +69,7 @@ DIRECT_CHANGES = (
 REST_S, RING_DOWN_S = 0.2, 0.3
 
 MODULES = {
-    "control": b"rigd.engine.control",
+    "control": b"rigd.engine.control_process",
     "recorder": b"rigd.engine.recorder",
     "publisher": b"rigd.live.publisher",
 }

@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.engine.board import Phase, Word
-from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.recorder import Recorder
 from rigd.engine.ring import shared_memory_fd
-from rigd.engine.signals import StopRequest
+from rigd.engine.shared_state import DESCRIPTORS, Phase, Word, create_channels
 from rigd.excitation import hold
 from rigd.profile import load_profile
+from rigd.runner.request import Order
+from rigd.runner.rig import Rig
+from rigd.runtime.signals import StopRequest
 from rigd.session import SessionWriter, read_session
 from rigd.session.format import pack_sample_into
-from rigd.supervisor.orders import Order
-from rigd.supervisor.rig import Rig
 
 
 @pytest.fixture

@@ -148,8 +148,8 @@ def stand_ins(monkeypatch):
     """Devices of which the checks believe that they are the profile's."""
     made = StandIns()
     monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
-    monkeypatch.setattr("rigd.devices.resetting.open_devices", made.open)
-    monkeypatch.setattr("rigd.checks.exchange.TICKS", 100)
+    monkeypatch.setattr("rigd.devices.wired_rig.open_devices", made.open)
+    monkeypatch.setattr("rigd.checks.devices.TICKS", 100)
     return made
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.beam import Damping
-from rigd.checks.loop import loop_rows
+from rigd.checks.on_paper import loop_rows
 from rigd.checks.rows import Verdict, overall
 from rigd.profile import load_profile
 

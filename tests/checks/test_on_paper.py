@@ -6,7 +6,7 @@ import pytest
 
 from rigd.checks.on_paper import profile_rows, wiring_rows
 from rigd.checks.rows import Row, Verdict, overall
-from rigd.devices.canbus.load import bus_load
+from rigd.devices.canbus.budget import bus_load
 from rigd.profile import load_profile
 
 

@@ -8,21 +8,21 @@ import sys
 
 import pytest
 
-from rigd.engine.signals import StopRequest
-from rigd.foreground import _tell_stop
-from rigd.supervisor.session import SessionResult
+from rigd.runner.foreground import _tell_stop
+from rigd.runner.session import SessionResult
+from rigd.runtime.signals import StopRequest
 
 DURING = {
     # What defines a dataclass or a named tuple is an `exec` of text.
     "code made from text": (
-        "import rigd.cli.replay\n"
-        "rigd.cli.replay.has_screen = lambda: exec(\n"
+        "import rigd.cli.live\n"
+        "rigd.cli.live.has_screen = lambda: exec(\n"
         "    'import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(10)')\n"
     ),
     # What is raised there is dropped, and objects end anywhere.
     "an object that ends": (
         "import os, signal, time, weakref\n"
-        "import rigd.cli.replay\n"
+        "import rigd.cli.live\n"
         "class Ending: pass\n"
         "def ended(_): os.kill(os.getpid(), signal.SIGINT); time.sleep(0)\n"
         "def has_screen():\n"
@@ -30,17 +30,17 @@ DURING = {
         "    observed = weakref.ref(ending, ended)\n"
         "    del ending\n"
         "    time.sleep(10)\n"
-        "rigd.cli.replay.has_screen = has_screen\n"
+        "rigd.cli.live.has_screen = has_screen\n"
     ),
     "the clean-up after its end": (
         "import os, signal, sys\n"
-        "import rigd.cli.replay\n"
-        "from rigd.interruption import interrupt\n"
+        "import rigd.cli.live\n"
+        "from rigd.runtime.signals import interrupt\n"
         "class Late:\n"
         "    def __del__(self, kill=os.kill, pid=os.getpid(), number=signal.SIGINT):\n"
         "        kill(pid, number)\n"
         "sys.late = Late()\n"
-        "rigd.cli.replay.has_screen = lambda: interrupt(signal.SIGINT, None)\n"
+        "rigd.cli.live.has_screen = lambda: interrupt(signal.SIGINT, None)\n"
     ),
     "imports": (
         "import sys\n"

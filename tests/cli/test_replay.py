@@ -30,9 +30,9 @@ from rigd.session.format import (
     pack_sample_into,
     pack_timing_into,
 )
-from rigd.view.palette import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
+from rigd.view.frequency_charts import MAGNITUDE, ResponseCharts
+from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
 from rigd.view.recorded import nominal_damping, subject_of_session
-from rigd.view.response_charts import MAGNITUDE, ResponseCharts
 
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 RIGD = Path(sys.executable).parent / "rigd"
@@ -430,7 +430,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
 
 
 def test_progress_appears_when_it_takes_long(rigd_here, short, monkeypatch, tmp_path):
-    monkeypatch.setattr("rigd.cli.progress._QUIET_S", -1.0)
+    monkeypatch.setattr("rigd.cli.options._QUIET_S", -1.0)
     monkeypatch.setenv("FORCE_COLOR", "1")
     done = rigd_here("replay", short, "--save", tmp_path / "out.rrd")
     assert done.returncode == 0, done.stderr
@@ -556,11 +556,11 @@ def unseen(viewer, colors: dict) -> list:
 def test_a_port_that_somebody_takes_first_is_not_insisted_on(
     rerun_program, recording, tmp_path, monkeypatch
 ):
-    from rigd.live.playback import PageOfFile
+    from rigd.live.viewer import PageOfFile
 
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
-        monkeypatch.setattr("rigd.live.playback.free_port", lambda wanted: taken)
+        monkeypatch.setattr("rigd.live.viewer.free_port", lambda wanted: taken)
         with PageOfFile(recording, tmp_path) as page:
             assert page.program.grpc_port not in (0, taken)
             assert page.address.grpc_port == page.program.grpc_port
@@ -571,8 +571,8 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
-    from rigd.live.playback import PageOfFile, Window
-    from rigd.live.program import RerunProgram
+    from rigd.live.server import RerunProgram
+    from rigd.live.viewer import PageOfFile, Window
 
     headless = ("--headless", "--window-size", "960x600")
     if way == "window":

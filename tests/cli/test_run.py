@@ -227,7 +227,7 @@ def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
 def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
-    os.kill(child_running(process.pid, "rigd.engine.control"), signal.SIGSTOP)
+    os.kill(child_running(process.pid, "rigd.engine.control_process"), signal.SIGSTOP)
     to_one(process, signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 1, errors  # a fault is one, whatever was asked for
@@ -252,7 +252,8 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, t
 
 
 @pytest.mark.parametrize(
-    ("victim", "words"), [("rigd.engine.control", "control process"), ("rigd.engine.recorder", "")]
+    ("victim", "words"),
+    [("rigd.engine.control_process", "control process"), ("rigd.engine.recorder", "")],
 )
 def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path, victim, words):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
@@ -261,7 +262,7 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path,
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 1, (output, errors)
     assert "Traceback" not in errors
-    if victim == "rigd.engine.control":
+    if victim == "rigd.engine.control_process":
         (path,) = tmp_path.glob("sessions/*.mcap")
         record = read_session(path)
         assert record.outcome["outcome"] == "fault"
@@ -366,7 +367,7 @@ def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_p
 def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
-    control = child_running(process.pid, "rigd.engine.control")
+    control = child_running(process.pid, "rigd.engine.control_process")
     process.kill()
     process.wait()
     assert eventually(lambda: list(tmp_path.glob("sessions/*.mcap")))

@@ -17,7 +17,7 @@ def test_unknown_drivers_are_refused_with_what_there_is():
 
 def test_the_simulation_is_not_imported_unless_a_profile_names_it():
     code = (
-        "import sys, rigd.devices.registry, rigd.engine.control\n"
+        "import sys, rigd.devices.registry, rigd.engine.control_process\n"
         "assert not [name for name in sys.modules if name.startswith('rigd.sim')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -6,8 +6,8 @@ import tempfile
 
 import pytest
 
-from rigd.devices.held_file import HeldFile
-from rigd.devices.simulator import runtime_folder
+from rigd.runtime.folder import runtime_folder
+from rigd.runtime.locks import HeldFile
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from rigd.session import read_session
 
 BIN = Path(sys.executable).parent
 RATE_HZ = 1000
-MODULES = {"rigd.engine.control": "control", "rigd.engine.recorder": "recorder"}
+MODULES = {"rigd.engine.control_process": "control", "rigd.engine.recorder": "recorder"}
 
 _LOOK_S = 0.05
 _ENDLESS_HOURS = 500.0

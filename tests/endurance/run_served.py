@@ -26,13 +26,13 @@ from run_campaign import Look, growth_table
 from run_starved import judge
 from run_viewers import Reading, children
 
-from rigd.live.address import find
+from rigd.live.server import find
 
 RIGD = Path(sys.executable).parent / "rigd"
 RIG = "sim"
 OPTIONS = ("--rest", "0.2", "--ring-down", "0.2", "--amplitude", "0.01", "--json")
 NAMES = {
-    "rigd.engine.control": "control",
+    "rigd.engine.control_process": "control",
     "rigd.live.publisher": "live",
 }
 """Processes that last as long as the daemon does; a recorder is another one in each session."""

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from run_viewers import Reading
 
-from rigd.live.address import find
+from rigd.live.server import find
 from rigd.safety.limits import OVERLOADED
 from rigd.session import read_session
 

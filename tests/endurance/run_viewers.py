@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench.measure import measurement
-from rigd.live.address import LiveAddress, find
-from rigd.live.program import RerunProgram
+from rigd.live.server import LiveAddress, RerunProgram, find
 from rigd.live.viewer import Viewer
 from rigd.session import read_session
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine.processes import CONTROL
-from rigd.engine.signals import StopRequest
+from rigd.engine.ipc import CONTROL
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.supervisor.crew import Crew
-from rigd.supervisor.orders import Order
-from rigd.supervisor.rig import Rig
+from rigd.runner.process_group import Crew
+from rigd.runner.request import Order
+from rigd.runner.rig import Rig
+from rigd.runtime.signals import StopRequest
 
 COARSE_KB = 4096
 

@@ -7,17 +7,14 @@ import pytest
 
 from rigd.devices.contracts import Devices
 from rigd.devices.registry import open_devices
-from rigd.engine.board import Phase, Word
-from rigd.engine.channels import DESCRIPTORS, create_channels
-from rigd.engine.clocks import VirtualClock
-from rigd.engine.control import attend
-from rigd.engine.events import read_events
+from rigd.engine.control_process import attend
 from rigd.engine.jobs import SessionJob
-from rigd.engine.reference import put_reference
-from rigd.engine.ring import shared_memory_fd
-from rigd.engine.signals import StopRequest
+from rigd.engine.ring import put_reference, shared_memory_fd
+from rigd.engine.shared_state import DESCRIPTORS, Phase, Word, create_channels, read_events
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
 from rigd.profile import load_profile
+from rigd.runtime.signals import StopRequest
 from rigd.session.format import decode_controls, decode_samples
 
 

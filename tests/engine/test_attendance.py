@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.engine.board import Phase, Word
-from rigd.engine.clocks import SuspendWatch, VirtualClock
+from rigd.engine.shared_state import Phase, Word
+from rigd.engine.timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
 from rigd.session.format import Status
 
@@ -200,7 +200,7 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
 def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     boot_ns = [0]
     watch = SuspendWatch(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
-    monkeypatch.setattr("rigd.engine.procedure.SuspendWatch", lambda: watch)
+    monkeypatch.setattr("rigd.engine.session_sequence.SuspendWatch", lambda: watch)
     session = make_session(clock=FakeRealClock())
 
     read_angle = session.drive.read_angle
@@ -340,7 +340,7 @@ def test_virtual_time_goes_on_slowly_where_a_device_waits_for_signs_of_life(
     make_session, monkeypatch, bits
 ):
     """On a line, that is: it stands still for a rig that is simulated in this process."""
-    monkeypatch.setattr("rigd.engine.control._SIGN_OF_LIFE_S", 0.0)
+    monkeypatch.setattr("rigd.engine.control_process._SIGN_OF_LIFE_S", 0.0)
     session = make_session()
     session.drive.health = lambda: LineHealth(bits)
     reads = []

@@ -9,9 +9,9 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
-from rigd.engine.board import Word
-from rigd.engine.clocks import VirtualClock
-from rigd.engine.watch import make_watch
+from rigd.engine.cycle import make_watch
+from rigd.engine.shared_state import Word
+from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety import INTERLOCKS, Action

@@ -5,8 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine.clocks import SUSPENDED_S, RealClock, SuspendWatch, VirtualClock
-from rigd.engine.metronome import Metronome
+from rigd.engine.timing import SUSPENDED_S, Metronome, RealClock, SuspendWatch, VirtualClock
 
 
 class LateClock:

@@ -7,10 +7,9 @@ import subprocess
 import numpy as np
 import pytest
 
+from rigd.engine.ipc import Child, ChildError, packed_object
 from rigd.engine.jobs import SessionJob
-from rigd.engine.process import Child, ChildError, packed_object
-from rigd.engine.reference import map_reference, put_reference
-from rigd.engine.ring import shared_memory_fd
+from rigd.engine.ring import map_reference, put_reference, shared_memory_fd
 from rigd.excitation.signals import MAX_TICKS
 from rigd.profile import load_profile
 

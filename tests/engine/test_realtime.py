@@ -159,7 +159,7 @@ def test_touching_new_memory_is_counted():
 PRECEDENCE = """
 import json, os, resource, sys, threading
 from pathlib import Path
-from rigd.engine.process import Child
+from rigd.engine.ipc import Child
 from rigd.engine.realtime import Precedence
 {before}
 

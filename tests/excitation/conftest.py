@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from rigd.planning import Foresight
 from rigd.profile import load_profile
+from rigd.runner.planning import Foresight
 
 MODES = [
     {"frequency_hz": 2.57, "damping_ratio": 0.0091},

@@ -11,8 +11,8 @@ import pytest
 from rigd.control import PidController, design_pid
 from rigd.devices.contracts import Devices
 from rigd.devices.registry import open_devices
-from rigd.engine.cycle import Cycle
-from rigd.engine.watch import make_watch
+from rigd.engine.cycle import Cycle, make_watch
+from rigd.identification.estimate import Timing, Window, estimate_motor
 from rigd.identification.experiments import (
     TOP_HZ,
     lay_out_passes,
@@ -21,9 +21,7 @@ from rigd.identification.experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.identification.motor_estimate import Window, estimate_motor
-from rigd.identification.motor_moments import Timing
-from rigd.identification.tuning import cautious, tuned
+from rigd.identification.proposal import cautious, tuned
 from rigd.profile import load_profile
 
 OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigd.identification.motor_estimate import (
+from rigd.identification.estimate import (
     EstimateError,
+    Timing,
     Window,
+    _coverage,
     estimate_motor,
 )
-from rigd.identification.motor_fit import _coverage
-from rigd.identification.motor_moments import Timing
 
 RATE_HZ = 1000.0
 STEPS = 5

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.identification.motor_estimate import MotorEstimate, Quantity
+from rigd.identification.estimate import MotorEstimate, Quantity
 from rigd.identification.proposal import _rounded, propose
 from rigd.profile import load_profile
 

@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.devices.simulator import runtime_folder
-from rigd.live.address import LiveAddress, announce, find, running, withdraw
-from rigd.live.outlet import free_port
+from rigd.live.server import LiveAddress, announce, find, free_port, running, withdraw
+from rigd.runtime.folder import runtime_folder
 
 
 @pytest.fixture

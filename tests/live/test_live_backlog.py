@@ -4,11 +4,9 @@ from functools import partial
 
 import pytest
 
-from rigd.engine.board import UNKNOWN, Word
-from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.ring import shared_memory_fd
-from rigd.live.backlog import Backlog
-from rigd.live.vitals import LOOK_S, Vitals
+from rigd.engine.shared_state import DESCRIPTORS, UNKNOWN, Word, create_channels
+from rigd.live.publisher import LOOK_S, Backlog, Vitals
 
 
 def drawing(name):

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from processes import eventually
 
-from rigd.engine.board import Word
-from rigd.engine.signals import StopRequest
+from rigd.engine.shared_state import Word
 from rigd.excitation.named import make_excitation
-from rigd.live.address import find
+from rigd.live.server import find
 from rigd.profile import load_profile
+from rigd.runner import live_view
+from rigd.runner.request import Order
+from rigd.runner.rig import Rig
+from rigd.runtime.signals import StopRequest
 from rigd.session import read_session
-from rigd.supervisor import live_view
-from rigd.supervisor.orders import Order
-from rigd.supervisor.rig import Rig
 
 
 @pytest.fixture

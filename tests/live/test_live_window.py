@@ -22,7 +22,7 @@ from processes import eventually
 from rigd.view import plots
 from rigd.view.antenna import TITLE as ANTENNA
 from rigd.view.layout import TABS
-from rigd.view.palette import GREEN, GREY, ORANGE, SKY_BLUE
+from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
 
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 

@@ -8,6 +8,7 @@ import subprocess
 import pytest
 
 from rigd.cli.app import app
+from rigd.runner.request import what_is_kept
 from rigd.session import (
     SessionError,
     SessionWriter,
@@ -17,7 +18,6 @@ from rigd.session import (
     read_timings,
     recover,
 )
-from rigd.supervisor.orders import what_is_kept
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from analysis.settings import WelchSettings
 from analysis.welch_route import analyse
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
-from rigd.view.rrd_file import new_rrd_file
+from rigd.view.recorded import new_rrd_file
 
 BAND = (0.5875, 50.0)
 

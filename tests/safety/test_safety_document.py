@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.checks.travel import travel_rows, worst_travel
+from rigd.checks.on_paper import travel_rows, worst_travel
 from rigd.profile import load_profile
 from rigd.profile.schema import keys
 from rigd.safety import INTERLOCKS

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine.watch import make_watch
+from rigd.engine.cycle import make_watch
 from rigd.excitation import hold
-from rigd.planning import RefusedError
 from rigd.profile import load_profile
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import make_room
 from rigd.safety import LOOK_EVERY
-from rigd.supervisor.orders import make_room
 
 PROFILE = load_profile("antenna_can")
 LIMITS = PROFILE.limits

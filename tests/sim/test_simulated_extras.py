@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import LoadedBeam
 from rigd.profile import load_profile
-from rigd.sim.other_clock import OtherClock
+from rigd.sim.devices import OtherClock
 from rigd.sim.plant import SimulatedPlant
 
 TICKS = 12_000

@@ -8,7 +8,7 @@ import pytest
 from rigd.beam import Beam, Damping
 from rigd.session.format import SAMPLE_DTYPE
 from rigd.view.plots import TIMELINE
-from rigd.view.subject import Subject
+from rigd.view.session_info import Subject
 
 
 @pytest.fixture(autouse=True)

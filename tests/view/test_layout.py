@@ -3,9 +3,9 @@
 import pytest
 
 from rigd.view import plots
+from rigd.view.frequency_charts import SIZES
 from rigd.view.layout import CLOSE_UP_S, HISTORY_S, TABS, TIME_VIEWS, WINDOW_S, blueprint
 from rigd.view.plots import TIMELINE
-from rigd.view.response_charts import SIZES
 
 
 def leaves(part):

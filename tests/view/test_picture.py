@@ -13,12 +13,9 @@ from analysis.settings import PAPER_BAND_HZ, WelchSettings
 from rigd.beam import Damping
 from rigd.session import Status, read_session
 from rigd.session.format import TIMING_DTYPE
-from rigd.view.health import Health
-from rigd.view.notes import Note
-from rigd.view.picture import Picture
-from rigd.view.response_charts import MAGNITUDE
-from rigd.view.subject import Subject
-from rigd.view.sweep_response import SweepResponse
+from rigd.view.frequency_charts import MAGNITUDE, SweepResponse
+from rigd.view.scene import Picture
+from rigd.view.session_info import Health, Note, Subject
 
 RIGD = Path(sys.executable).parent / "rigd"
 

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rigd.view.layout import CLOSE_UP_S, TIME_VIEWS, TimeView
+from rigd.view.layout import CLOSE_UP_S, TIME_VIEWS, Scale, TimeView, missing_ticks
 from rigd.view.plots import COUPLING_TORQUE, HEALTH, LOOP, READINGS, SIGNALS, Plot
-from rigd.view.scale import Scale, missing_ticks
 
 RATE_HZ = 1000
 BLOCK = 100

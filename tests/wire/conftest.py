@@ -6,15 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine.board import Phase
-from rigd.engine.events import Event
-from rigd.engine.signals import StopRequest
+from rigd.engine.shared_state import Event, Phase
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.sim.wire.simulate import inject
-from rigd.supervisor.orders import Order
-from rigd.supervisor.rig import Rig
-from rigd.supervisor.session import SessionProgress, SessionResult
+from rigd.runner.request import Order
+from rigd.runner.rig import Rig
+from rigd.runner.session import SessionProgress, SessionResult
+from rigd.runtime.signals import StopRequest
+from rigd.sim.wire.simulator import inject
 
 
 @dataclass(frozen=True)

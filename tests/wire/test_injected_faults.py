@@ -8,10 +8,10 @@ import pytest
 from processes import eventually
 
 from rigd.devices.contracts import DeviceError
-from rigd.devices.resetting import reset_drive
+from rigd.devices.wired_rig import reset_drive
+from rigd.runner.rig import RigError
 from rigd.session import Status, read_session
-from rigd.sim.wire.simulate import inject
-from rigd.supervisor.rig import RigError
+from rigd.sim.wire.simulator import inject
 
 # Fast from the beginning, so that every fault is met while the motor moves.
 CHIRP = {"start_hz": 5.0, "stop_hz": 10.0, "rest_s": 0.1, "ring_down_s": 0.1}

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from rigd.devices.parameters import Selection
-from rigd.engine.signals import StopRequest
 from rigd.excitation import hold
+from rigd.runner.request import Order
+from rigd.runner.rig import Rig
+from rigd.runtime.signals import StopRequest
 from rigd.session import read_session
-from rigd.sim.wire.simulate import inject
-from rigd.supervisor.orders import Order
-from rigd.supervisor.rig import Rig
+from rigd.sim.wire.simulator import inject
 
 
 @pytest.mark.parametrize(

@@ -158,7 +158,7 @@ def test_without_the_loop_the_drive_goes_off_by_itself(
     simulator = start_simulator(profile, "--log", log)
     running = start_chirp(profile)
     assert eventually(lambda: _recording(tmp_path))
-    os.kill(child_running(running.pid, "rigd.engine.control"), how)
+    os.kill(child_running(running.pid, "rigd.engine.control_process"), how)
     assert eventually(lambda: any(e["code"] == 0x8130 for e in drive_log(log).of("emcy")))
     running.send_signal(signal.SIGINT)  # the supervisor kills a process that does not answer
     running.communicate(timeout=60)

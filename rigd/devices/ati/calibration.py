@@ -1,4 +1,10 @@
-"""A calibration as an ATI sensor holds it, and the way from gauge counts to a wrench.
+"""Calibration of an ATI sensor: from gauge counts to a wrench; and the status words.
+
+The status words of both sensors in words, and which of their bits forbid measuring.
+
+Sources: devices.md 1.1 for NETCANOEM and 2.1 for Digital F/T. They differ in bits 9, 10 and 13.
+
+A calibration as an ATI sensor holds it, and the way from gauge counts to a wrench.
 
 For a force (N after the unit's factor) ``F_i = unit · Σ_j M_ij g_j / counts_per_force``, and
 likewise for a torque (N·m).
@@ -7,10 +13,66 @@ likewise for a torque (N·m).
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from struct import pack, unpack
 
 import numpy as np
 
 from rigd.devices.contracts import Wrench
+
+CAN_WATCHDOG_RESET = 0x0001
+CAN_BAD_CALIBRATION = 0x0040
+CAN_BUS_ERROR = 0x4000
+
+_COMMON_WORDS = {
+    0: "its watchdog has reset the board",
+    1: "the gauges' excitation is too high",
+    2: "the gauges' excitation is too low",
+    3: "its artificial analogue ground is out of range",
+    4: "its supply voltage is too high",
+    5: "its supply voltage is too low",
+    7: "its memory (EEPROM) has failed",
+    8: "its configuration is invalid",
+}
+_CAN_WORDS = {
+    **_COMMON_WORDS,
+    6: "the active calibration is bad",
+    11: "the sensor is too hot",
+    12: "the sensor is too cold",
+    14: "it has seen errors on the CAN bus",
+}
+CAN_CRITICAL = 0x18FE
+"""Bits 1 to 7, 11 and 12."""
+
+_SERIAL_WORDS = {
+    **_COMMON_WORDS,
+    9: "the bridges take too much current (broken gauge or cable)",
+    10: "the bridges take too little current (broken gauge or cable)",
+    11: "the reading of its thermistor is too high",
+    12: "the reading of its thermistor is too low",
+    13: "the reading of its analogue output is out of range",
+}
+SERIAL_CRITICAL = 0x3EBE
+"""Bits 1 to 5, 7 and 9 to 13: what is critical on NETCANOEM, and the bits only this one has."""
+
+
+def can_status(word: int) -> list[str]:
+    """Return what the status word of a NETCANOEM box says, one clause a bit."""
+    # Bit 15 only sums up the others.
+    return _words(word & 0x7FFF, _CAN_WORDS)
+
+
+def serial_status(word: int) -> list[str]:
+    """Return what the status word of a Digital F/T sensor says, one clause a bit."""
+    return _words(word, _SERIAL_WORDS)
+
+
+def _words(word: int, table: dict[int, str]) -> list[str]:
+    return [
+        table.get(bit, f"status bit {bit}, which has no known meaning, is set")
+        for bit in range(16)
+        if word >> bit & 1
+    ]
+
 
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
 """Which gauge stands where in a reading, on CAN as on the serial line."""
@@ -218,3 +280,59 @@ def text_of(raw: Sequence[int]) -> str:
     data = bytes(raw).rstrip(b"\0\xff ")
     text = data.decode("latin-1").strip()
     return text if text.isascii() and (text.isprintable() or not text) else data.hex(" ")
+
+
+BLOCK_REGISTERS = 133
+"""Of a block, as far as the driver needs it."""
+
+_FIRST_BLOCK = 0x00E3
+_BLOCK_SPACING = 192
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationBlock:
+    """A calibration, and the amplifier settings that belong to it."""
+
+    calibration: Calibration
+    gains: tuple[int, ...]
+    """Of gauges 0 to 5, as register values."""
+    offsets: tuple[int, ...]
+
+
+def first_register(number: int) -> int:
+    """Return where block ``number`` (1 to 16) begins."""
+    return _FIRST_BLOCK + (number - 1) * _BLOCK_SPACING
+
+
+def parse_block(registers: Sequence[int]) -> CalibrationBlock:
+    """Read a block.
+
+    Raises
+    ------
+    ValueError
+        If no wrench can be computed with it; the message is a sentence for the operator.
+    """
+    raw = pack(f">{BLOCK_REGISTERS}H", *registers)
+
+    def part(first: int, count: int) -> bytes:
+        return raw[2 * first : 2 * (first + count)]
+
+    entries = unpack(">36f", part(32, 72))
+    counts_per_force, counts_per_torque = unpack(">ii", part(117, 4))
+    calibration = Calibration(
+        serial_number=text_of(part(0, 4)),
+        part_number=text_of(part(4, 16)),
+        family=text_of(part(20, 2)),
+        date=text_of(part(22, 10)),
+        matrix=tuple(tuple(entries[6 * axis : 6 * axis + 6]) for axis in range(6)),
+        force_unit=registers[104] >> 8,
+        torque_unit=registers[104] & 0xFF,
+        ratings=unpack(">6f", part(105, 12)),
+        counts_per_force=counts_per_force,
+        counts_per_torque=counts_per_torque,
+    )
+    return CalibrationBlock(
+        calibration=calibration,
+        gains=unpack(">6H", part(121, 6)),
+        offsets=unpack(">6H", part(127, 6)),
+    )

@@ -6,16 +6,18 @@ from functools import partial
 from math import ceil
 
 from rigd.devices.ati import netcanoem
-from rigd.devices.ati.calibration import Calibration, Rows, same_serial_number, wrench_function
-from rigd.devices.ati.netcanoem import REPLY_LENGTHS, identifier
-from rigd.devices.ati.polling import Answer, GaugePolls
-from rigd.devices.ati.status import (
+from rigd.devices.ati.calibration import (
     CAN_BAD_CALIBRATION,
     CAN_BUS_ERROR,
     CAN_CRITICAL,
     CAN_WATCHDOG_RESET,
+    Calibration,
+    Rows,
     can_status,
+    same_serial_number,
+    wrench_function,
 )
+from rigd.devices.ati.netcanoem import REPLY_LENGTHS, Answer, GaugePolls, identifier
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters

@@ -11,11 +11,9 @@ from struct import Struct
 
 import numpy as np
 
-from rigd.devices.ati.calibration_block import CalibrationBlock
-from rigd.devices.ati.serial_line import SerialLine
-from rigd.devices.ati.serial_setup import SILENCE_S, SerialSetup
-from rigd.devices.ati.status import SERIAL_CRITICAL, serial_status
-from rigd.devices.ati.stream import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
+from rigd.devices.ati.calibration import SERIAL_CRITICAL, CalibrationBlock, serial_status
+from rigd.devices.ati.serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
+from rigd.devices.ati.serial_setup import SILENCE_S, SerialLine, SerialSetup
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
 from rigd.devices.simulator import SimulatorAddress

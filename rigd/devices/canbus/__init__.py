@@ -5,10 +5,15 @@ CAN sockets it is one of those; the bus of ``rigd simulate`` is a Unix socket th
 16 bytes; every other adapter goes through python-can. The drivers see no difference.
 """
 
-from rigd.devices.canbus.exchange import CanExchange
-from rigd.devices.canbus.frame import BUS_OFF_FRAME, FRAME_SIZE, pack_frame, unpack_frame
-from rigd.devices.canbus.link import CanLink
-from rigd.devices.canbus.port import CanPort, open_port
+from rigd.devices.canbus.exchange import CanExchange, CanLink
+from rigd.devices.canbus.port import (
+    BUS_OFF_FRAME,
+    FRAME_SIZE,
+    CanPort,
+    open_port,
+    pack_frame,
+    unpack_frame,
+)
 
 __all__ = [
     "BUS_OFF_FRAME",

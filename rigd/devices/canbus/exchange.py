@@ -1,13 +1,149 @@
-"""The cyclic exchange on one port: who gets which frame, and waiting for replies."""
+"""The cyclic exchange on one port: who gets which frame, and waiting for replies.
+
+Which request the last reply answers, on a bus whose replies do not say so: both are counted.
+
+A device answers every request with one reply, in order. Where one is missing, the next to come may
+be the missing one, late, or the next one, the missing one being lost; and from then on there is one
+reply to each request either way. So one tick is left without a request: if no reply comes in it,
+none is on its way, and what is missing is lost. If one comes, replies are late by whole periods,
+and no reading counts until they have caught up.
+"""
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
-from rigd.devices.canbus.frame import BUS_OFF, ERROR_FLAG, ERROR_MASK, LENGTH_AT, read_head
-from rigd.devices.canbus.load import FRAME_BITS
-from rigd.devices.canbus.port import CanPort
+from rigd.devices.canbus.budget import FRAME_BITS
+from rigd.devices.canbus.port import (
+    BUS_OFF,
+    ERROR_FLAG,
+    ERROR_MASK,
+    LENGTH_AT,
+    CanPort,
+    open_port,
+    read_head,
+)
 from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import CanBus
+from rigd.devices.simulator import SimulatorAddress
+from rigd.runtime.locks import HeldError, HeldFile
+
+_STEADY_PERIODS = 3
+"""Periods with one reply each after which what is missing is given up where there is no pause."""
+
+
+class Counter(Protocol):
+    """Where replies are counted as they come."""
+
+    replies: int
+    """Since somebody set this to zero, whatever was in them."""
+
+
+class ReplyPairing:
+    """Counts requests and their replies.
+
+    Parameters
+    ----------
+    inbox
+        Of the replies.
+    pauses
+        A tick may be left without a request. Not so with a device whose time passes with the
+        requests: there what is missing is taken for lost in the end, unproven.
+
+    Attributes
+    ----------
+    owed : int
+        Replies that have not come yet, to the last request or to earlier ones.
+    lost : int
+        Replies that were taken for lost.
+    unproven : int
+        Those of them that may also be late for good.
+    """
+
+    __slots__ = (
+        "_alone",
+        "_asked",
+        "_heard",
+        "_inbox",
+        "_pauses",
+        "_steady",
+        "lost",
+        "owed",
+        "unproven",
+    )
+
+    def __init__(self, inbox: Counter, *, pauses: bool = True) -> None:
+        self._inbox = inbox
+        self._pauses = pauses
+        self.lost = 0
+        self.unproven = 0
+        self.start()
+
+    def start(self) -> None:
+        """Begin anew, with nothing on its way."""
+        self._inbox.replies = 0
+        self._asked = self._alone = True
+        self._heard = 0
+        self._steady = 0
+        self.owed = 0
+
+    def wants_pause(self) -> bool:
+        """Whether the next tick is to make no request; all that has come has been delivered."""
+        if not (self.owed and self._pauses):
+            return False
+        self._take()
+        # A pause in which a reply came goes on until they have all come, or none does.
+        return self.owed > 0 and (self._heard == 1 if self._asked else self._heard > 0)
+
+    def ask(self) -> None:
+        """Note a new request, right before it is made; all that has come has been delivered."""
+        self._close()
+        self._asked = True
+        self._alone = not self.owed
+        self.owed += 1
+
+    def pause(self) -> None:
+        """Note a tick without a request, likewise."""
+        self._close()
+        self._asked = self._alone = False
+
+    def has_caught_up(self) -> bool:
+        """Whether the last reply is the one to the last request."""
+        return 0 < self.owed <= self._inbox.replies
+
+    def settle(self) -> bool:
+        """Take what has come; return whether it is the reply to this tick's request.
+
+        Where older ones were owed as well the next tick is the first to count: what a fault on the
+        line delays may come after what was sent later.
+        """
+        return self._take() > 0 and self.owed == 0 and self._alone
+
+    def _close(self) -> None:
+        """End the period of the last tick."""
+        self._take()
+        if self.owed:
+            if not self._asked:
+                if not self._heard:
+                    self.lost += self.owed
+                    self.owed = 0
+            elif not self._pauses:
+                self._steady = self._steady + 1 if self._heard == 1 else 0
+                if self._steady >= _STEADY_PERIODS:
+                    self.lost += self.owed
+                    self.unproven += self.owed
+                    self.owed = self._steady = 0
+        else:
+            self._steady = 0
+        self._heard = 0
+
+    def _take(self) -> int:
+        replies, self._inbox.replies = self._inbox.replies, 0
+        self._heard += replies
+        self.owed = max(0, self.owed - replies)
+        return replies
+
 
 Handler = Callable[[bytes], None]
 
@@ -166,3 +302,103 @@ class CanExchange:
                 f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
                 "disturbed; look at cable and termination."
             )
+
+
+class BusLock:
+    """Held from the opening of a bus to its closing.
+
+    Parameters
+    ----------
+    bus
+        Where the bus is: a channel, or the socket of a simulated one.
+    simulated
+        It is a simulated one: other users have others.
+    """
+
+    def __init__(self, bus: str, *, simulated: bool) -> None:
+        self._bus = bus
+        self._file = HeldFile(f"bus-{bus}", everybody=not simulated)
+
+    def acquire(self) -> None:
+        """Take the bus.
+
+        Raises
+        ------
+        DeviceError
+            If another program has it; the message says which process.
+        """
+        try:
+            self._file.acquire("rigd")
+        except HeldError as holder:
+            raise DeviceError(
+                f"CAN bus {self._bus}: another rigd is using it ({holder}); wait for it, or stop "
+                "it."
+            ) from None
+        except OSError as error:
+            raise DeviceError(
+                f"CAN bus {self._bus}: it cannot be reserved in {self._file.path.parent} "
+                f"({error.strerror}); set XDG_RUNTIME_DIR to a folder that is yours."
+            ) from None
+
+    def release(self) -> None:
+        """Give the bus up; harmless when repeated."""
+        self._file.release()
+
+
+class CanLink:
+    """One bus and its users.
+
+    Parameters
+    ----------
+    settings
+        Which bus.
+    simulator
+        Of the simulated rig that stands in for it, or None.
+    """
+
+    def __init__(self, settings: CanBus, simulator: SimulatorAddress | None) -> None:
+        self._settings = settings
+        self._simulator = simulator
+        self._exchange: CanExchange | None = None
+        self._users = 0
+        simulated = "" if simulator is None else simulator.can_socket
+        self._lock = BusLock(simulated or settings.channel, simulated=bool(simulated))
+
+    @property
+    def exchange(self) -> CanExchange:
+        """The cyclic exchange on the open bus.
+
+        Raises
+        ------
+        DeviceError
+            If the bus is not open.
+        """
+        if self._exchange is None:
+            raise DeviceError(f"CAN bus {self._settings.channel}: it is not open.")
+        return self._exchange
+
+    def open(self) -> CanExchange:
+        """Open the bus if nobody has yet.
+
+        Raises
+        ------
+        DeviceError
+            If that fails, or another program uses it.
+        """
+        if self._exchange is None:
+            self._lock.acquire()
+            try:
+                self._exchange = CanExchange(open_port(self._settings, self._simulator))
+            except BaseException:
+                self._lock.release()
+                raise
+        self._users += 1
+        return self._exchange
+
+    def close(self) -> None:
+        """Give the bus up; the last of its users closes it."""
+        self._users = max(0, self._users - 1)
+        if self._users == 0 and self._exchange is not None:
+            self._exchange.port.close()
+            self._exchange = None
+            self._lock.release()

@@ -5,17 +5,17 @@ import time
 
 import can
 
-from rigd.devices.canbus.frame import (
+from rigd.devices.canbus.port import (
     ERROR_FLAG,
     ERROR_MASK,
     LONG_FLAG,
     REMOTE_FLAG,
     SFF_MASK,
+    CanPort,
     pack_frame,
     read_head,
     unpack_frame,
 )
-from rigd.devices.canbus.port import CanPort
 
 
 class SetupBus(can.BusABC):

@@ -1,6 +1,6 @@
 """The drive on its bus: set-up, the exchange of every tick, its guards, enabling and disabling.
 
-A TPDO does not say which SYNC it answers: :mod:`rigd.devices.canbus.pairing` counts both, and
+A TPDO does not say which SYNC it answers: :mod:`rigd.devices.canbus.exchange` counts both, and
 where that is in doubt a SYNC is left out. A drive that takes more than a period for its answer is
 refused by :meth:`Cia402Drive.connect` already.
 """
@@ -9,31 +9,31 @@ from collections.abc import Callable
 from math import isnan
 
 from rigd.devices.canbus import CanExchange, CanLink
-from rigd.devices.cia402.departure import left_operation
-from rigd.devices.cia402.following import TorqueFollowing
-from rigd.devices.cia402.frames import NodeFrames
-from rigd.devices.cia402.inbox import Inbox
-from rigd.devices.cia402.node import Node
-from rigd.devices.cia402.objects import (
+from rigd.devices.cia402.node import Inbox, Node
+from rigd.devices.cia402.protocol import (
     ACTUAL_TORQUE,
-    HEARTBEAT_CONSUMER,
-    HEARTBEAT_PRODUCER_MS,
-)
-from rigd.devices.cia402.requirements import Watchdog
-from rigd.devices.cia402.setup import Outfit, set_up
-from rigd.devices.cia402.standing import reset_fault
-from rigd.devices.cia402.states import (
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     ENABLED,
     FAULT_BIT,
     FOLLOWS_TARGET,
+    HEARTBEAT_CONSUMER,
+    HEARTBEAT_PRODUCER_MS,
     STATE_BITS,
     DriveState,
+    NodeFrames,
     state_of,
 )
-from rigd.devices.cia402.switching import StopAskedError, step_up, switch_off
-from rigd.devices.cia402.values import torque_limit_per_mille
+from rigd.devices.cia402.requirements import Watchdog, torque_limit_per_mille
+from rigd.devices.cia402.setup import Outfit, set_up
+from rigd.devices.cia402.standing import reset_fault
+from rigd.devices.cia402.transitions import (
+    StopAskedError,
+    TorqueFollowing,
+    left_operation,
+    step_up,
+    switch_off,
+)
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.devices.parameters import RigParameters
 

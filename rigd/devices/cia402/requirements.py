@@ -11,9 +11,14 @@ Imports nothing but the indices, so that a program which only reads an EDS file 
 from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum, Flag, auto
-from typing import Final
+from math import ceil, tau
+from typing import TYPE_CHECKING, Final
 
-from rigd.devices.cia402 import objects
+from rigd.devices.cia402 import protocol
+from rigd.devices.contracts import DeviceError
+
+if TYPE_CHECKING:
+    from rigd.devices.parameters import RigParameters, ServoDrive
 
 WATCHDOG: Final = "watchdog"
 TORQUE_LIMIT: Final = "torque_limit"
@@ -152,11 +157,11 @@ _FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
 
 CORE: Final = (
     Requirement(
-        objects.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
+        protocol.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
     ),
-    Requirement(objects.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
+    Requirement(protocol.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
     Requirement(
-        objects.MODE,
+        protocol.MODE,
         0,
         "Modes of operation",
         True,
@@ -164,10 +169,10 @@ CORE: Final = (
         sentence="It has to take 10, cyclic synchronous torque mode.",
     ),
     Requirement(
-        objects.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
+        protocol.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
     ),
     Requirement(
-        objects.POSITION,
+        protocol.POSITION,
         0,
         "Position actual value",
         True,
@@ -175,7 +180,7 @@ CORE: Final = (
         sentence="The loop runs on it.",
     ),
     Requirement(
-        objects.TARGET_TORQUE,
+        protocol.TARGET_TORQUE,
         0,
         "Target torque",
         True,
@@ -183,43 +188,47 @@ CORE: Final = (
         sentence="Without it the drive has no torque mode that rigd could use.",
     ),
     Requirement(
-        objects.SUPPORTED_MODES,
+        protocol.SUPPORTED_MODES,
         0,
         "Supported drive modes",
         True,
         _R,
         sentence="Its bit 9 has to say that the drive has cyclic synchronous torque mode.",
     ),
-    Requirement(objects.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC),
     Requirement(
-        objects.RPDO_COMMUNICATION,
+        protocol.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC
+    ),
+    Requirement(
+        protocol.RPDO_COMMUNICATION,
         2,
         "Transmission type of RPDO1",
         True,
         _R | _W,
         sentence="It has to be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
     ),
-    Requirement(objects.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
-    Requirement(objects.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(protocol.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
     Requirement(
-        objects.TPDO_COMMUNICATION,
+        protocol.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC
+    ),
+    Requirement(
+        protocol.TPDO_COMMUNICATION,
         2,
         "Transmission type of TPDO1",
         True,
         _R | _W,
         sentence="It has to be 1: an angle at every SYNC.",
     ),
-    Requirement(objects.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(protocol.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
 )
 """No session without one of these. Mapping entries 1600 and 1A00 sub 1 and on go with sub 0."""
 
 OPTIONAL: Final = (
     # Identity and texts: told in reports, compared only where the profile names them.
     Requirement(
-        objects.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
+        protocol.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
     ),
     Requirement(
-        objects.IDENTITY,
+        protocol.IDENTITY,
         2,
         "Product code",
         False,
@@ -227,13 +236,13 @@ OPTIONAL: Final = (
         "nothing: cia402.product_code = 0",
         fit=Fit.ANY,
     ),
-    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
+    Requirement(protocol.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
     Requirement(
-        objects.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
+        protocol.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
     ),
     # SYNC.
     Requirement(
-        objects.SYNC_COB_ID,
+        protocol.SYNC_COB_ID,
         0,
         "COB-ID SYNC",
         False,
@@ -241,7 +250,7 @@ OPTIONAL: Final = (
         "0x080, which CiA 301 sets beforehand",
     ),
     Requirement(
-        objects.SYNC_PERIOD_US,
+        protocol.SYNC_PERIOD_US,
         0,
         "Communication cycle period",
         False,
@@ -251,7 +260,7 @@ OPTIONAL: Final = (
         Fit.EQUAL_OR_UNUSED,
     ),
     Requirement(
-        objects.SYNC_WINDOW_US,
+        protocol.SYNC_WINDOW_US,
         0,
         "Synchronous window length",
         False,
@@ -261,7 +270,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.SYNC_OVERFLOW,
+        protocol.SYNC_OVERFLOW,
         0,
         "Synchronous counter overflow value",
         False,
@@ -271,7 +280,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.INTERPOLATION_TIME,
+        protocol.INTERPOLATION_TIME,
         1,
         "Interpolation time period value",
         False,
@@ -280,7 +289,7 @@ OPTIONAL: Final = (
         "With 60C2:2 it has to be the period of rig.rate_hz.",
     ),
     Requirement(
-        objects.INTERPOLATION_TIME,
+        protocol.INTERPOLATION_TIME,
         2,
         "Interpolation time index",
         False,
@@ -290,7 +299,7 @@ OPTIONAL: Final = (
     ),
     # Who watches over whom.
     Requirement(
-        objects.HEARTBEAT_CONSUMER,
+        protocol.HEARTBEAT_CONSUMER,
         1,
         "Consumer heartbeat time",
         False,
@@ -301,15 +310,15 @@ OPTIONAL: Final = (
         accept=WATCHDOG,
     ),
     Requirement(
-        objects.RPDO_COMMUNICATION,
-        objects.EVENT_TIMER,
+        protocol.RPDO_COMMUNICATION,
+        protocol.EVENT_TIMER,
         "Event timer of RPDO1",
         False,
         _R | _W,
         "the heartbeat consumer (1016:1), which comes first",
     ),
     Requirement(
-        objects.ABORT_OPTION,
+        protocol.ABORT_OPTION,
         0,
         "Abort connection option code",
         False,
@@ -321,7 +330,7 @@ OPTIONAL: Final = (
         accept=ABORT_OPTION,
     ),
     Requirement(
-        objects.COMMUNICATION_ERROR,
+        protocol.COMMUNICATION_ERROR,
         1,
         "Error behaviour on communication error",
         False,
@@ -330,7 +339,7 @@ OPTIONAL: Final = (
         "It has to be cia402.communication_error_option.",
     ),
     Requirement(
-        objects.HEARTBEAT_PRODUCER_MS,
+        protocol.HEARTBEAT_PRODUCER_MS,
         0,
         "Producer heartbeat time",
         False,
@@ -339,7 +348,7 @@ OPTIONAL: Final = (
         "It has to be cia402.drive_heartbeat_period_s in milliseconds.",
     ),
     Requirement(
-        objects.EMERGENCY_COB_ID,
+        protocol.EMERGENCY_COB_ID,
         0,
         "COB-ID EMCY",
         False,
@@ -349,7 +358,7 @@ OPTIONAL: Final = (
     ),
     # Torque and speed.
     Requirement(
-        objects.MAX_TORQUE,
+        protocol.MAX_TORQUE,
         0,
         "Max torque",
         False,
@@ -373,13 +382,13 @@ OPTIONAL: Final = (
             Fit.AT_LEAST,
         )
         for index, name in zip(
-            objects.TORQUE_LIMITS,
+            protocol.TORQUE_LIMITS,
             ("Positive torque limit value", "Negative torque limit value"),
             strict=True,
         )
     ),
     Requirement(
-        objects.TORQUE_OFFSET,
+        protocol.TORQUE_OFFSET,
         0,
         "Torque offset",
         False,
@@ -389,7 +398,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.RATED_TORQUE,
+        protocol.RATED_TORQUE,
         0,
         "Motor rated torque",
         False,
@@ -400,7 +409,7 @@ OPTIONAL: Final = (
         fit=Fit.ANY,
     ),
     Requirement(
-        objects.ACTUAL_TORQUE,
+        protocol.ACTUAL_TORQUE,
         0,
         "Torque actual value",
         False,
@@ -411,7 +420,7 @@ OPTIONAL: Final = (
         accept=TORQUE_FEEDBACK,
     ),
     Requirement(
-        objects.MAX_SPEED_RPM,
+        protocol.MAX_SPEED_RPM,
         0,
         "Max motor speed",
         False,
@@ -422,8 +431,8 @@ OPTIONAL: Final = (
     ),
     # What a drive may hold from before.
     Requirement(
-        objects.TPDO_COMMUNICATION,
-        objects.INHIBIT_TIME,
+        protocol.TPDO_COMMUNICATION,
+        protocol.INHIBIT_TIME,
         "Inhibit time of TPDO1",
         False,
         _R | _W,
@@ -432,7 +441,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.POLARITY,
+        protocol.POLARITY,
         0,
         "Polarity",
         False,
@@ -443,10 +452,10 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
+        protocol.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
     ),
     Requirement(
-        objects.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
+        protocol.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
     ),
 )
 """Objects that something else stands in for."""
@@ -454,13 +463,13 @@ OPTIONAL: Final = (
 REQUIREMENTS: Final = CORE + OPTIONAL
 
 MAY_BE_WRITE_ONLY: Final = (
-    objects.MODE,
-    objects.INTERPOLATION_TIME,
-    objects.ABORT_OPTION,
-    objects.COMMUNICATION_ERROR,
-    objects.HEARTBEAT_PRODUCER_MS,
-    objects.MAX_TORQUE,
-    objects.MAX_SPEED_RPM,
+    protocol.MODE,
+    protocol.INTERPOLATION_TIME,
+    protocol.ABORT_OPTION,
+    protocol.COMMUNICATION_ERROR,
+    protocol.HEARTBEAT_PRODUCER_MS,
+    protocol.MAX_TORQUE,
+    protocol.MAX_SPEED_RPM,
 )
 """Objects that are set whatever they held before, so that one that cannot be read is written and
 taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
@@ -477,3 +486,112 @@ def requirement(index: int, sub: int = 0) -> Requirement:
         If rigd asks nothing of it.
     """
     return _BY_PLACE[index, sub]
+
+
+_ROUNDING = 1e-9
+
+
+def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
+    """Return what objects are to hold whatever the profile says, by index and sub-index.
+
+    Parameters
+    ----------
+    node_id
+        Of the drive. CiA 301 sets its identifiers beforehand: it is added to all but that of SYNC.
+    """
+    return {
+        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},
+        (protocol.MODE, 0): protocol.CYCLIC_TORQUE,
+        (protocol.SYNC_COB_ID, 0): protocol.SYNC_ID,
+        (protocol.EMERGENCY_COB_ID, 0): 0x080 + node_id,
+        (protocol.TPDO_COMMUNICATION, 1): 0x180 + node_id,
+        (protocol.TPDO_COMMUNICATION, 2): protocol.AT_EVERY_SYNC,
+        (protocol.RPDO_COMMUNICATION, 1): 0x200 + node_id,
+    }
+
+
+def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
+    """Return what the set-up has the drive's objects hold, by index and sub-index.
+
+    Only what the set-up asks the drive about, such as which watchdog it has, is not among it.
+
+    Parameters
+    ----------
+    rig
+        With a section ``cia402``.
+
+    Raises
+    ------
+    DeviceError
+        If the period cannot be told to a drive.
+    """
+    settings = rig.cia402
+    assert settings is not None
+    at_sync = settings.torque_delivery == "at_sync"
+    period_us = sync_period_us(rig.rate_hz)
+    value, exponent = interpolation_time(rig.rate_hz)
+    limit = torque_limit_per_mille(rig)
+    wanted = fixed_values(settings.node_id) | {
+        (protocol.RPDO_COMMUNICATION, 2): protocol.AT_EVERY_SYNC
+        if at_sync
+        else protocol.ON_ARRIVAL,
+        (protocol.SYNC_PERIOD_US, 0): period_us,
+        (protocol.INTERPOLATION_TIME, 1): value,
+        (protocol.INTERPOLATION_TIME, 2): exponent,
+        (protocol.ABORT_OPTION, 0): settings.abort_option,
+        (protocol.COMMUNICATION_ERROR, 1): settings.communication_error_option,
+        (protocol.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
+        (protocol.MAX_TORQUE, 0): limit,
+        **{(index, 0): limit for index in protocol.TORQUE_LIMITS},
+    }
+    if settings.max_speed_rad_s > 0:
+        wanted[protocol.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
+    return wanted
+
+
+def sync_period_us(rate_hz: float) -> int:
+    """Return the period in whole microseconds, for object 1006.
+
+    Raises
+    ------
+    DeviceError
+        If it is none.
+    """
+    period_us = 1e6 / rate_hz
+    if abs(period_us - round(period_us)) > _ROUNDING * period_us:
+        raise DeviceError(
+            f"rig.rate_hz = {rate_hz:g} Hz: its period is no whole number of microseconds, which "
+            "a CANopen drive needs; choose another rate, such as 1000 Hz."
+        )
+    return round(period_us)
+
+
+def interpolation_time(rate_hz: float) -> tuple[int, int]:
+    """Return value (1 to 255) and power of ten in s of the period, for object 60C2.
+
+    Milliseconds come first: some drives take nothing else.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such pair.
+    """
+    for exponent in (-3, -4, -5, -6, -2, -1, 0):
+        value = 10.0**-exponent / rate_hz
+        if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING * value:
+            return round(value), exponent
+    raise DeviceError(
+        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "
+        "1 to 255 times a power of ten of a second); choose another rate, such as 1000 Hz."
+    )
+
+
+def torque_limit_per_mille(rig: "RigParameters") -> int:
+    """Return the peak torque in 1/1000 of the rated torque, rounded down, within 16 bits."""
+    motor = rig.motor
+    return min(int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING), 32767)
+
+
+def max_speed_rpm(settings: "ServoDrive") -> int:
+    """Return the speed limit in turns of the motor a minute, rounded up, for object 6080."""
+    return ceil(settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _ROUNDING)

@@ -25,9 +25,9 @@ from canopen.objectdictionary import (
 from canopen.sdo.base import SdoVariable
 
 from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import objects
+from rigd.devices.cia402 import protocol
 from rigd.devices.cia402.assignments import Assignment
-from rigd.devices.cia402.frames import NMT_PRE_OPERATIONAL
+from rigd.devices.cia402.protocol import NMT_PRE_OPERATIONAL
 from rigd.devices.contracts import DeviceError
 from rigd.devices.eds import EdsError, read_eds
 
@@ -157,7 +157,7 @@ class SdoAccess:
         """
         self.tell_pre_operational()
         try:
-            self.read(objects.IDENTITY, 1)
+            self.read(protocol.IDENTITY, 1)
         except SdoRefusal:
             return
         except DeviceError as error:

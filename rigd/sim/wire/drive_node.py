@@ -14,22 +14,29 @@ from typing import TYPE_CHECKING
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.canopen_emergency import Emergencies
-from rigd.sim.wire.canopen_heartbeat import WATCHES, HeartbeatProducer, add_watches
-from rigd.sim.wire.canopen_objects import ObjectDictionary
-from rigd.sim.wire.canopen_pdo import DISABLED, MAX_ENTRIES, ReceivePdo, TransmitPdo
-from rigd.sim.wire.canopen_sdo import SdoServer
+from rigd.sim.wire.canopen_services import (
+    DISABLED,
+    MAX_ENTRIES,
+    WATCHES,
+    Emergencies,
+    HeartbeatProducer,
+    ReceivePdo,
+    TransmitPdo,
+    add_watches,
+)
 from rigd.sim.wire.drive_objects import (
     CYCLIC_SYNCHRONOUS_TORQUE,
     NO_MODE,
+    State,
+    StateMachine,
     add_drive_objects,
     follow_file,
     peak_permille,
 )
-from rigd.sim.wire.drive_states import State, StateMachine
+from rigd.sim.wire.object_dictionary import ObjectDictionary, SdoServer
 
 if TYPE_CHECKING:
-    from rigd.sim.wire.canopen_eds import DeviceFile
+    from rigd.sim.wire.object_dictionary import DeviceFile
 
 Log = Callable[..., None]
 

@@ -10,14 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigd.devices.ati.calibration import (
+    CAN_CRITICAL,
+    SERIAL_CRITICAL,
     WIRE_ORDER,
     Calibration,
+    can_status,
+    first_register,
+    parse_block,
     same_serial_number,
+    serial_status,
     text_of,
     wrench_function,
 )
-from rigd.devices.ati.calibration_block import first_register, parse_block
-from rigd.devices.ati.status import CAN_CRITICAL, SERIAL_CRITICAL, can_status, serial_status
 
 ONES = tuple(tuple(1.0 if axis == gauge else 0.0 for gauge in range(6)) for axis in range(6))
 

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rigd.devices.ati.serial_line import SerialLine
 from rigd.devices.ati.serial_sensor import AtiSerialSensor
+from rigd.devices.ati.serial_setup import SerialLine
 from rigd.devices.contracts import DeviceError
 from rigd.devices.simulator import SimulatorAddress
 

@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from rigd.devices.canbus import CanLink
-from rigd.devices.canbus.lock import BusLock
+from rigd.devices.canbus.exchange import BusLock
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.simulator import SimulatorAddress

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks.drive import drive_rows
+from rigd.checks.devices import drive_rows
 from rigd.checks.rows import Verdict
 from rigd.devices.cia402.requirements import Watchdog
 from rigd.devices.contracts import DeviceError

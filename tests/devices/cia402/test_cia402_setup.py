@@ -8,8 +8,12 @@ from dataclasses import replace
 import pytest
 
 from rigd.devices.cia402.drive import Cia402Drive
+from rigd.devices.cia402.requirements import (
+    interpolation_time,
+    sync_period_us,
+    torque_limit_per_mille,
+)
 from rigd.devices.cia402.sdo import SdoAccess
-from rigd.devices.cia402.values import interpolation_time, sync_period_us, torque_limit_per_mille
 from rigd.devices.contracts import DeviceError
 
 TPDO1, RPDO1 = 0x40000185, 0x205

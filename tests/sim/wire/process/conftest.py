@@ -6,8 +6,8 @@ import pytest
 
 from rigd.profile import load_profile
 from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.log import EventLog
-from rigd.sim.wire.world import World
+from rigd.sim.wire.bus_simulation import World
+from rigd.sim.wire.faults import EventLog
 
 PERIOD_NS = 1_000_000
 

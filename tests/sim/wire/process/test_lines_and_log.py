@@ -12,10 +12,9 @@ import pytest
 from rigd.devices.contracts import DeviceError
 from rigd.devices.simulator import SimulatorAddress
 from rigd.profile import load_profile
-from rigd.sim.wire.control import ControlSocket, ask
-from rigd.sim.wire.log import EventLog
-from rigd.sim.wire.pty_line import PtyLine
-from rigd.sim.wire.transport import without_transport
+from rigd.sim.wire.faults import EventLog
+from rigd.sim.wire.links import PtyLine, without_transport
+from rigd.sim.wire.simulator import ControlSocket, ask
 
 # The serial line
 

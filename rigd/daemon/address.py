@@ -1,0 +1,166 @@
+"""Where the daemon of a rig listens, and how its socket is made and found."""
+
+import errno
+import grp
+import os
+import socket
+import stat
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from rigd.runtime.folder import runtime_folder
+
+COMMON = Path("/run/rigd")
+"""For a daemon that a group may use: a user's own runtime folder is closed to others."""
+_SUFFIX = ".daemon"
+_PROBE_S = 1.0
+_CREDENTIALS = struct.Struct("3i")
+
+
+class AddressError(Exception):
+    """There can be no socket, or no daemon is found; the message is for the operator."""
+
+
+class UnknownGroupError(AddressError):
+    """There is no group of that name."""
+
+
+def socket_path(rig: str, folder: Path | None = None) -> Path:
+    """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise."""
+    plain = "".join(c if c.isalnum() else "-" for c in rig).strip("-")
+    return (folder or runtime_folder()) / f"{plain}{_SUFFIX}"
+
+
+def peer_of(link: socket.socket) -> tuple[int, int]:
+    """Return process and user at the other end of a connection, as the kernel knows them.
+
+    Raises
+    ------
+    OSError
+        If the kernel does not tell.
+    """
+    told = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(told)
+    return pid, uid
+
+
+def bind(path: Path, group: str | None) -> socket.socket:
+    """Make the socket; nobody can connect before it listens, and nobody else than told after.
+
+    Call it only while holding the rig: what a dead daemon left is replaced.
+
+    Parameters
+    ----------
+    path
+        Of the socket. The user's own folder is made if it can be, one for a group has to be there.
+    group
+        Whose members may use it too.
+
+    Raises
+    ------
+    UnknownGroupError
+        If there is no such group.
+    AddressError
+        If the socket cannot be made, its folder is closed to the group, or a living daemon has it.
+    """
+    number = None if group is None else _group_number(group)
+    if answers(path):
+        raise AddressError(f"Another daemon answers on {path}; see rigd status.")
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+    try:
+        if number is None:
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        elif not _open_to(number, path.parent):
+            raise PermissionError(errno.EACCES, f"{path.parent} is closed to the group {group}")
+        path.unlink(missing_ok=True)
+        before = os.umask(0o177)
+        try:
+            listener.bind(os.fspath(path))
+        finally:
+            os.umask(before)
+        if number is not None:
+            os.chown(path, -1, number, follow_symlinks=False)
+            path.chmod(0o660)
+    except OSError as error:
+        listener.close()
+        raise AddressError(_refused(path, group, error)) from None
+    return listener
+
+
+def answers(path: Path) -> bool:
+    """Whether a daemon listens there: what a dead one left does not."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(_PROBE_S)
+        try:
+            probe.connect(os.fspath(path))
+        except (BlockingIOError, TimeoutError):
+            return True  # its queue is full
+        except OSError:
+            return False
+    return True
+
+
+def running() -> list[Path]:
+    """Return the sockets of all daemons that this user can reach."""
+    return sorted(path for path in _sockets() if answers(path))
+
+
+def find(rig: str | None) -> Path:
+    """Return the socket of the daemon of a rig, or of the only one there is.
+
+    Raises
+    ------
+    AddressError
+        Naming the remedy.
+    """
+    if rig is not None:
+        for folder in (runtime_folder(), COMMON):
+            path = socket_path(rig, folder)
+            if answers(path):
+                return path
+        raise AddressError(
+            f"No daemon of the rig {rig} is running; start it with rigd serve --profile {rig}."
+        )
+    found = running()
+    if not found:
+        raise AddressError("No daemon is running; start it with rigd serve --profile NAME.")
+    if len(found) > 1:
+        rigs = ", ".join(path.name.removesuffix(_SUFFIX) for path in found)
+        raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
+    return found[0]
+
+
+def _sockets() -> Iterator[Path]:
+    for folder in (runtime_folder(), COMMON):
+        with suppress(OSError):
+            yield from folder.glob(f"*{_SUFFIX}")
+
+
+def _group_number(group: str) -> int:
+    try:
+        return grp.getgrnam(group).gr_gid
+    except KeyError:
+        raise UnknownGroupError(
+            f"--group {group!r}: there is no such group; name one that exists, or have the "
+            "administrator make it with groupadd."
+        ) from None
+
+
+def _open_to(group: int, folder: Path) -> bool:
+    """Whether the members of a group can reach what is in a folder."""
+    status = folder.stat()
+    return bool(
+        status.st_mode & stat.S_IXOTH or (status.st_gid == group and status.st_mode & stat.S_IXGRP)
+    )
+
+
+def _refused(path: Path, group: str | None, error: OSError) -> str:
+    remedy = (
+        "set XDG_RUNTIME_DIR to a folder with a short name that is yours."
+        if group is None
+        else f"have the administrator make its folder: install -d -o $USER -g {group} -m 2750 "
+        f"{path.parent}; and be a member of {group} yourself."
+    )
+    return f"The socket {path} cannot be made ({error.strerror or error}); {remedy}"

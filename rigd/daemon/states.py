@@ -1,0 +1,317 @@
+"""The states of the daemon, what leads from one to another, and what is told of them as JSON."""
+
+import os
+import pwd
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from math import isfinite
+from typing import Any
+
+from rigd.engine.ipc import PROCESSES
+from rigd.engine.shared_state import Phase
+from rigd.live.server import LiveAddress
+from rigd.runner.planning import Plan
+from rigd.runner.status import ProcessStatus, RigStatus
+
+_REMEMBERED = 50
+
+
+class State(StrEnum):
+    """Where the daemon is."""
+
+    IDLE = "idle"
+    """The devices are closed."""
+    READY = "ready"
+    """The devices are connected, the torque is off."""
+    RUNNING = "running"
+    """A session, or the pause between two of a series."""
+    STOPPING = "stopping"
+    """A stop was asked for, and the session has not ended yet."""
+    FAULT = "fault"
+    """Nothing commands a torque until an operator resets the rig; the reason says what the drive
+    showed."""
+
+
+_LEADS_TO: Mapping[State, frozenset[State]] = {
+    State.IDLE: frozenset({State.READY, State.FAULT}),
+    State.READY: frozenset({State.RUNNING, State.IDLE, State.FAULT}),
+    State.RUNNING: frozenset({State.STOPPING, State.READY, State.FAULT}),
+    State.STOPPING: frozenset({State.READY, State.FAULT}),
+    State.FAULT: frozenset({State.IDLE, State.READY}),
+}
+
+_REMEDIES: Mapping[State, str] = {
+    State.IDLE: "its devices are being connected; try again in a moment",
+    State.READY: "there is nothing to reset",
+    State.RUNNING: "wait for the session to end, or end it with rigd stop",
+    State.STOPPING: "the session is being stopped; wait for its end",
+    State.FAULT: "remove the cause, then run rigd reset",
+}
+_ADJECTIVES: Mapping[State, str] = {state: state.value for state in State} | {
+    State.FAULT: "in fault"
+}
+_COMES_FROM: Mapping[str, State] = {
+    "start": State.READY,
+    "tare": State.READY,
+    "zero": State.READY,
+    "reset": State.FAULT,
+}
+
+
+class IllegalTransitionError(Exception):
+    """A transition that there is not: a mistake in the program."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One change of state."""
+
+    utc_ns: int
+    before: State
+    after: State
+    reason: str
+
+
+class StateMachine:
+    """The present state and how it came about.
+
+    Parameters
+    ----------
+    on_change
+        Called with each transition, after it.
+    utc_ns
+        The wall clock, for tests.
+
+    Attributes
+    ----------
+    state
+        The present one.
+    history
+        The last transitions, oldest first.
+    """
+
+    def __init__(
+        self,
+        on_change: Callable[[Transition], None] = lambda _: None,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._on_change = on_change
+        self._utc_ns = utc_ns
+        self._began_utc_ns = utc_ns()
+        self.state = State.IDLE
+        self.history: deque[Transition] = deque(maxlen=_REMEMBERED)
+
+    @property
+    def since_utc_ns(self) -> int:
+        """When the present state began."""
+        return self.history[-1].utc_ns if self.history else self._began_utc_ns
+
+    @property
+    def reason(self) -> str:
+        """Why it is the present one."""
+        return self.history[-1].reason if self.history else "the daemon was started"
+
+    def move(self, after: State, reason: str) -> None:
+        """Go to another state.
+
+        Raises
+        ------
+        IllegalTransitionError
+            If nothing leads there from the present one.
+        """
+        if after not in _LEADS_TO[self.state]:
+            raise IllegalTransitionError(f"{self.state} does not lead to {after} ({reason}).")
+        transition = Transition(self._utc_ns(), self.state, after, reason)
+        self.state = after
+        self.history.append(transition)
+        self._on_change(transition)
+
+    def refusal(self, command: str) -> str:
+        """Say why a command cannot be obeyed in the present state; empty if it can."""
+        wanted = _COMES_FROM.get(command, self.state)
+        if wanted is self.state:
+            return ""
+        why = f" ({self.reason.rstrip('.')})" if self.state is State.FAULT else ""
+        return (
+            f"{command} is for a rig that is {_ADJECTIVES[wanted]}, and this one is "
+            f"{_ADJECTIVES[self.state]}{why}: {_REMEDIES[self.state]}."
+        )
+
+
+Document = dict[str, Any]
+
+
+_USERS: dict[int, str] = {}
+"""Names by number."""
+
+
+def look_up_user(uid: int) -> None:
+    """Find out the name of a user, which may take its time, for :class:`Peer`."""
+    if uid not in _USERS:
+        with suppress(KeyError):
+            _USERS[uid] = pwd.getpwuid(uid).pw_name
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A client, as the kernel knows it."""
+
+    number: int
+    """Of its connection."""
+    pid: int
+    uid: int
+
+    @property
+    def user(self) -> str:
+        """Its user's name, as far as that was looked up."""
+        return _USERS.get(self.uid, str(self.uid))
+
+    def __str__(self) -> str:
+        return f"process {self.pid} of {self.user}"
+
+
+def peer_document(peer: Peer | None) -> Document | None:
+    """Tell who controls."""
+    return None if peer is None else {"pid": peer.pid, "uid": peer.uid, "user": peer.user}
+
+
+def plan_document(plan: Plan, record_s: float) -> Document:
+    """Tell what a session is predicted to do."""
+    return {
+        "record_s": record_s,
+        **asdict(plan.prediction),
+        "tip_in_words": plan.tip_in_words,
+        "warnings": list(plan.warnings),
+    }
+
+
+def transition_document(transition: Transition) -> Document:
+    """Tell of one change of state."""
+    return {
+        "utc_ns": transition.utc_ns,
+        "from": transition.before.value,
+        "to": transition.after.value,
+        "reason": transition.reason,
+    }
+
+
+def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document:
+    """Tell how the rig and its processes are.
+
+    Parameters
+    ----------
+    look
+        At the board.
+    rates
+        Measured records a second, by topic.
+    """
+    return {
+        "phase": look.phase.name.lower(),
+        "angle_rad": look.angle_rad,
+        "coupling_torque_nm": look.coupling_torque_nm,
+        "torque_command_nm": look.torque_command_nm,
+        "signals": None if look.signals is None else _finite(asdict(look.signals)),
+        "health": {
+            "missed": look.missed,
+            "late": look.late,
+            "lost": look.lost,
+            "bus_load_percent": look.bus_load_percent,
+            "bus_errors": look.bus_errors,
+            "sensor_status": look.sensor_status,
+            "disk_free_mb": look.disk_free_mb,
+            "view_dropped": look.view_dropped,
+        },
+        "live_view": _view_document(look.live_view),
+        "processes": [
+            asdict(process) | {"state": _state(process, look.phase)} for process in look.processes
+        ],
+        "topics": [
+            {
+                "name": topic.name,
+                "written": topic.written,
+                "waiting": topic.waiting,
+                "rate_hz": rates.get(topic.name),
+                "expected_hz": topic.expected_hz,
+            }
+            for topic in look.topics
+        ],
+    }
+
+
+def _finite(values: Mapping[str, float]) -> Document:
+    """Return numbers as JSON can have them."""
+    return {name: value if isfinite(value) else None for name, value in values.items()}
+
+
+def _view_document(view: LiveAddress | None) -> Document | None:
+    """Tell where the live view is."""
+    return None if view is None else {"url": view.page_url, **asdict(view)}
+
+
+def _state(process: ProcessStatus, phase: Phase) -> str:
+    """Return a process's state; of one that is started for each session its end is no news."""
+    passing = any(p.for_one_session and p.name == process.name for p in PROCESSES)
+    return "done" if process.state == "ended" and passing and phase is Phase.OFF else process.state
+
+
+def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Document:
+    """Tell how far a session is.
+
+    Parameters
+    ----------
+    look
+        At the board.
+    total
+        Ticks of the record.
+    rate_hz
+        Ticks a second of real time; None where time is skipped.
+    """
+    # Until tick 0 the board may still have the counts of the session before.
+    left = max(0, total - look.tick)
+    return {
+        "phase": look.phase.name.lower(),
+        "tick": look.tick,
+        "total": total,
+        "percent": round(100.0 * look.tick / total, 1) if total else 100.0,
+        "time_left_s": None if rate_hz is None else round(left / rate_hz, 1),
+        "missed": look.missed,
+        "late": look.late,
+        "lost": look.lost,
+    }
+
+
+def daemon_document(
+    profile: str,
+    output: str,
+    *,
+    moving: str,
+    hardware: bool,
+    told: str,
+    fast: bool,
+    live: bool,
+    began_utc_ns: int,
+) -> Document:
+    """Tell which daemon this is."""
+    from rigd import __version__
+
+    return {
+        "pid": os.getpid(),
+        "version": __version__,
+        "profile": profile,
+        "moving": moving,
+        "hardware": hardware,
+        "what_moves": told,
+        "output": output,
+        "fast": fast,
+        "live": live,
+        "since_utc_ns": began_utc_ns,
+    }
+
+
+def histories(transitions: Iterable[Transition]) -> list[Document]:
+    """Tell of the last changes of state."""
+    return [transition_document(transition) for transition in transitions]

@@ -1,0 +1,397 @@
+"""The control process: it alone talks to the devices, and it never leaves the torque on.
+
+It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
+the supervisor orders, one after the other. A device that fails ends it: connecting anew is the
+operator's decision.
+"""
+
+import gc
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+
+from rigd.control import PidController, design_pid
+from rigd.devices.contracts import DeviceError, Devices, StatedDrive
+from rigd.devices.registry import open_devices
+from rigd.engine.cycle import (
+    AXES,
+    Cycle,
+    Rest,
+    Standstill,
+    make_watch,
+    observe_rest,
+    recalled_heat_nm2,
+    remember_heat,
+)
+from rigd.engine.ipc import Message, Parent
+from rigd.engine.jobs import ControlJob, SessionJob
+from rigd.engine.publish import Display
+from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
+from rigd.engine.ring import map_reference
+from rigd.engine.session_sequence import Procedure, SessionEnd
+from rigd.engine.shared_state import Channels, Event, Phase, Word, attach_channels, write_event
+from rigd.engine.timing import Clock, Metronome, RealClock, VirtualClock
+from rigd.profile import Profile
+from rigd.runtime.signals import StopRequest
+from rigd.safety import LOOK_EVERY
+
+_SILENCE_S = 1.0
+"""For which a device may be silent between sessions."""
+_STANDSTILL_POLL_S = 0.05
+_ZERO_S = 0.2
+_SIGN_OF_LIFE_S = 1.0
+_TAKE_UP_TICKS = 2
+"""After which it is known where the motor stands and that it does."""
+
+
+def main() -> None:
+    """Run as ``python -m rigd.engine.control_process``."""
+    stop = StopRequest()
+    stop.catch()
+    parent = Parent()
+    job: ControlJob = parent.receive_job()
+    channels = attach_channels(job.channels)
+    realtime = job.profile.realtime
+    if job.fast:
+        obtained = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+    else:
+        obtained = {"clock": "real"} | obtain(priority=realtime.priority, cpu=realtime.cpu)
+    try:
+        devices = open_devices(job.profile.rig, job.moving)
+    except DeviceError as error:
+        parent.send(ended=str(error))
+        return
+    clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
+    attend(job.profile, devices, clock, channels, parent, stop, obtained)
+
+
+def attend(
+    profile: Profile,
+    devices: Devices,
+    clock: Clock,
+    channels: Channels,
+    parent: Parent,
+    stop: StopRequest,
+    obtained: dict[str, str],
+) -> None:
+    """Own `devices` from connecting to closing, whatever happens, and say last why it ended.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    devices
+        Not yet connected.
+    clock, channels, parent, stop
+        As for :class:`rigd.engine.session_sequence.Procedure`.
+    obtained
+        The real-time settings that were granted, for the file.
+    """
+    failure = ""
+    try:
+        # The drive last: once it is operational it expects a SYNC every period.
+        devices.sensor.connect()
+        drive = devices.drive
+        drive.connect()
+        attendance = _Attendance(profile, devices, clock, channels, parent, stop, obtained)
+        channels.board[Word.PHASE] = Phase.OFF
+        attendance.take_up_standstill()
+        parent.send(
+            connected=True,
+            calibration=devices.sensor.calibration(),
+            drive=drive.statement() if isinstance(drive, StatedDrive) else {},
+            realtime=obtained,
+            simulated=devices.simulated,
+        )
+        attendance.serve()
+    except (DeviceError, OSError) as error:
+        failure = str(error)
+    finally:
+        devices.drive.disable()
+        channels.board[Word.PHASE] = Phase.OFF
+        devices.drive.close()
+        devices.sensor.close()
+    parent.send(ended=f"{failure} {devices.drive.off_doubt}".strip())
+
+
+class _Attendance:
+    """Connected devices, and what is ordered of them."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        devices: Devices,
+        clock: Clock,
+        channels: Channels,
+        parent: Parent,
+        stop: StopRequest,
+        obtained: dict[str, str],
+    ) -> None:
+        self._profile = profile
+        self._devices = devices
+        self._clock = clock
+        self._metronome = Metronome(clock, profile.rig.rate_hz)
+        self._channels = channels
+        self._board = channels.board
+        self._parent = parent
+        self._stop = stop
+        self._obtained = obtained
+        self._zero_rad = 0.0
+        self._silent = 0
+        self._on_lines = devices.drive.health().bits is not None
+        # A simulated motor is as cold as it was made.
+        warm = not devices.simulated
+        self._watch = make_watch(profile, recalled_heat_nm2(profile) if warm else 0.0)
+        self._standstill = Standstill(profile)
+        self._display = Display(channels.board, devices)
+        self._cycle = self._make_cycle(profile)
+
+    def remember(self) -> None:
+        """Keep how warm the motor is for whoever connects next, once nothing hurries."""
+        if not self._devices.simulated:
+            remember_heat(self._profile, self._watch.heat_nm2)
+
+    def take_up_standstill(self) -> None:
+        """Read where the motor stands, unless that is known: virtual time stands still from now on.
+
+        Raises
+        ------
+        DeviceError, OSError
+            If a device failed.
+        """
+        for _ in range(_TAKE_UP_TICKS):
+            if not self._standstill.begun:
+                self._metronome.wait()
+                self._read_at_rest()
+
+    def serve(self) -> None:
+        """Do what the supervisor orders, until it is gone or a stop is asked for between sessions.
+
+        Raises
+        ------
+        DeviceError, OSError
+            If a device failed.
+        """
+        while (message := self._await_order()) is not None:
+            if "session" in message:
+                try:
+                    self._run_session(message["session"])
+                finally:
+                    self.remember()
+                self.take_up_standstill()
+                gc.collect()  # the torque is off: the only time for it
+            elif "tare" in message:
+                self._answer(self._tare)
+            elif "zero" in message:
+                self._answer(self._zero)
+
+    def _await_order(self) -> Message | None:
+        """Observe with the torque off until there is something to do; None: nothing any more.
+
+        Virtual time stands still meanwhile, but for a tick now and then where there are lines: at
+        their other end a host that is silent for long is taken for dead.
+        """
+        seen_s = time.monotonic()
+        while not self._stop.requested:
+            self._show()
+            try:
+                message = self._parent.poll(_STANDSTILL_POLL_S if self._clock.virtual else 0.0)
+            except EOFError:
+                return None
+            if message is not None:
+                return message
+            if not self._clock.virtual:
+                self._observe()
+            elif self._on_lines and time.monotonic() - seen_s > _SIGN_OF_LIFE_S:
+                seen_s = time.monotonic()
+                self._metronome.wait()
+                self._read_at_rest()
+        return None
+
+    def _observe(self) -> None:
+        """Read the devices for some ticks, the torque off."""
+        cycle = self._cycle
+        for _ in range(LOOK_EVERY):
+            self._metronome.wait()
+            self._read_at_rest()
+            self._silent = self._silent + 1 if cycle.stale else 0
+        if self._silent > _SILENCE_S * self._profile.rig.rate_hz:
+            raise DeviceError(
+                f"{cycle.what_is_stale} has not come for {_SILENCE_S:g} s; see whether the device "
+                "is on and connected."
+            )
+
+    def _read_at_rest(self) -> None:
+        """Read the devices for one tick, the torque off."""
+        self._cycle.observe(self._metronome.due_ns)
+        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
+
+    def _run_session(self, job: SessionJob) -> None:
+        """Run one session to a disabled drive and a final message, whatever happens.
+
+        Raises
+        ------
+        DeviceError
+            If a device failed: the message has been sent all the same.
+        """
+        board, devices = self._board, self._devices
+        for word in (
+            Word.START_UTC_NS,
+            Word.SCHEDULED,
+            Word.MISSED,
+            Word.LATE,
+            Word.LOST,
+            Word.STALE_ANGLES,
+            Word.STALE_WRENCHES,
+        ):
+            board[word] = 0
+        self._warn_of_refusals(job)
+        cycle = self._cycle = self._make_cycle(job.profile)
+        procedure = Procedure(
+            job.profile,
+            map_reference(job.reference),
+            cycle,
+            self._clock,
+            self._metronome,
+            self._standstill,
+            self._channels,
+            self._display,
+            self._parent,
+            self._stop,
+        )
+        outcome, reason = "complete", ""
+        recorded = device_failed = False
+        try:
+            tare = procedure.tare()
+            devices.drive.enable(procedure.stop_asked)
+            procedure.hold()
+            self._parent.send(ready=tare)
+            procedure.wait_for_go()
+            procedure.record()
+            recorded = True
+            procedure.go_back()
+            cycle.torque_off()
+            procedure.check_tare()
+        except SessionEnd as end:
+            outcome, reason, device_failed = end.outcome, end.reason, end.device_failed
+        except (DeviceError, OSError) as error:
+            outcome, reason, device_failed = "fault", str(error), True
+        finally:
+            devices.drive.disable()
+            cycle.torque_off()
+            board[Word.PHASE] = Phase.OFF
+            self._show()
+        doubt = devices.drive.off_doubt
+        if doubt:
+            outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
+        failure, fault = reason, outcome == "fault"
+        if recorded and reason:
+            # What happens after the last tick does not make the record any less complete.
+            outcome, reason = "complete", f"After the record: {reason}"
+        self._parent.send(
+            finished=outcome,
+            reason=reason,
+            fault=fault,
+            counts=asdict(procedure.counts),
+            results=procedure.results,
+            device_failed=device_failed,
+        )
+        if device_failed:
+            raise DeviceError(failure)
+
+    def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
+        """Do something at rest and tell what came out, or why it could not be done."""
+        try:
+            self._parent.send(done=measure())
+        except SessionEnd as end:
+            self._parent.send(refused=end.reason)
+
+    def _tare(self) -> dict[str, object]:
+        """Average the sensor; each session does so for itself, this is for the operator's eyes."""
+        rest = self._rest(self._profile.session.tare_s)
+        self._cycle.tare = rest.mean
+        self._watch.tared_nm = float(rest.torques_nm.mean())
+        return {
+            "mean": dict(zip(AXES, rest.mean, strict=True)),
+            "std": dict(zip(AXES, rest.spread, strict=True)),
+            "torque_std_nm": rest.torque_spread_nm,
+        }
+
+    def _zero(self) -> dict[str, object]:
+        """Make the angle where the motor stands the rig's zero, to which its limits are relative.
+
+        Raises
+        ------
+        SessionEnd
+            If the motor moves.
+        """
+        rest = self._rest(_ZERO_S)
+        limit_rad_s = self._profile.session.rest_velocity_rad_s
+        if rest.speed_rad_s > limit_rad_s:
+            raise SessionEnd(
+                "fault",
+                f"The motor moves by {rest.speed_rad_s:.2g} rad/s, more than "
+                f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it stands still.",
+            )
+        moved_rad = self._cycle.angle_rad
+        self._zero_rad += moved_rad
+        self._cycle.zero_rad = self._zero_rad
+        self._cycle.angle_rad = 0.0
+        self._show()
+        return {"moved_rad": moved_rad}
+
+    def _show(self) -> None:
+        self._display.show(self._cycle, self._metronome.due_ns)
+
+    def _rest(self, duration_s: float) -> Rest:
+        rig = self._profile.rig
+        return observe_rest(
+            self._cycle,
+            self._metronome,
+            rate_hz=rig.rate_hz,
+            duration_s=duration_s,
+            projection=rig.sensor.projection,
+            check=self._check_reading,
+        )
+
+    def _check_reading(self) -> None:
+        if self._metronome.tick % LOOK_EVERY == 0:
+            self._show()
+        if self._stop.requested or not self._parent.alive():
+            raise SessionEnd("stopped", "The rig is being shut down.")
+        self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
+        silent = self._cycle.check_stale()
+        if silent is not None:
+            raise SessionEnd("fault", str(silent))
+
+    def _make_cycle(self, profile: Profile) -> Cycle:
+        rig = profile.rig
+        cycle = Cycle(
+            self._devices,
+            rig.sensor.projection,
+            _controller(profile),
+            self._watch,
+        )
+        cycle.zero_rad = self._zero_rad
+        return cycle
+
+    def _warn_of_refusals(self, job: SessionJob) -> None:
+        own = {name: text for name, text in self._obtained.items() if text.startswith(REFUSED)}
+        for refused, what_follows in (
+            (own, "more ticks will be late"),
+            (job.refused, "a computer that is busy with other programs may end the session"),
+        ):
+            if refused:
+                names = ", ".join(f"{name} ({text})" for name, text in refused.items())
+                message = f"The system did not grant {names}: {what_follows}."
+                write_event(self._channels.events, Event(0, "warning", message))
+
+
+def _controller(profile: Profile) -> PidController:
+    motor = profile.control_motor
+    gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
+    return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
+
+
+if __name__ == "__main__":
+    main()

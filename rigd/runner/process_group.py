@@ -1,0 +1,150 @@
+"""The processes of a rig, and the memory they share.
+
+This module is quick to import, so that the processes can be started before anything else: they
+import what they need while the supervisor reads the profile and plans.
+"""
+
+import contextlib
+import os
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rigd.engine.ipc import CONTROL, LIVE, PROCESSES, RECORDER, Child, ChildError, Process
+from rigd.engine.ring import shared_memory_fd
+
+if TYPE_CHECKING:
+    from rigd.engine.shared_state import Channels
+
+_DESCRIPTORS = 6
+
+
+class Crew:
+    """Control, recorder and, if wanted, live publisher of a rig.
+
+    Leaving the context ends them all, the one with the torque first.
+
+    Parameters
+    ----------
+    live
+        Start the live publisher too.
+
+    Raises
+    ------
+    ChildError
+        If a process cannot be started.
+    OSError
+        If there is no shared memory.
+
+    Attributes
+    ----------
+    live
+        As given.
+    cores
+        For the processes that are still to be started, where this one keeps off some; empty: its
+        own.
+    """
+
+    def __init__(self, *, live: bool) -> None:
+        self.live = live
+        self.cores: frozenset[int] = frozenset()
+        self._fds: list[int] = []
+        self._channels: Channels | None = None
+        self._used: set[Process] = set()
+        self._children: dict[Process, Child] = {}
+        try:
+            while len(self._fds) < _DESCRIPTORS:
+                self._fds.append(shared_memory_fd())
+            for process in (CONTROL, RECORDER, LIVE) if live else (CONTROL, RECORDER):
+                self._start(process)
+        except (OSError, ChildError):
+            self.end()
+            raise
+
+    def __getitem__(self, process: Process) -> Child:
+        return self._children[process]
+
+    def __contains__(self, process: Process) -> bool:
+        return process in self._children
+
+    @property
+    def control(self) -> Child:
+        """The process that talks to the devices."""
+        return self._children[CONTROL]
+
+    @property
+    def recorder(self) -> Child:
+        """The process that writes the file."""
+        return self._children[RECORDER]
+
+    def fresh(self, process: Process) -> Child:
+        """Return a process that has had no job yet, in place of the one that has.
+
+        Raises
+        ------
+        ChildError
+            If it cannot be started.
+        """
+        if process in self._used:
+            if process in self._children:  # the last one may not have been started
+                self._children.pop(process).stop(process.grace_s)
+            self._start(process)
+        self._used.add(process)
+        return self._children[process]
+
+    def has_job(self, process: Process) -> bool:
+        """Whether a process has had its job."""
+        return process in self._used
+
+    @property
+    def laid_out(self) -> bool:
+        """Whether the shared memory has its size."""
+        return self._channels is not None
+
+    @property
+    def channels(self) -> "Channels":
+        """The shared memory, laid out."""
+        assert self._channels is not None
+        return self._channels
+
+    def lay_out(self, rate_hz: float, *, fast: bool = False) -> None:
+        """Size the shared memory for sessions at ``rate_hz``, `fast` under the virtual clock.
+
+        Raises
+        ------
+        OSError
+            If there is not enough shared memory.
+        """
+        from rigd.engine.shared_state import HURRIED_BUFFERED_S, create_channels
+        from rigd.safety.limits import BUFFERED_S
+
+        buffered_s = HURRIED_BUFFERED_S if fast and self.live else BUFFERED_S
+        self._channels = create_channels(rate_hz, self._fds, buffered_s)
+
+    def _start(self, process: Process) -> None:
+        self._children[process] = Child(process.name, process.module, self._fds, self.cores)
+        self._used.discard(process)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End all processes and give the memory back; harmless when repeated."""
+        if self._channels is not None:
+            self._channels.ask_to_stop()
+        with contextlib.ExitStack() as ending:  # which goes on whatever becomes of one of them
+            for process in reversed(PROCESSES):
+                if process in self._children:
+                    ending.callback(self._children.pop(process).stop, process.grace_s)
+        if self._channels is not None:
+            self._channels.close()
+            self._channels = None
+        while self._fds:
+            os.close(self._fds.pop())

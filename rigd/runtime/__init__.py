@@ -1,0 +1,1 @@
+"""What the processes of a user share with the system: locks and signals."""

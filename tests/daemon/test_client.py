@@ -1,0 +1,249 @@
+"""What a client does about a daemon that is crowded, suspended, or gone."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from rigd.daemon import client as client_module
+from rigd.daemon.client import (
+    STOP_SIGNAL,
+    Client,
+    DaemonGoneError,
+    RefusedByDaemonError,
+    await_end,
+    stop_session,
+    what_is_left,
+)
+
+CROWDED = {"reply": None, "ok": False, "error": "too many", "wrong_use": False, "crowded": True}
+
+
+@pytest.fixture
+def path(runtime_folder):
+    return runtime_folder / "fake.daemon"
+
+
+@pytest.fixture
+def answer(path):
+    """Answer the first line of each connection; None: close without a word."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    heard = []
+
+    def begin(*replies):
+        listener.listen(5)
+
+        def work():
+            for reply in replies:
+                try:
+                    link, _ = listener.accept()
+                except OSError:  # the test is over
+                    return
+                with link, link.makefile("rw") as file:
+                    heard.append(json.loads(file.readline()))
+                    if reply is not None:
+                        file.write(json.dumps(reply) + "\n")
+                        file.flush()
+
+        threading.Thread(target=work, daemon=True).start()
+        return heard
+
+    yield begin
+    listener.shutdown(socket.SHUT_RDWR)  # which wakes whoever waits for somebody to come
+    listener.close()
+
+
+def test_whoever_is_turned_away_asks_again(path, answer):
+    heard = answer(CROWDED, CROWDED, {"reply": "status", "ok": True})
+    with Client(path) as client:
+        assert client.ask("status")["ok"]
+    assert [request["command"] for request in heard] == ["status"] * 3
+
+
+def test_whoever_is_turned_away_for_long_is_told(path, answer, monkeypatch):
+    monkeypatch.setattr(client_module, "_CROWD_PATIENCE_S", 0.0)
+    answer(CROWDED, CROWDED)
+    with Client(path) as client, pytest.raises(RefusedByDaemonError, match="too many"):
+        client.ask("start")
+
+
+def test_a_refusal_is_not_asked_again(path, answer):
+    heard = answer(CROWDED | {"crowded": False}, {"reply": "tare", "ok": True})
+    with Client(path) as client, pytest.raises(RefusedByDaemonError, match="too many"):
+        client.ask("tare")
+    assert len(heard) == 1
+
+
+def test_a_stop_is_asked_for_until_it_is_answered(path, answer):
+    heard = answer(None, CROWDED, None, {"reply": "stop", "ok": True, "stopping": True})
+    told = stop_session(path)
+    assert (told["stopping"], told["signalled"]) == (True, False)
+    assert [request["command"] for request in heard] == ["stop"] * 4
+
+
+def test_a_full_queue_is_not_waited_for_for_ever(path):
+    with socket.socket(socket.AF_UNIX) as listener, socket.socket(socket.AF_UNIX) as first:
+        listener.bind(str(path))
+        listener.listen(0)
+        first.connect(str(path))
+        with pytest.raises(DaemonGoneError, match=r"suspended.*not known.*STO"):
+            Client(path, connect_s=0.05)
+
+
+DEAF = """
+import signal, socket, sys, time
+link = socket.socket(socket.AF_UNIX)
+link.bind(sys.argv[1])
+signal.signal(signal.SIGUSR1, lambda *_: print("asked to stop", flush=True))
+link.listen(5)
+print("listens", flush=True)
+time.sleep(60.0)
+time.sleep(60.0)
+"""
+
+
+@pytest.fixture
+def deaf(path):
+    """A daemon whose socket nobody serves; without `handles`, one that knows no signal either."""
+    started = []
+
+    def start(*, handles=True):
+        code = DEAF if handles else DEAF.replace("signal.signal(", "(lambda *_: None)(")
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True
+        )
+        started.append(process)
+        assert process.stdout.readline() == "listens\n"
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
+    path, deaf, monkeypatch
+):
+    monkeypatch.setattr(client_module, "_STOP_PATIENCE_S", 1.0)
+    process = deaf()
+    with pytest.raises(DaemonGoneError) as raised:
+        stop_session(path)
+    assert process.stdout.readline() == "asked to stop\n"
+    said = raised.value.after_looking()
+    assert f"process {process.pid}" in said
+    assert STOP_SIGNAL.name in said
+    assert "not known" in said
+    assert "STO" in said
+
+
+def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, monkeypatch):
+    monkeypatch.setattr(client_module, "_STOP_PATIENCE_S", 1.0)
+    monkeypatch.setattr(client_module, "_END_PATIENCE_S", 0.1)
+    process = deaf(handles=False)
+    with pytest.raises(DaemonGoneError) as raised:
+        stop_session(path)
+    assert process.poll() is None
+    assert "though it runs" in raised.value.after_looking()
+
+
+@pytest.fixture
+def ended():
+    """The number of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_what_a_dead_daemon_left_is_looked_for(ended, monkeypatch):
+    assert "Its control process, which alone moves the motor, has ended" in what_is_left(
+        ended, os.getuid()
+    )
+    monkeypatch.setattr(client_module, "_END_PATIENCE_S", 0.3)
+    control = subprocess.Popen(
+        [sys.executable, "-m", "rigd.engine.control_process", str(ended)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        while not Path(f"/proc/{control.pid}/cmdline").read_bytes():
+            time.sleep(0.001)  # its program is being loaded, and has no arguments yet
+        said = what_is_left(ended, os.getuid())
+        assert f"control process {control.pid} still runs" in said
+        assert "STO" in said
+    finally:
+        control.kill()
+        control.communicate()
+    assert "not known" in what_is_left(os.getpid(), os.getuid())
+
+
+def test_a_process_that_is_dead_but_not_buried_is_gone():
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    assert "The daemon is gone." in what_is_left(process.pid, os.getuid())
+    process.wait()
+
+
+def test_the_end_is_waited_for_until_it_is_seen(path):
+    states = [
+        {"state": "running", "series": {"running": True}},
+        {"state": "stopping", "series": {"running": True}},
+        {"state": "ready", "series": {"running": False}},
+    ]
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen(5)
+
+    def work():
+        link, _ = listener.accept()
+        with link, link.makefile("rw") as file:
+            for state in states:
+                file.readline()
+                file.write(json.dumps({"reply": "status", "ok": True, **state}) + "\n")
+                file.flush()
+            file.readline()
+
+    threading.Thread(target=work, daemon=True).start()
+    status = await_end(path, 30.0)
+    assert status is not None
+    assert status["state"] == "ready"
+    listener.close()
+
+
+def test_an_end_that_a_crowd_or_a_silent_daemon_hides_is_not_told(path, monkeypatch):
+    """Not seen is not seen: neither that the session has ended, nor that it goes on."""
+    monkeypatch.setattr(client_module, "_PAUSE_S", 0.01)
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen(5)
+    full = {"reply": None, "ok": False, "error": "There are too many clients.", "crowded": True}
+    crowded = threading.Event()
+    crowded.set()
+
+    def work():
+        with suppress(OSError):
+            while True:
+                link, _ = listener.accept()
+                if crowded.is_set():
+                    with link:
+                        link.sendall(json.dumps(full).encode() + b"\n")
+                else:
+                    kept.append(link)
+
+    kept = []
+    threading.Thread(target=work, daemon=True).start()
+    began_s = time.monotonic()
+    assert await_end(path, 0.3) is None
+    crowded.clear()
+    with pytest.raises(DaemonGoneError, match="not known"):
+        await_end(path, 0.3)
+    assert time.monotonic() - began_s < 30.0  # and not the minute of other answers
+    listener.close()

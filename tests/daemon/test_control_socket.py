@@ -1,0 +1,370 @@
+"""The daemon's socket: who may use it, and clients that harm nobody whatever they do."""
+
+import asyncio
+import contextlib
+import grp
+import json
+import os
+import resource
+import socket
+import stat
+from pathlib import Path
+
+import pytest
+
+from rigd.daemon import address, server
+from rigd.daemon.address import AddressError, answers, bind, find, running, socket_path
+from rigd.daemon.server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
+from rigd.daemon.states import Peer, State
+
+LONG = {
+    "command": "start",
+    "excitation": "hold",
+    "parameters": {"duration_s": 2.0, "rest_s": 0.0, "ring_down_s": 0.0},
+    "repeat": 1000,
+}
+
+
+class Link:
+    """A client within the event loop."""
+
+    def __init__(self, reader, writer):
+        self.reader, self.writer = reader, writer
+
+    async def send(self, document):
+        line = document if isinstance(document, bytes) else json.dumps(document).encode() + b"\n"
+        self.writer.write(line)
+        await self.writer.drain()
+
+    async def next(self):
+        """The next line, or None at the end."""
+        line = await asyncio.wait_for(self.reader.readline(), 60.0)
+        return json.loads(line) if line else None
+
+    async def ask(self, document):
+        await self.send(document)
+        while "reply" not in (message := await self.next()):
+            pass
+        return message
+
+    async def close(self):
+        self.writer.close()
+        with contextlib.suppress(OSError):
+            await self.writer.wait_closed()
+
+
+class Served:
+    """A service behind its socket."""
+
+    def __init__(self, operated, path):
+        self.operated = operated
+        self.path = path
+        self.server = Server(bind(path, None))
+        operated.service._publish = self.server.publish
+        self.links = []
+
+    async def connect(self):
+        link = Link(*await asyncio.open_unix_connection(self.path, limit=1 << 20))
+        self.links.append(link)
+        return link
+
+    async def until(self, state):
+        while self.operated.state is not state:
+            await asyncio.sleep(0.002)
+
+    def run(self, scenario):
+        """Run a scenario against it, and end it as the daemon does."""
+
+        async def whole():
+            self.server.serve(self.operated.service)
+            try:
+                await scenario(self)
+            finally:
+                await self.operated.service.close("the test is over")
+                await self.server.close()
+                for link in self.links:
+                    await link.close()
+
+        self.operated.loop.run_until_complete(whole())
+
+
+@pytest.fixture
+def served(operated, runtime_folder):
+    return Served(operated, socket_path("sim"))
+
+
+def descriptors():
+    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - the descriptor that lists counts too
+
+
+def test_commands_and_events(served):
+    async def scenario(served):
+        watcher, operator = await served.connect(), await served.connect()
+        assert await watcher.ask({"command": "watch", "id": 3}) == {
+            "reply": "watch", "ok": True, "id": 3,
+        }  # fmt: skip
+        status = await operator.ask({"command": "status"})
+        assert status["state"] == "ready"
+        short = LONG | {"repeat": 2, "parameters": LONG["parameters"] | {"duration_s": 0.3}}
+        assert (await operator.ask(short))["plan"]["record_s"] == 0.3
+        events = []
+        while not events or events[-1]["event"] != "series":
+            events.append(await watcher.next())
+        assert [e["to"] for e in events if e["event"] == "state"] == ["running", "ready"]
+        assert sum(e["event"] == "session" for e in events) == 2
+        assert len(events[-1]["sessions"]) == 2
+        refused = await watcher.ask({"command": "tare"})
+        assert not refused["ok"]
+        assert f"process {os.getpid()}" in refused["error"]
+        await operator.close()
+        while (await watcher.ask({"command": "status"}))["controller"] is not None:
+            pass
+        assert (await watcher.ask({"command": "tare"}))["ok"]
+
+    served.run(scenario)
+
+
+def test_one_that_shuts_its_side_down_is_answered_and_let_go(served):
+    async def scenario(served):
+        link = await served.connect()
+        await link.send(b'{"command":"tare"}\n{"command":"status"}')
+        link.writer.write_eof()
+        assert (await link.next())["reply"] == "tare"
+        assert await link.next() is None
+        assert served.operated.service.controller is None
+
+    served.run(scenario)
+
+
+def test_nothing_that_clients_do_harms_a_running_session(served, monkeypatch):
+    monkeypatch.setattr(server, "_MOST_UNREAD", 65_536)
+
+    async def scenario(served):
+        operator = await served.connect()
+        assert (await operator.ask(LONG))["ok"]
+        await operator.close()
+
+        rude = await served.connect()
+        await rude.send(b"\xff\x00{{{\n" + b"[" * 50_000 + b"\n" + b"\n" * 20)
+        assert [(await rude.next())["ok"] for _ in range(22)] == [False] * 22
+
+        endless = await served.connect()
+        with contextlib.suppress(OSError):
+            await endless.send(b"x" * 1_000_000)
+        with contextlib.suppress(OSError):
+            assert "65536 bytes" in (await endless.next())["error"]
+            assert await endless.next() is None
+
+        half = await served.connect()
+        await half.send(b'{"command": "sta')
+
+        flood = await served.connect()
+        await flood.send(b'{"command":"status"}\n' * 500)
+        assert (await flood.next())["reply"] == "status"
+
+        slow = await served.connect()
+        assert (await slow.ask({"command": "watch"}))["ok"]
+        for _ in range(2000):
+            served.server.publish({"event": "message", "text": "x" * 1000})
+        await asyncio.sleep(0.01)
+        assert all(not client.watching for client in served.server._clients)
+
+        status = await (await served.connect()).ask({"command": "status"})
+        assert status["state"] == "running"
+        assert [s["outcome"] for s in status["series"]["sessions"]] == (
+            ["complete"] * len(status["series"]["sessions"])
+        )
+        assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
+        await served.until(State.READY)
+
+    served.run(scenario)
+    assert served.operated.world.wrong == []
+
+
+async def join_queue(link, path):
+    """Connect without waiting to be accepted, only for room in the queue."""
+    while True:
+        try:
+            return link.connect(str(path))
+        except BlockingIOError:
+            await asyncio.sleep(0.001)
+
+
+def test_a_thousand_connections_leave_room_for_a_stop(served):
+    async def scenario(served):
+        operator = await served.connect()
+        assert (await operator.ask(LONG))["ok"]
+        before = descriptors()
+        told = most = 0
+        for _ in range(20):
+            links = [socket.socket(socket.AF_UNIX) for _ in range(MOST_SILENT + 10)]
+            for link in links:
+                link.setblocking(False)
+                await join_queue(link, served.path)
+            await asyncio.sleep(0.01)
+            assert len(served.server._clients) <= MOST_CLIENTS
+            assert len(served.server._silent) <= MOST_SILENT
+            # Some are on their way out, and a session has its files.
+            most = max(most, descriptors() - len(links))
+            for link in links:
+                with contextlib.suppress(BlockingIOError):
+                    told += b"too many clients" in link.recv(1000)
+                link.close()
+        assert told > 0
+        assert most <= before + MOST_SILENT + MOST_CLIENTS
+        assert (await operator.ask({"command": "status"}))["state"] == "running"
+        assert (await (await served.connect()).ask({"command": "stop"}))["stopping"]
+        await served.until(State.READY)
+        assert served.operated.service.controller is not None
+
+    served.run(scenario)
+
+
+def test_a_stop_is_obeyed_where_there_is_no_room_left(served, monkeypatch):
+    monkeypatch.setattr(server, "MOST_CLIENTS", 5)
+
+    async def scenario(served):
+        assert (await (await served.connect()).ask(LONG))["ok"]
+        watchers = [await served.connect() for _ in range(4)]
+        assert (await watchers[0].ask({"command": "watch"}))["ok"]
+        for watcher in watchers[1:]:
+            assert (await watcher.ask({"command": "watch"}))["ok"]
+        refused = await (await served.connect()).ask({"command": "status"})
+        assert (refused["ok"], refused["crowded"]) == (False, True)
+        told = await (await served.connect()).ask({"command": "stop", "id": 7})
+        assert (told["stopping"], told["id"]) == (True, 7)
+        await served.until(State.READY)
+
+    served.run(scenario)
+
+
+def test_the_crowd_of_one_process_pushes_out_nobody_else(served, monkeypatch):
+    """The connection of another process is the oldest, and stays."""
+    crowd = []
+
+    def introduced(link):
+        silent = introduce(link)
+        if crowd:
+            silent.peer = Peer(silent.peer.number, 1, silent.peer.uid)
+        return silent
+
+    introduce = served.server._introduced
+    monkeypatch.setattr(served.server, "_introduced", introduced)
+
+    async def scenario(served):
+        slow = await served.connect()
+        await slow.send(b'{"command":')
+        while not served.server._silent:
+            await asyncio.sleep(0.001)
+        for _ in range(3 * MOST_SILENT):
+            crowd.append(socket.socket(socket.AF_UNIX))
+            crowd[-1].setblocking(False)
+            await join_queue(crowd[-1], served.path)
+        await asyncio.sleep(0.05)
+        assert len(served.server._silent) == MOST_SILENT
+        assert b"too many clients" in crowd[0].recv(1000)
+        assert (await slow.ask(b'"status"}\n'))["state"] == "ready"
+        for link in crowd:
+            link.close()
+
+    served.run(scenario)
+
+
+def test_there_is_room_for_those_who_ask_beside_those_who_watch(served):
+    async def scenario(served):
+        watchers = [await served.connect() for _ in range(MOST_CLIENTS)]
+        replies = [await watcher.ask({"command": "watch"}) for watcher in watchers]
+        assert sum(reply["ok"] for reply in replies) == MOST_WATCHERS
+        assert (await (await served.connect()).ask({"command": "status"}))["ok"]
+
+    served.run(scenario)
+
+
+@pytest.mark.parametrize("says_stop", [False, True])
+def test_without_descriptors_clients_are_turned_away_but_a_stop_is_obeyed(served, says_stop):
+    async def scenario(served):
+        link = socket.socket(socket.AF_UNIX)
+        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        fill = []
+        resource.setrlimit(resource.RLIMIT_NOFILE, (descriptors() + 20, limits[1]))
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    fill.append(os.open(os.devnull, os.O_RDONLY))
+            link.connect(str(served.path))
+            link.sendall(b'{"command":"%s"}\n' % (b"stop" if says_stop else b"status"))
+            await asyncio.sleep(0.05)
+        finally:
+            for fd in fill:
+                os.close(fd)
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        link.settimeout(10.0)
+        told = json.loads(link.recv(1000))
+        link.close()
+        assert "stopping" in told if says_stop else "too many clients" in told["error"]
+        assert (await (await served.connect()).ask({"command": "status"}))["ok"]
+
+    served.run(scenario)
+
+
+def mode(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_the_socket_is_the_user_s_own(runtime_folder):
+    path = socket_path("my rig/2")
+    assert path.parent == runtime_folder / "rigd"
+    listener = bind(path, None)
+    assert mode(path) == 0o600
+    assert mode(path.parent) == 0o700
+    assert not answers(path)  # not before it listens
+    listener.listen(5)
+    assert answers(path)
+    with pytest.raises(AddressError, match="Another daemon"):
+        bind(path, None)
+    listener.close()
+    with bind(path, None):  # what a dead daemon left
+        assert not answers(path)
+
+
+def test_a_group_may_use_it_if_asked_for(runtime_folder):
+    group = grp.getgrgid(os.getgid()).gr_name
+    common = runtime_folder / "common"
+    path = socket_path("sim", common)
+    with pytest.raises(AddressError, match=f"install -d -o .* -g {group} .*{common}"):
+        bind(path, group)
+    assert not common.exists()  # it is the administrator's to make
+    common.mkdir(mode=0o700)
+    with pytest.raises(AddressError, match=f"closed to the group {group}"):
+        bind(path, group)
+    common.chmod(0o710)
+    with bind(path, group):
+        assert mode(path) == 0o660
+        assert path.stat().st_gid == os.getgid()
+    with pytest.raises(AddressError, match="no such group"):
+        bind(path, "nobody-has-this-group")
+
+
+def test_a_folder_that_there_cannot_be_is_refused_with_the_remedy(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
+        bind(tmp_path / "file" / "sim.daemon", None)
+    with pytest.raises(AddressError, match="XDG_RUNTIME_DIR"):
+        bind(tmp_path / ("x" * 120) / "sim.daemon", None)
+
+
+def test_daemons_are_found(runtime_folder, monkeypatch):
+    monkeypatch.setattr(address, "COMMON", runtime_folder / "common")
+    with pytest.raises(AddressError, match="rigd serve"):
+        find(None)
+    with bind(socket_path("one"), None) as one, bind(socket_path("two"), None) as two:
+        one.listen(5)
+        assert find(None) == socket_path("one")  # the other one is dead
+        two.listen(5)
+        assert running() == [socket_path("one"), socket_path("two")]
+        with pytest.raises(AddressError, match=r"one, two.*--profile"):
+            find(None)
+        assert find("two") == socket_path("two")
+        with pytest.raises(AddressError, match="rigd serve --profile three"):
+            find("three")
+        assert isinstance(find("one"), Path)

@@ -1,0 +1,305 @@
+"""`rigd serve` and its clients as an operator runs them."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from processes import eventually
+
+from rigd.daemon.address import answers, socket_path
+from rigd.daemon.client import STOP_SIGNAL
+from rigd.session import read_session
+
+RIGD = Path(sys.executable).parent / "rigd"
+SHORT = ("--duration", "1", "--rest", "0.2", "--ring-down", "0")
+LONG = ("--duration", "600", "--rest", "0.2")
+
+
+@pytest.fixture
+def rigd(runtime_folder, tmp_path):
+    """Start `rigd`; what still runs at the end is killed."""
+    started = []
+
+    def start(*arguments):
+        started.append(
+            subprocess.Popen(
+                [RIGD, *map(str, arguments)],
+                cwd=tmp_path,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
+            )
+        )
+        return started[-1]
+
+    yield start
+    for process in reversed(started):
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def ask(rigd):
+    """Run a command to its end; returns exit code, standard output and standard error."""
+
+    def run(*arguments):
+        process = rigd(*arguments)
+        out, err = process.communicate(timeout=60.0)
+        return process.returncode, out, err
+
+    return run
+
+
+@pytest.fixture
+def ask_here(rigd_here):
+    """The same within this process, which costs less; the daemon is a process all the same."""
+
+    def run(*arguments):
+        done = rigd_here(*arguments)
+        return done.returncode, done.stdout, done.stderr
+
+    return run
+
+
+@pytest.fixture
+def profile(write_profile):
+    return write_profile("sim", patient=True)
+
+
+@pytest.fixture
+def serve(rigd, profile):
+    """Start the daemon and wait until its rig is connected."""
+
+    def start(*options):
+        daemon = rigd("serve", "--profile", profile, "--output", "out", *options)
+        until(lambda: answers(socket_path("sim")), daemon)
+        until(lambda: request("status")["state"] != "idle", daemon)
+        return daemon
+
+    return start
+
+
+def until(condition, daemon=None):
+    """Wait for a condition, as long as the daemon runs."""
+
+    def ended():
+        return daemon is not None and daemon.poll() is not None
+
+    met = eventually(lambda: ended() or condition())
+    assert not ended(), daemon.communicate()
+    assert met
+
+
+def request(command, **fields):
+    with socket.socket(socket.AF_UNIX) as link, link.makefile("rw") as file:
+        link.settimeout(30.0)
+        link.connect(str(socket_path("sim")))
+        file.write(json.dumps({"command": command, **fields}) + "\n")
+        file.flush()
+        return json.loads(file.readline())
+
+
+def recording():
+    progress = request("status")["progress"]
+    return progress is not None and progress["phase"] == "running" and progress["tick"] > 0
+
+
+def control_process():
+    processes = request("status")["rig"]["processes"]
+    return next(process["pid"] for process in processes if process["name"] == "control")
+
+
+def test_without_a_daemon_every_command_says_how_to_start_one(runtime_folder, ask_here):
+    for command in (("status",), ("stop",), ("start", "hold")):
+        code, out, err = ask_here(*command)
+        assert (code, out) == (1, "")
+        assert "rigd serve --profile" in err
+
+
+def test_watching_needs_a_terminal(ask):
+    code, out, err = ask("status", "--watch")
+    assert (code, out) == (2, "")
+    assert "terminal" in err
+
+
+def test_what_cannot_be_served_is_refused_at_once(ask, profile, tmp_path):
+    (tmp_path / "file").touch()
+    for options in (("--output", "file/out"), ("--group", "")):
+        code, out, err = ask("serve", "--profile", profile, *options)
+        assert (code, out) == (2, "")
+        assert options[0] in err
+        assert "Traceback" not in err
+
+
+def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
+    daemon = serve("--fast")
+    code, out, err = ask("start", "chirp", *SHORT, "--stop-hz", "10", "--repeat", "2", "--json",
+                         "--operator", "Ada")  # fmt: skip
+    assert code == 0
+    assert err.startswith("No hardware: sim is simulated (in this process).\n")
+    sessions = json.loads(out)["sessions"]
+    assert [s["outcome"] for s in sessions] == ["complete", "complete"]
+    assert [s["hardware"] for s in sessions] == [False, False]
+    record = read_session(Path(sessions[1]["path"]))
+    assert record.metadata["operator"] == "Ada"
+    assert record.metadata["series"] == "2 of 2"
+    assert Path(sessions[0]["path"]).parent == tmp_path / "out"
+
+    code, out, err = ask_here("start", "step", "--amplitude", "3")
+    assert (code, out) == (2, "")
+    assert "lower the amplitude" in err
+    code, out, err = ask_here("start", "chirp", "--amplitude", "nan")
+    assert code == 2
+    code, out, _ = ask("status")
+    assert code == 0
+    assert "ready since" in out
+    code, out, _ = ask_here("tare", "--json")
+    assert "torque_std_nm" in json.loads(out)
+    code, out, _ = ask_here("zero", "--profile", "sim")
+    assert code == 0
+    code, out, err = ask_here("reset")
+    assert code == 1
+    assert "nothing to reset" in err
+
+    code, _, err = ask("serve", "--profile", profile)
+    assert code == 1
+    assert "rigd serve, process" in err
+    code, _, err = ask_here("run", "hold", "--profile", profile, "--fast", *SHORT)
+    assert code == 1
+    assert "rigd start" in err
+
+    os.kill(control_process(), signal.SIGKILL)
+    until(lambda: request("status")["state"] == "fault")
+    code, _, err = ask_here("start", "hold", *SHORT)
+    assert code == 1
+    assert "killed by signal 9" in err
+    code, out, _ = ask("reset")
+    assert code == 0
+    assert "rigd zero" in out  # it was set before, and is lost
+    assert request("status")["state"] == "ready"
+
+    daemon.send_signal(signal.SIGTERM)
+    _, said = daemon.communicate(timeout=60.0)
+    assert daemon.returncode == 0
+    assert "state: ready -> running: chirp was started, 2 sessions" in said
+    assert not socket_path("sim").exists()
+
+
+def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, rigd):
+    daemon = serve()
+    client = rigd("start", "hold", *LONG, "--repeat", "3")
+    until(recording, daemon)
+    client.kill()
+    client.wait()
+    until(lambda: request("status")["controller"] is None)
+    assert request("status")["state"] == "running"
+    code, out, _ = ask("stop")
+    assert code == 0
+    assert "The session has ended; the torque is off." in out
+    assert request("status")["state"] == "ready"
+    (session,) = request("status")["series"]["sessions"]
+    assert session["outcome"] == "stopped"
+    assert session["lost"] == 0
+    assert session["path"] in out
+    assert read_session(Path(session["path"])).outcome["outcome"] == "stopped"
+
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    code, out, _ = ask("stop", "--no-wait")
+    assert code == 0
+    assert "is being stopped" in out
+    client.communicate(timeout=60.0)
+    assert client.returncode == 130
+
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    daemon.send_signal(STOP_SIGNAL)
+    client.communicate(timeout=60.0)
+    assert client.returncode == 130
+    until(lambda: request("status")["state"] == "ready", daemon)
+    code, out, _ = ask("stop")
+    assert (code, out) == (0, "No session is running; the torque is off.\n")
+
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    client.send_signal(signal.SIGINT)
+    out, err = client.communicate(timeout=60.0)
+    assert client.returncode == 130
+    assert "stopped:" in err
+
+    client = rigd("start", "hold", *LONG, "--json")
+    until(recording, daemon)
+    control = control_process()
+    os.killpg(daemon.pid, signal.SIGINT)
+    _, said = daemon.communicate(timeout=60.0)
+    assert daemon.returncode == 130
+    assert "stopping -> ready" in said
+    out, _ = client.communicate(timeout=60.0)
+    assert client.returncode == 130
+    assert json.loads(out)["sessions"][0]["outcome"] == "stopped"
+    assert not Path(f"/proc/{control}").exists()
+    assert not socket_path("sim").exists()
+
+
+CROWD = """
+import socket, sys
+kept = []
+while True:
+    link = socket.socket(socket.AF_UNIX)
+    try:
+        link.connect(sys.argv[1])
+        if sys.argv[2] == "half":
+            link.send(b'{"command": "sto')
+    except OSError:
+        continue
+    if sys.argv[2] != "close":
+        kept = [*kept[-200:], link]
+"""
+
+
+def test_a_crowd_at_the_socket_keeps_nobody_from_a_stop(serve, rigd, ask):
+    daemon = serve()
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    crowd = [
+        subprocess.Popen([sys.executable, "-c", CROWD, socket_path("sim"), kind])
+        for kind in ("silent", "half", "close")
+    ]
+    try:
+        code, out, err = ask("status", "--json")
+        assert code == 0, err
+        assert json.loads(out)["state"] == "running"
+        code, out, err = ask("stop")
+        assert code == 0, err
+        assert "The session has ended; the torque is off." in out
+    finally:
+        for process in crowd:
+            process.kill()
+            process.wait()
+    _, err = client.communicate(timeout=60.0)
+    assert client.returncode == 130, err
+    assert request("status")["state"] == "ready"
+
+
+def test_a_killed_daemon_stops_the_rig_and_is_replaced(serve, rigd):
+    daemon = serve()
+    client = rigd("start", "hold", *LONG)
+    until(recording, daemon)
+    control = control_process()
+    daemon.kill()
+    daemon.wait()
+    _, err = client.communicate(timeout=60.0)
+    assert client.returncode == 1
+    assert "The daemon is gone." in err
+    assert "rigd serve" in err
+    until(lambda: not Path(f"/proc/{control}").exists())
+    assert socket_path("sim").exists()
+    serve("--fast")
+    assert request("status")["state"] == "ready"

@@ -1,0 +1,222 @@
+"""No sequence of commands and faults reaches torque without an enabled, healthy session."""
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
+
+from rigd.daemon.service import CommandError
+from rigd.daemon.states import Document, IllegalTransitionError, Peer, State, StateMachine
+from rigd.devices.contracts import DeviceError
+
+MOST_CALLS = 3000
+"""Calls of the drive in a session: rest, settling, record, return, second tare."""
+
+
+def sessions(duration_s):
+    return {
+        "excitation": "hold",
+        "parameters": {"duration_s": duration_s, "rest_s": 0.0, "ring_down_s": 0.0},
+    }
+
+
+def device_fails(operated, drive):
+    raise DeviceError("The drive is gone.")
+
+
+def limit_is_violated(operated, drive):
+    drive.offset_rad += 0.5
+
+
+def control_dies(operated, drive):
+    operated.rig._crew.control.kill()
+
+
+def recorder_dies(operated, drive):
+    operated.rig._crew.recorder.kill()
+
+
+def stop_is_asked_for(operated, drive):
+    operated.meanwhile("stop")
+
+
+def everything_is_asked_for(operated, drive):
+    for command in ("tare", "zero", "reset"):
+        assert isinstance(operated.meanwhile(command), CommandError)
+    assert isinstance(operated.meanwhile("start", **sessions(0.3)), CommandError)
+
+
+def client_leaves(operated, drive):
+    operated.service.release(operated.peer)
+
+
+INCIDENTS = (
+    device_fails,
+    limit_is_violated,
+    control_dies,
+    recorder_dies,
+    stop_is_asked_for,
+    everything_is_asked_for,
+    client_leaves,
+)
+
+
+def make_machine(operate):
+    class Daemon(RuleBasedStateMachine):
+        def __init__(self):
+            super().__init__()
+            self.operated = operate().open()
+            self.world = self.operated.world
+            self.reset_asked = False
+
+        def arrange(self, incident, when):
+            self.world.countdown = when
+            self.world.then = incident and (lambda drive: incident(self.operated, drive))
+
+        def settle(self):
+            self.world.then = None
+            for drive in self.world.drives:
+                drive.offset_rad = 0.0
+
+        def ask(self, command, **fields) -> Document | CommandError:
+            before, seen = self.operated.state, len(self.operated.events)
+            answer = self.operated.ask(command, **fields)
+            self.settle()
+            states = [e for e in self.operated.events[seen:] if e["event"] == "state"]
+            if before is State.FAULT and command != "reset":
+                assert isinstance(answer, CommandError) or command == "stop"
+                assert states == []
+            if before is not State.FAULT:
+                assert all(event["from"] != "fault" for event in states)
+            return answer
+
+        @rule(
+            incident=st.sampled_from((None, *INCIDENTS)),
+            when=st.integers(1, MOST_CALLS),
+            repeat=st.integers(1, 2),
+            ms=st.integers(50, 400),
+        )
+        def start(self, incident, when, repeat, ms):
+            self.arrange(incident, when)
+            highest = self.world.highest_nm
+            self.world.highest_nm = 0.0
+            ready = self.operated.state is State.READY and not self.operated.rig.zero_lost
+            answer = self.ask("start", **sessions(ms / 1000), repeat=repeat)
+            assert isinstance(answer, CommandError) != ready
+            if not ready:
+                assert self.world.highest_nm == 0.0
+            elif incident is None:
+                assert self.operated.state is State.READY
+                assert len(self.operated.last["sessions"]) == repeat
+                assert self.world.highest_nm > 0.0
+            self.world.highest_nm = max(highest, self.world.highest_nm)
+
+        @rule(
+            command=st.sampled_from(("tare", "zero")),
+            incident=st.sampled_from((None, device_fails, control_dies, limit_is_violated)),
+            when=st.integers(1, 600),
+        )
+        def measure(self, command, incident, when):
+            self.arrange(incident, when)
+            before = self.world.highest_nm
+            self.ask(command)
+            assert self.world.highest_nm == before
+
+        @rule(absent=st.booleans())
+        def reset(self, absent):
+            fault = self.operated.state is State.FAULT
+            self.world.absent = absent
+            answer = self.ask("reset")
+            self.world.absent = False
+            if isinstance(answer, CommandError):
+                assert absent or not fault
+            else:
+                assert self.operated.state is State.READY
+
+        @rule()
+        def stop(self):
+            assert self.ask("stop") == {"stopping": False}
+
+        @rule()
+        def another_client_comes(self):
+            self.operated.peer = Peer(self.operated.peer.number + 1, 300, 0)
+            assert isinstance(self.ask("tare"), dict) == (
+                self.operated.service.controller == self.operated.peer
+                and self.operated.state is State.READY
+            )
+            self.operated.service.release(self.operated.peer)
+            self.operated.peer = self.operated.service.controller or self.operated.peer
+
+        @rule()
+        def control_dies_between_sessions(self):
+            if self.operated.rig.connected:
+                self.operated.rig._crew.control.kill()
+            self.operated.watch()
+            assert self.operated.state is State.FAULT
+
+        @rule()
+        def time_passes(self):
+            before = self.operated.state
+            self.operated.watch()
+            assert self.operated.state is before
+
+        @invariant()
+        def torque_only_in_a_session(self):
+            assert self.world.wrong == []
+            assert all(drive.safe for drive in self.world.drives)
+            assert self.operated.state in (State.READY, State.FAULT)
+            if self.operated.state is State.READY:
+                assert self.operated.rig.connected
+
+        def teardown(self):
+            self.operated.close()
+            assert all(drive.safe for drive in self.world.drives)
+            assert not self.operated.rig.connected
+
+    return Daemon
+
+
+def test_no_sequence_of_commands_and_faults_reaches_torque_outside_a_session(operate):
+    run_state_machine_as_test(
+        make_machine(operate),
+        settings=settings(
+            max_examples=25,
+            stateful_step_count=12,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "wrong"),
+    [
+        ((), State.RUNNING),
+        ((), State.STOPPING),
+        ((State.READY,), State.STOPPING),
+        ((State.READY, State.RUNNING), State.IDLE),
+        ((State.READY, State.RUNNING, State.STOPPING), State.RUNNING),
+        ((State.FAULT,), State.RUNNING),
+        ((State.FAULT,), State.STOPPING),
+    ],
+)
+def test_what_leads_nowhere(path, wrong):
+    told = []
+    machine = StateMachine(told.append)
+    for state in path:
+        machine.move(state, "test")
+    with pytest.raises(IllegalTransitionError):
+        machine.move(wrong, "test")
+    assert machine.state is (path[-1] if path else State.IDLE)
+    assert len(told) == len(path)
+
+
+def test_the_history_is_bounded_and_knows_since_when():
+    clock = iter(range(10_000))
+    machine = StateMachine(utc_ns=lambda: next(clock))
+    assert machine.since_utc_ns == 0
+    for _ in range(100):
+        machine.move(State.READY, "in")
+        machine.move(State.IDLE, "out")
+    assert len(machine.history) == 50
+    assert machine.since_utc_ns == 200
+    assert machine.history[-1].reason == machine.reason == "out"

@@ -1,0 +1,47 @@
+"""The daemon's log never keeps the daemon."""
+
+import subprocess
+import sys
+
+FLOOD = """
+import logging
+from rigd.daemon.log import NAME, Log
+
+with Log():
+    for number in range(20_000):
+        logging.getLogger(NAME).info("line %d %s", number, "x" * 100)
+print("through")
+"""
+A_FEW = """
+import logging
+from rigd.daemon import log
+from rigd.daemon.log import NAME, Log
+
+log._FLUSH_S = 60.0  # the machine may stand still for longer than a daemon would wait
+with Log():
+    for number in range(5):
+        logging.getLogger(NAME).warning("line %d", number)
+"""
+
+
+def start(program):
+    return subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_a_terminal_that_takes_nothing_is_not_waited_for():
+    process = start(FLOOD)
+    assert process.stdout.read() == "through\n"  # and nobody reads the log
+    assert process.wait(60.0) == 0
+    process.communicate()
+
+
+def test_every_line_is_there_at_the_end():
+    process = start(A_FEW)
+    _, said = process.communicate(timeout=60.0)
+    lines = said.splitlines()
+    assert [line.rsplit("WARNING ")[1] for line in lines] == [f"line {n}" for n in range(5)]

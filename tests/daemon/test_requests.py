@@ -1,0 +1,144 @@
+"""Requests from anybody: understood or refused by a message that names what is wrong."""
+
+import inspect
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from rigd.daemon.protocol import RequestError, Start, parse_request
+from rigd.excitation import ExcitationError
+from rigd.excitation.named import KINDS, make_excitation
+
+START = {"command": "start", "excitation": "chirp"}
+
+
+def parse(document):
+    return parse_request(json.dumps(document).encode())
+
+
+@pytest.mark.parametrize("command", ["status", "watch", "stop", "tare", "zero", "reset"])
+def test_plain_commands(command):
+    request = parse({"command": command, "id": 7})
+    assert (request.command, request.id) == (command, 7)
+
+
+def test_a_start_has_the_parameters_of_its_excitation():
+    request = parse(START | {"parameters": {"amplitude_rad": 1, "stop_hz": 20.5}, "repeat": 3})
+    assert isinstance(request, Start)
+    assert request.parameters == {"amplitude_rad": 1.0, "stop_hz": 20.5}
+    assert request.repeat == 3
+    request = parse(
+        {"command": "start", "excitation": "file", "parameters": {"path": "/data/reference.csv"}}
+    )
+    assert request.parameters == {"path": Path("/data/reference.csv")}
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        (b"", "JSON"),
+        (b"{", "JSON"),
+        (b"[]", "object"),
+        (b"7", "object"),
+        (b'"status"', "object"),
+        (b"\xff\xfe", "UTF-8"),
+        (b"[" * 30_000, "nested"),
+        (b'{"command":' * 5_000, "nested"),
+        (b'{"command": NaN}', "NaN"),
+        (b'{"command": ' + b"9" * 5000 + b"}", "JSON"),
+        (b"{}", "command"),
+        (b'{"command": "fire"}', "fire"),
+        (b'{"command": ["status"]}', "command"),
+        (b'{"command": "status", "more": 1}', "more"),
+        (b'{"command": "status", "id": 1.5}', "id"),
+        (b'{"command": "status", "id": true}', "id"),
+        (b'{"command": "status", "id": "' + b"x" * 65 + b'"}', "at most 64"),
+    ],
+)
+def test_what_is_no_request_is_refused_by_name(line, named):
+    with pytest.raises(RequestError, match=named):
+        parse_request(line)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"excitation": "dance"}, "dance"),
+        ({"excitation": 3}, "excitation"),
+        ({"parameters": {"amplitude": 1.0}}, "amplitude"),
+        ({"parameters": {"rate_hz": 10.0}}, "rate_hz"),
+        ({"parameters": {"amplitude_rad": "1"}}, "amplitude_rad"),
+        ({"parameters": {"amplitude_rad": True}}, "amplitude_rad"),
+        ({"parameters": {"amplitude_rad": None}}, "amplitude_rad"),
+        ({"parameters": {"amplitude_rad": [1.0]}}, "amplitude_rad"),
+        ({"parameters": {"amplitude_rad": 10**400}}, "amplitude_rad"),
+        ({"parameters": [1.0]}, "parameters"),
+        ({"excitation": "multisine", "parameters": {"seed": 1.0}}, "seed"),
+        ({"excitation": "multisine", "parameters": {"seed": 10**30}}, "seed"),
+        ({"excitation": "file"}, "path is missing"),
+        ({"excitation": "file", "parameters": {"path": "reference.csv"}}, "absolute"),
+        ({"excitation": "file", "parameters": {"path": "/a\u0000b"}}, "path"),
+        ({"excitation": "file", "parameters": {"path": "/a\ud800"}}, "path"),
+        ({"repeat": 0}, "repeat"),
+        ({"repeat": 10_000}, "repeat"),
+        ({"repeat": 1.0}, "repeat"),
+        ({"notes": {"operator": "two\nlines"}}, "operator"),
+        ({"notes": {"weather": "fine"}}, "weather"),
+        ({"force": "yes"}, "force"),
+    ],
+)
+def test_a_start_that_is_wrong_is_refused_by_name(fields, named):
+    with pytest.raises(RequestError, match=named):
+        parse(START | fields)
+
+
+def test_an_overflowing_number_is_refused():
+    with pytest.raises(RequestError, match="amplitude_rad"):
+        parse_request(
+            b'{"command": "start", "excitation": "step", "parameters": {"amplitude_rad": 1e999}}'
+        )
+
+
+def test_a_refusal_says_whose_request_it_was():
+    with pytest.raises(RequestError) as refused:
+        parse({"command": "fire", "id": "mine"})
+    assert refused.value.request_id == "mine"
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=300))
+@example(b'{"command": "status"}')
+def test_no_bytes_break_it(line):
+    try:
+        parse_request(line)
+    except RequestError as error:
+        assert str(error)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=10,
+)
+NAMES = sorted({name for make in KINDS.values() for name in inspect.signature(make).parameters})
+
+
+@settings(max_examples=200)
+@given(
+    kind=st.sampled_from([*KINDS, "dance"]),
+    parameters=st.dictionaries(st.sampled_from(NAMES), JSON | st.floats(-10.0, 100.0), max_size=4),
+    more=st.dictionaries(st.sampled_from(["repeat", "notes", "force", "id"]), JSON, max_size=2),
+)
+def test_whatever_a_start_asks_for_is_made_or_refused(kind, parameters, more):
+    line = json.dumps(
+        {"command": "start", "excitation": kind, "parameters": parameters, **more}
+    ).encode()
+    try:
+        request = parse_request(line)
+        assert isinstance(request, Start)
+        make_excitation(request.excitation, request.parameters, 100.0)
+    except (RequestError, ExcitationError) as error:
+        assert str(error)

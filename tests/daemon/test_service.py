@@ -1,0 +1,490 @@
+"""The daemon's logic on a rig in this process: commands, states, control, and what goes wrong."""
+
+import asyncio
+
+import pytest
+
+from rigd.daemon import protocol
+from rigd.daemon.service import CommandError
+from rigd.daemon.states import Peer, State
+from rigd.devices.contracts import DeviceError, LineHealth
+from rigd.devices.registry import Reality
+from rigd.engine.ipc import ChildError
+from rigd.engine.shared_state import Word
+
+SHORT = {
+    "excitation": "hold",
+    "parameters": {"duration_s": 0.3, "rest_s": 0.0, "ring_down_s": 0.0},
+}
+OTHER = Peer(2, 200, 0)
+
+
+def fail(drive):
+    raise DeviceError("The drive is gone.")
+
+
+def fall_silent(drive):
+    drive.inner.angle_stale = True
+
+
+def transitions(operated):
+    return [(e["from"], e["to"]) for e in operated.events if e["event"] == "state"]
+
+
+def test_a_session_goes_from_ready_over_running_to_ready(operated, tmp_path):
+    assert operated.state is State.READY
+    reply = operated.ask("start", **SHORT, notes={"operator": "Ada"})
+    assert reply["plan"]["record_s"] == 0.3
+    assert operated.state is State.READY
+    assert transitions(operated) == [("idle", "ready"), ("ready", "running"), ("running", "ready")]
+    (session,) = operated.last["sessions"]
+    assert session["outcome"] == "complete"
+    assert session["recorded"] == 300
+    assert session["path"].startswith(str(tmp_path / "out"))
+    assert not operated.last["failed"]
+    assert operated.world.highest_nm > 0.0
+    assert operated.world.drives[0].safe
+    assert operated.world.wrong == []
+
+
+def test_a_series_runs_on_one_connection_and_stops_at_the_first_that_fails(operated):
+    operated.ask("start", **SHORT, repeat=2)
+    assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "complete"]
+    assert len(operated.world.drives) == 1
+    operated.world.countdown, operated.world.then = 2700, fail
+    operated.ask("start", **SHORT, repeat=3)
+    assert [s["outcome"] for s in operated.last["sessions"]] == ["complete", "fault"]
+    assert operated.last["failed"]
+    assert operated.state is State.FAULT
+    assert "The drive is gone." in operated.service.status()["reason"]
+
+
+def test_a_stop_may_come_from_anybody_and_ends_the_series(operated):
+    def stop(drive):
+        reply = operated.meanwhile("stop")
+        assert reply == {"stopping": True}
+        assert operated.state is State.STOPPING
+
+    operated.world.countdown, operated.world.then = 1200, stop
+    operated.ask("start", **SHORT, repeat=5)
+    (session,) = operated.last["sessions"]
+    assert session["outcome"] == "stopped"
+    assert operated.last["stopped"]
+    assert not operated.last["failed"]
+    assert operated.state is State.READY
+    assert ("stopping", "ready") in transitions(operated)
+    assert operated.ask("stop", peer=OTHER) == {"stopping": False}
+
+
+def test_what_a_state_does_not_allow_is_refused(operated):
+    refused = []
+
+    def ask_everything(drive):
+        for command, fields in (("start", SHORT), ("tare", {}), ("zero", {}), ("reset", {})):
+            refused.append(operated.meanwhile(command, **fields))
+
+    operated.world.countdown, operated.world.then = 1200, ask_everything
+    operated.ask("start", **SHORT)
+    assert len(refused) == 4
+    assert all(isinstance(error, CommandError) for error in refused)
+    assert all("running" in str(error) for error in refused)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+    assert isinstance(operated.ask("reset"), CommandError)
+
+
+def test_control_belongs_to_one_client_until_it_leaves(operated):
+    operated.ask("tare")
+    refusal = operated.ask("start", peer=OTHER, **SHORT)
+    assert "controlled by process 100 of" in str(refusal)
+    assert operated.service.status()["controller"]["pid"] == 100
+    assert operated.ask("status", peer=OTHER)["state"] == "ready"
+    operated.service.release(OTHER)
+    assert isinstance(operated.ask("zero", peer=OTHER), CommandError)
+    operated.service.release(operated.peer)
+    assert "moved_rad" in operated.ask("zero", peer=OTHER)
+
+
+def test_a_client_that_leaves_stops_nothing(operated):
+    def leave(drive):
+        operated.service.release(operated.peer)
+
+    operated.world.countdown, operated.world.then = 1200, leave
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_tare_and_zero_without_torque(operated):
+    tare = operated.ask("tare")
+    assert set(tare["mean"]) == {"fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"}
+    assert operated.ask("zero")["moved_rad"] == pytest.approx(0.0, abs=1e-3)
+    assert operated.world.highest_nm == 0.0
+
+
+def test_only_reset_leaves_a_fault(operated):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    for command, fields in (("start", SHORT), ("tare", {}), ("zero", {})):
+        refusal = operated.ask(command, **fields)
+        assert "rigd reset" in str(refusal)
+    operated.watch()
+    assert operated.state is State.FAULT
+    operated.ask("reset")
+    assert operated.state is State.READY
+    assert transitions(operated)[-2:] == [("fault", "idle"), ("idle", "ready")]
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_a_limit_that_ends_a_session_is_a_fault_and_the_zero_survives_its_reset(operated):
+    operated.ask("zero")
+    operated.world.countdown, operated.world.then = 1200, fall_silent
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert operated.rig.connected
+    operated.world.drives[0].inner.angle_stale = False
+    assert operated.ask("reset") == {"zero_lost": False}
+    assert transitions(operated)[-1] == ("fault", "ready")
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def slip(drive):
+    drive.offset_rad = 8000 * 7e-5
+
+
+@pytest.mark.parametrize("when", ["ready", "session"])
+def test_an_encoder_that_jumps_makes_the_zero_void(operated, when):
+    """And the limits with it: nothing is started until there is another zero."""
+    operated.ask("zero")
+    if when == "ready":  # no time passes under the virtual clock until something is asked for
+        slip(operated.world.drives[0])
+    else:
+        operated.world.countdown, operated.world.then = 1900, slip
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert "encoder" in operated.last["reason"]
+    assert "0.56 rad" in operated.last["reason"]
+    assert "the zero" in operated.last["reason"]
+    assert "rigd reset" in str(operated.ask("start", **SHORT))
+    assert operated.ask("reset") == {"zero_lost": True}
+    refusal = operated.ask("start", **SHORT)
+    assert isinstance(refusal, CommandError)
+    assert "rigd zero" in str(refusal)
+    operated.ask("zero")
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_an_encoder_that_jumps_before_the_zero_is_set_is_told(operated):
+    slip(operated.world.drives[0])
+    assert "The encoder jumped by 0.56 rad" in str(operated.ask("zero"))
+    assert operated.state is State.FAULT
+
+
+def test_a_zero_that_was_lost_has_to_be_set_before_the_next_session(operated):
+    operated.ask("zero")
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.ask("reset") == {"zero_lost": True}
+    assert "rigd zero" in str(operated.ask("start", **SHORT))
+    assert operated.service.status()["zero_lost"]
+    operated.ask("zero")
+    operated.ask("start", **SHORT)
+    assert operated.last["sessions"][0]["outcome"] == "complete"
+
+
+def test_a_rig_that_cannot_be_connected_is_a_fault_until_it_can(operate):
+    operated = operate()
+    operated.world.absent = True
+    operated.open()
+    assert operated.state is State.FAULT
+    assert "does not answer" in str(operated.ask("reset"))
+    assert operated.state is State.FAULT
+    operated.world.absent = False
+    operated.ask("reset")
+    assert operated.state is State.READY
+
+
+def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    operated.moving = Reality.HARDWARE
+    assert "start it anew" in str(operated.ask("reset"))
+    assert operated.state is State.FAULT
+    assert len(operated.world.drives) == 1
+
+
+def test_a_control_process_that_dies_between_sessions_is_a_fault(operated):
+    operated.rig._crew.control.kill()
+    for _ in range(100):
+        operated.watch()
+        if operated.state is State.FAULT:
+            break
+    assert operated.state is State.FAULT
+    assert "killed by signal 9" in operated.service.status()["reason"]
+
+
+def test_a_fault_is_one_though_a_stop_was_asked_for(operated):
+    def stop_and_jump(drive):
+        operated.meanwhile("stop")
+        drive.offset_rad = 3.0
+
+    operated.world.countdown, operated.world.then = 3000, stop_and_jump
+    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    assert operated.last["stopped"]
+    assert operated.last["failed"]
+    assert operated.state is State.FAULT
+    assert operated.last["sessions"][0]["outcome"] == "fault"
+
+
+def test_a_recorder_that_dies_is_told_with_what_is_kept(operated):
+    operated.world.countdown = 3000
+    operated.world.then = lambda _: operated.rig._crew.recorder.kill()
+    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    assert operated.state is State.FAULT
+    for words in ("killed by signal 9", "drive is disabled", "rigd recover"):
+        assert words in operated.last["reason"]
+    (session,) = operated.last["sessions"]
+    assert (session["outcome"], session["path"], session["recorded"]) == ("fault", None, None)
+    assert session["part"].endswith(".mcap.part")
+    assert session["scheduled"] > 0
+    (told,) = (event for event in operated.events if event["event"] == "session")
+    assert told.items() >= session.items()
+
+
+def test_a_drive_that_does_not_show_itself_off_is_told_whatever_else_has_failed(operated):
+    doubt = "Drive: it does not show that it is off; see that it is, by its STO if need be."
+
+    def fail_both(drive):
+        drive.off_doubt = doubt
+        operated.rig._crew.recorder.kill()
+
+    operated.world.countdown, operated.world.then = 3000, fail_both
+    operated.ask("start", excitation="hold", parameters={"duration_s": 5.0})
+    assert operated.state is State.FAULT
+    reason = operated.last["reason"]
+    for words in ("killed by signal 9", doubt, "rigd recover"):
+        assert words in reason
+    assert "is disabled" not in reason
+
+
+def test_what_the_limits_forbid_is_refused_before_anything_moves(operated):
+    refusal = operated.ask(
+        "start", excitation="step", parameters={"amplitude_rad": 3.0, "duration_s": 1.0}
+    )
+    assert refusal.wrong_use
+    assert "limits.angle_rad" in str(refusal)
+    assert operated.state is State.READY
+    assert operated.world.highest_nm == 0.0
+
+
+@pytest.mark.parametrize("name", ["missing.csv", "/dev/zero"])
+def test_only_plain_files_are_read(operated, tmp_path, name):
+    refusal = operated.ask("start", excitation="file", parameters={"path": str(tmp_path / name)})
+    assert refusal.wrong_use
+    assert name in str(refusal)
+
+
+def test_a_disk_without_room_for_a_file_is_refused(operated, tmp_path):
+    (tmp_path / "out").write_text("in the way")
+    refusal = operated.ask("start", **SHORT)
+    assert "cannot be made a folder" in str(refusal)
+    assert not refusal.wrong_use  # the same request may succeed later
+    assert operated.state is State.READY
+
+
+def test_a_folder_that_cannot_be_written_any_more_ends_the_series_as_a_fault(operated, tmp_path):
+    def take_away(drive):
+        (tmp_path / "out").rename(tmp_path / "gone")
+        (tmp_path / "out").write_text("in the way")
+
+    operated.world.countdown, operated.world.then = 2500, take_away
+    operated.ask("start", **SHORT, repeat=2)
+    assert operated.last["failed"]
+    assert operated.world.drives[0].safe
+
+
+def test_what_nobody_foresaw_ends_with_everything_off(operated, monkeypatch):
+    def break_(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(operated.rig, "run", break_)
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert not operated.rig.connected
+    assert "ZeroDivisionError" in operated.last["reason"]
+
+
+def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate, monkeypatch):
+    def break_(*_, **__):
+        raise ZeroDivisionError
+
+    operated = operate()
+    with monkeypatch.context() as broken:
+        broken.setattr(operated.rig, "connect", break_)
+        operated.open()
+        assert operated.state is State.FAULT
+        assert "ZeroDivisionError" in str(operated.ask("reset"))
+    assert operated.state is State.FAULT
+    operated.ask("reset")
+    assert operated.state is State.READY
+
+
+def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
+    assert operated.ask("start", **SHORT)["series"] == 1
+    crew = operated.rig._crew
+    with monkeypatch.context() as broken:
+        broken.setattr(type(crew), "_start", refuse_to_start)
+        operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+    assert "cannot be started" in operated.last["reason"]
+    operated.ask("reset")
+    operated.ask("start", **SHORT)
+    assert operated.state is State.READY
+
+
+def refuse_to_start(*_):
+    raise ChildError("The recorder process cannot be started.")
+
+
+def test_a_reset_does_not_connect_what_is_being_closed(operated):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.state is State.FAULT
+
+    async def both():
+        reset = asyncio.ensure_future(operated.handle("reset"))
+        await asyncio.sleep(0)
+        await operated.service.close("it ends")
+        return await reset
+
+    refusal = operated.loop.run_until_complete(both())
+    assert "shut down" in str(refusal)
+    assert not operated.rig.connected
+
+
+def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, monkeypatch):
+    heard = iter([True, True, False])
+    monkeypatch.setattr(operated.service, "_listens", lambda: next(heard, False))
+    beats = []
+    operated.world.countdown = 1200
+    operated.world.then = lambda _: beats.append(board(operated)[Word.SUPERVISOR_BEAT])
+    operated.ask("start", **SHORT, repeat=2)
+    assert board(operated)[Word.SUPERVISOR_BEAT] == beats[0]
+    assert len(operated.last["sessions"]) == 1
+    assert "hears nobody" in operated.last["reason"]
+
+
+def board(operated):
+    return operated.rig._crew.channels.board
+
+
+def test_the_end_of_the_daemon_stops_a_session_safely(operated):
+    operated.world.countdown = 1200
+    operated.world.then = lambda drive: operated.loop.call_soon_threadsafe(close)
+    closed = []
+
+    def close():
+        closed.append(operated.loop.create_task(operated.service.close("it ends")))
+
+    operated.ask("start", excitation="hold", parameters={"duration_s": 60.0}, repeat=3)
+    operated.loop.run_until_complete(closed[0])
+    (session,) = operated.last["sessions"]
+    assert session["outcome"] == "stopped"
+    assert operated.state is State.IDLE
+    assert not operated.rig.connected
+    assert operated.world.drives[0].safe
+    assert "shut down" in str(operated.ask("reset"))
+
+
+def test_status_tells_of_progress_processes_and_topics(operated):
+    seen = []
+
+    def look(drive):
+        operated.service.look()
+        seen.append(operated.service.status())
+
+    operated.service.look()  # from now on it sees the samples
+    operated.world.countdown, operated.world.then = 1200, look
+    operated.ask("start", **SHORT)
+    (status,) = seen
+    assert status["state"] == "running"
+    assert status["progress"]["phase"] == "running"
+    assert 0 < status["progress"]["tick"] < status["progress"]["total"] == 300
+    signals, health = status["rig"]["signals"], status["rig"]["health"]
+    assert signals["rate_hz"] == 1000.0
+    assert signals["peak_torque_command_nm"] >= abs(status["rig"]["torque_command_nm"])
+    assert (health["missed"], health["lost"], health["bus_load_percent"]) == (0, 0, None)
+    assert health["sensor_status"] == 0
+    protocol.json.dumps(status, allow_nan=False)
+    assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
+        "control": "at work", "recorder": "at work", "supervisor": "at work",
+    }  # fmt: skip
+    assert [t["name"] for t in status["rig"]["topics"]][-1] == "/rig/sample"
+    assert [(h["from"], h["to"]) for h in status["history"]] == [
+        ("idle", "ready"), ("ready", "running"),
+    ]  # fmt: skip
+    assert any(event["event"] == "progress" for event in operated.events)
+
+
+def test_a_refused_start_leaves_the_last_series_as_it_was(operated):
+    assert operated.service.status()["series"] is None
+    assert isinstance(operated.ask("start", **TOO_FAR), CommandError)
+    assert operated.service.status()["series"] is None
+    operated.ask("start", **SHORT, repeat=2)
+    last = operated.service.status()["series"]
+    assert len(last["sessions"]) == 2
+    assert isinstance(operated.ask("start", **TOO_FAR), CommandError)
+    assert operated.service.status()["series"] == last
+
+
+TOO_FAR = {"excitation": "chirp", "parameters": {"amplitude_rad": 9.0}}
+
+
+def test_the_log_tells_of_refusals_and_results(operated, caplog):
+    caplog.set_level("INFO", "rigd.serve")
+    operated.ask("start", **TOO_FAR)
+    operated.ask("reset")
+    operated.ask("tare", peer=OTHER)
+    operated.ask("start", **SHORT)
+    told = [record.getMessage() for record in caplog.records]
+    refused = [line for line in told if ": refused: " in line]
+    assert [line.partition(":")[0] for line in refused] == ["start", "reset", "tare"]
+    assert "amplitude_rad = 9" in refused[0]
+    assert "is controlled by" in refused[2]
+    (result,) = [line for line in told if "scheduled" in line]
+    path = operated.last["sessions"][0]["path"]
+    assert result == (
+        f"series 2: session 1 of 1: {path}, complete: 300 ticks scheduled, 300 recorded, 0 missed, "
+        "0 late, 0 lost, 0 stale angles, 0 stale wrenches, 0 not shown live"
+    )
+
+
+def test_the_log_tells_of_warnings(operated, caplog):
+    caplog.set_level("INFO", "rigd.serve")
+
+    def doubt(drive):
+        drive.health = lambda: LineHealth(doubt="Angles are old.")
+
+    operated.world.countdown, operated.world.then = 1200, doubt
+    operated.ask("start", **SHORT)
+    (told,) = [r for r in caplog.records if r.getMessage() == "series 1: Angles are old."]
+    assert told.levelname == "WARNING"
+
+
+def test_a_reset_that_fails_does_not_lose_what_was_to_be_reset(operated, caplog):
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    first = operated.service.status()["reason"]
+    operated.world.absent = True
+    for _ in range(2):  # not longer each time
+        assert str(operated.ask("reset")) == "The drive does not answer."
+        assert operated.service.status()["reason"] == (
+            f"The drive does not answer. Not reset: {first}"
+        )
+    operated.world.absent = False
+    operated.ask("reset")
+    operated.world.countdown, operated.world.then = 1200, fail
+    operated.ask("start", **SHORT)
+    assert operated.service.status()["reason"] == first

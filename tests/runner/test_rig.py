@@ -1,0 +1,157 @@
+"""A rig in its own processes, without the command line: connected once, and then used."""
+
+import gc
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from processes import children
+
+from rigd.engine.shared_state import Phase
+from rigd.excitation import hold
+from rigd.profile import load_profile
+from rigd.runner.request import Order
+from rigd.runner.rig import Rig, RigError
+from rigd.runtime.signals import StopRequest
+from rigd.session import read_session
+
+
+@pytest.fixture
+def profile():
+    return load_profile("sim")
+
+
+@pytest.fixture
+def rig(profile):
+    rig = Rig(profile, fast=True)
+    rig.connect()
+    yield rig
+    rig.disconnect()
+
+
+@pytest.fixture
+def run(profile, tmp_path):
+    """Run a short session."""
+    number = iter(range(100))
+
+    def run(rig, *, stop=None, watcher=lambda *_: None, duration_s=1.0):
+        excitation = hold(
+            rate_hz=profile.rig.rate_hz, duration_s=duration_s, rest_s=0.2, ring_down_s=0.0
+        )
+        order = Order(profile, excitation, tmp_path / f"{next(number)}.mcap")
+        return rig.run(order, stop or StopRequest(), watcher)
+
+    return run
+
+
+def descriptors() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+def test_nothing_is_left_of_a_rig(profile, run):
+    gc.collect()  # of other tests: it would close what counts here
+    before = set(children(os.getpid())), descriptors()
+    rig = Rig(profile, fast=True)
+    assert rig.status() is None
+    rig.connect()
+    assert run(rig).went_well
+    assert run(rig).went_well
+    rig.disconnect()
+    rig.disconnect()
+    assert rig.status() is None
+    assert set(children(os.getpid())) <= before[0]
+    assert descriptors() <= before[1]
+
+
+def test_status_tells_of_every_process_and_topic(rig, run):
+    first = rig.status()
+    assert first.phase is Phase.OFF
+    assert first.torque_command_nm == 0.0
+    assert {p.name: p.state for p in first.processes} == {
+        "control": "at work", "recorder": "waiting", "supervisor": "at work",
+    }  # fmt: skip
+    result = run(rig)
+    second = rig.status()
+    written = {topic.name: topic.written for topic in second.topics}
+    assert written["/rig/sample"] == result.recorded == 1200
+    assert written["/rig/control"] == 120
+    assert written["/rig/timing"] == 0  # under the virtual clock
+    assert {topic.name: topic.expected_hz for topic in second.topics} == {
+        "/rig/event": None, "/rig/control": 100.0, "/rig/timing": 1000.0, "/rig/sample": 1000.0,
+    }  # fmt: skip
+    assert all(topic.waiting == 0 for topic in second.topics)
+    assert (second.tick, second.missed, second.lost) == (1200, 0, 0)
+
+
+def test_tare_and_zero_between_sessions(rig, run):
+    run(rig)
+    tare = rig.tare()
+    assert set(tare) == {"mean", "std", "torque_std_nm"}
+    assert abs(rig.zero()["moved_rad"]) < 1e-2
+    assert rig.status().angle_rad == 0.0
+    assert run(rig).went_well
+
+
+def test_a_zero_is_lost_with_its_connection_and_has_to_be_set_again(rig, run):
+    rig.zero()
+    rig.disconnect()
+    with pytest.raises(RigError, match="not connected"):
+        run(rig)
+    rig.connect()
+    with pytest.raises(RigError, match="rigd zero"):
+        run(rig)
+    rig.zero()
+    assert run(rig).went_well
+
+
+def test_a_control_process_that_dies_between_sessions_is_noticed(rig):
+    rig.watch()
+    (control,) = (p for p in rig.status().processes if p.name == "control")
+    os.kill(control.pid, signal.SIGKILL)
+    deadline = time.monotonic() + 10.0
+    with pytest.raises(RigError, match="killed by signal 9"):
+        while time.monotonic() < deadline:
+            rig.watch()
+            time.sleep(0.01)
+    assert not rig.connected
+
+
+def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
+    stop = StopRequest()
+
+    def watcher(progress, events):
+        if progress.phase is Phase.RUNNING:
+            stop.request()
+
+    stopped = run(rig, stop=stop, watcher=watcher, duration_s=100.0)
+    assert stopped.outcome == "stopped"
+    assert stopped.scheduled == stopped.recorded + stopped.missed + stopped.lost < 100_200
+    after = run(rig)
+    assert after.went_well
+    assert read_session(after.path).samples["tick"].tolist() == list(range(1200))
+
+
+def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_path):
+    def watcher(progress, events):
+        if progress.phase is Phase.RUNNING:
+            (recorder,) = (p for p in rig.status().processes if p.name == "recorder")
+            if recorder.state != "ended":
+                os.kill(recorder.pid, signal.SIGKILL)
+
+    from rigd.runner.session import SessionFailedError
+
+    with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
+        run(rig, watcher=watcher, duration_s=100.0)
+    told = caught.value.result()
+    assert (told.outcome, told.fault, told.path) == ("fault", True, None)
+    assert told.part == tmp_path / "0.mcap.part"
+    assert 0 < told.scheduled < 100_200
+    assert told.as_dict()["recorded"] is None
+    (tmp_path / "0.mcap").touch()  # made whole by a recorder that was only slow, or another's
+    assert caught.value.result().path is None
+    told.part.unlink()
+    assert caught.value.result().path == tmp_path / "0.mcap"
+    assert rig.status().phase is Phase.OFF
+    assert run(rig).went_well

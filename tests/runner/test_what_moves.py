@@ -1,0 +1,93 @@
+"""What will move is said before it does, and a simulation out of reach is not taken for absent."""
+
+import os
+import socket
+from contextlib import contextmanager
+
+import pytest
+
+from rigd.devices.registry import Reality, what_moves
+from rigd.devices.simulator import unreachable_simulators
+from rigd.runner.planning import RefusedError
+from rigd.runner.request import load_rig
+
+
+@pytest.fixture
+def profile(write_profile):
+    """Of a name that nobody else on this computer simulates."""
+    return write_profile("antenna_can", {"name": f'"out_of_reach_{os.getpid()}"'})
+
+
+@contextmanager
+def listening(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen(1)
+        yield path
+
+
+def test_hardware_is_named_as_loudly_as_its_simulation(profile, runtime_folder):
+    loaded, moving = load_rig(profile)
+    assert moving is Reality.HARDWARE
+    assert what_moves(loaded.rig, moving).startswith(f"HARDWARE: {loaded.name} moves the drive on ")
+    assert "node" in what_moves(loaded.rig, moving)
+    assert what_moves(loaded.rig, Reality.LOCK_STEP).startswith("No hardware: ")
+
+
+def test_a_simulated_rig_of_another_environment_keeps_the_hardware_from_moving(
+    profile, start_simulator, runtime_folder, monkeypatch, tmp_path
+):
+    """As with sudo, cron or ssh, which have another runtime folder or none."""
+    process = start_simulator(profile)
+    assert load_rig(profile)[1] is Reality.SIMULATOR
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with pytest.raises(RefusedError, match=rf"XDG_RUNTIME_DIR={runtime_folder} .*--hardware"):
+        load_rig(profile)
+    assert load_rig(profile, hardware=True)[1] is Reality.HARDWARE
+    process.terminate()
+    process.wait()
+    assert load_rig(profile)[1] is Reality.HARDWARE
+
+
+def test_neither_does_the_hardware_move_beside_one_of_another_user(profile, runtime_folder):
+    name = profile.stem
+    with listening(runtime_folder / "elsewhere" / f"{name}.control") as path:
+        if os.getuid():
+            pytest.skip("only root can give a socket away")
+        os.chown(path, 12345, 12345)
+        assert unreachable_simulators(name) == [path]
+        with pytest.raises(RefusedError, match=r"by user 12345 .*--hardware"):
+            load_rig(profile)
+    assert unreachable_simulators(name) == []
+
+
+def test_a_socket_of_any_name_is_no_traceback_and_does_nothing_to_the_terminal(
+    profile, runtime_folder
+):
+    """Every user may make one, and the kernel lists its name as it is, line breaks included."""
+    for name in ("a\n1: 2 3 xyz 5 6 7 /8", "b\n1 2 3 xyz 5 6 7 8", "c\x0b1 2 3 xyz 5 6 7 8"):
+        with listening(runtime_folder / name):
+            assert load_rig(profile)[1] is Reality.HARDWARE
+    with (
+        listening(runtime_folder / "\x1b]0;gone\x07" / f"{profile.stem}.control"),
+        pytest.raises(RefusedError, match="A simulated rig of") as refused,
+    ):
+        load_rig(profile)
+    assert "\x1b" not in str(refused.value)
+
+
+def test_simulated_rigs_of_other_names_and_dead_ones_are_passed_over(profile, runtime_folder):
+    with listening(runtime_folder / "rigd" / f"other_{profile.stem}.control"):
+        assert load_rig(profile)[1] is Reality.HARDWARE
+    with socket.socket(socket.AF_UNIX) as bound:  # nobody listens there
+        bound.bind(str(runtime_folder / "rigd" / f"{profile.stem}.control"))
+        assert load_rig(profile)[1] is Reality.HARDWARE
+
+
+def test_hardware_cannot_be_asked_for_where_something_stands_in(start_simulator, profile):
+    with pytest.raises(RefusedError, match="--hardware: No hardware: sim is simulated"):
+        load_rig("sim", hardware=True)
+    start_simulator(profile)
+    with pytest.raises(RefusedError, match=r"--hardware: .*by the clock"):
+        load_rig(profile, hardware=True)
