@@ -70,7 +70,9 @@ class Note:
 
 def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
     """Return the last line of a session's log: how it ended, at the time of its last sample."""
-    return Note(t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip())
+    return Note(
+        t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
+    )
 
 
 _LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
