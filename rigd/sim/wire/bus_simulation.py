@@ -1,7 +1,5 @@
 """The simulated rig between its lines: nodes, clock and faults, without any input or output.
 
-The simulated rig between its lines: nodes, clock and faults, without any input or output.
-
 Whatever comes in is handed over with the time it came; what the nodes say goes out through two
 callables. So the same world runs behind sockets and in a test.
 """
