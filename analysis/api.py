@@ -13,12 +13,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from analysis.campaigns import Campaign
+    from analysis.identify import RecordAnalysis, Selection, Setting
+    from analysis.models import WelchSettings
+    from analysis.paper.route import WelchAnalysis
     from analysis.record import Record
-    from analysis.selection import Selection
-    from analysis.settings import WelchSettings
     from analysis.welch_aware import WelchAwareFit
-    from analysis.welch_route import WelchAnalysis
-    from analysis.whole_record import RecordAnalysis, Setting
     from rigd.spectral import FrequencyResponse
 
 __all__ = ["campaign", "fit", "frf", "load", "select"]
@@ -69,8 +68,8 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     EstimateError
         The settings do not suit the record, or its angle does not move.
     """
-    from analysis.estimate import estimate
-    from analysis.settings import WelchSettings
+    from analysis.models import WelchSettings
+    from analysis.paper.estimate import estimate
     from analysis.suited import welch_settings
 
     return estimate(record, welch_settings(record, settings or WelchSettings()))[0]
@@ -131,7 +130,7 @@ def fit(
         estimate with the model put through the same estimator.
     fixed : iterable of str
         Not with "welch": settings of beam and rig that stay at the file's values, of
-        `analysis.whole_record.SETTINGS`.
+        `analysis.identify.SETTINGS`.
     weightings : sequence of str, optional
         Not with "record": "const", "omega", "omega^K"; by default the first two, with
         "welch-aware" the second.
@@ -152,7 +151,7 @@ def fit(
     """
     if isinstance(types, str) or isinstance(fixed, str) or isinstance(weightings, str):
         raise ValueError('Give names in a list, if only one: ["VI"] and not "VI".')
-    from analysis.structures import STRUCTURES
+    from analysis.models import STRUCTURES
 
     unknown = [name for name in types or () if name not in STRUCTURES]
     if unknown:
@@ -161,8 +160,8 @@ def fit(
             f"{', '.join(STRUCTURES)}."
         )
     if method == "record":
+        from analysis.identify import Measurement, fit_record
         from analysis.suited import record_band_hz
-        from analysis.whole_record import Measurement, fit_record
 
         return fit_record(
             Measurement.of_record(record),
@@ -171,9 +170,9 @@ def fit(
             band_hz=record_band_hz(record, band_hz),
         )
     if method == "welch":
-        from analysis.settings import PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
+        from analysis.models import PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
+        from analysis.paper.route import analyse
         from analysis.suited import welch_settings
-        from analysis.welch_route import analyse
 
         settings = WelchSettings(
             types=tuple(types or PAPER_TYPES),
@@ -181,7 +180,7 @@ def fit(
         )
         return analyse(record, welch_settings(record, settings, band_hz))
     if method == "welch-aware":
-        from analysis.settings import PAPER_BAND_HZ, WelchSettings
+        from analysis.models import PAPER_BAND_HZ, WelchSettings
         from analysis.welch_aware import fit_record_welch_aware
 
         settings = WelchSettings(
@@ -219,9 +218,9 @@ def select(
     MeasurementError
         The record cannot be used.
     """
-    from analysis.selection import select as select_structure
+    from analysis.identify import Measurement
+    from analysis.identify import select as select_structure
     from analysis.suited import record_band_hz
-    from analysis.whole_record import Measurement
 
     return select_structure(
         Measurement.of_record(record), fixed=fixed, band_hz=record_band_hz(record, band_hz)
@@ -269,7 +268,7 @@ def campaign(
     A script has to call this under ``if __name__ == "__main__":``; a notebook need not.
     """
     from analysis.campaigns import campaign as run
-    from analysis.structures import STRUCTURES
+    from analysis.models import STRUCTURES
 
     return run(
         [Path(path) for path in paths],

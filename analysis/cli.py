@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.campaigns.errors import LoneSessionError
-    from analysis.whole_record import Setting
+    from analysis.identify import Setting
 
 _EXIT_INTERRUPTED: Final = 130
 
@@ -210,7 +210,7 @@ def analyze(
             code = session_command(files, routes, report, json, rerun)
         else:
             from analysis.campaigns.command import campaign_command
-            from analysis.structures import STRUCTURES
+            from analysis.models import STRUCTURES
 
             try:
                 code = campaign_command(
@@ -280,7 +280,7 @@ def _lone_session(
 
 
 def _fixed(text: str) -> tuple[Setting, ...]:
-    from analysis.whole_record import SETTINGS
+    from analysis.identify import SETTINGS
 
     names = [name.strip() for name in text.split(",") if name.strip()]
     unknown = [name for name in names if name not in SETTINGS]

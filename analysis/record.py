@@ -22,8 +22,6 @@ from analysis.record_checks import (
     check_sensor,
     check_span,
     longest_run,
-)
-from analysis.stated_values import (
     stated_beam,
     stated_delay_s,
     stated_rate_hz,

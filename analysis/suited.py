@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.settings import LARGEST_SHARE_OF_RATE, PAPER_BAND_HZ, RECORD_BAND_HZ
+from analysis.models import LARGEST_SHARE_OF_RATE, PAPER_BAND_HZ, RECORD_BAND_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from analysis.models import WelchSettings
+    from analysis.paper.route import WelchAnalysis
     from analysis.record import Record
-    from analysis.settings import WelchSettings
-    from analysis.welch_route import WelchAnalysis
 
 Band = tuple[float, float]
 
@@ -53,7 +53,7 @@ def check_record_band(record: Record, asked_hz: Band | None) -> None:
     SettingsError
         It ends too high.
     """
-    from analysis.estimate import SettingsError
+    from analysis.paper.estimate import SettingsError
 
     limit_hz = LARGEST_SHARE_OF_RATE * record.rate_hz
     if asked_hz is not None and asked_hz[1] > limit_hz:
@@ -125,7 +125,7 @@ def welch_analysis(
         Whether the record is analysed without them, too. Even so, segments or an estimator that
         were chosen for it are not dropped in silence.
     on_step : callable, optional
-        As of `analysis.welch_route.analyse`.
+        As of `analysis.paper.route.analyse`.
 
     Returns
     -------
@@ -138,8 +138,8 @@ def welch_analysis(
     EstimateError
         They were to be run, and cannot be.
     """
-    from analysis.estimate import EstimateError, SettingsError
-    from analysis.welch_route import analyse
+    from analysis.paper.estimate import EstimateError, SettingsError
+    from analysis.paper.route import analyse
 
     optional = optional and settings.are_usual
     reason = against_welch(record, asked_hz) if optional else None

@@ -29,13 +29,9 @@ from analysis.campaigns import campaign
 from analysis.campaigns.local_workers import process_pool
 from analysis.campaigns.session import SessionTask, analyse_session
 from analysis.campaigns.write import write_campaign
-from analysis.fit_frf import fit_many
-from analysis.model import FrequencyResponseModel
-from analysis.settings import WelchSettings
-from analysis.structures import STRUCTURES
-from analysis.unknowns import Unknowns
-from analysis.weights import weights
-from analysis.whole_record import BAND_HZ
+from analysis.identify import BAND_HZ
+from analysis.models import STRUCTURES, FrequencyResponseModel, Unknowns, WelchSettings, weights
+from analysis.paper.fit import fit_many
 
 SESSIONS = 20
 JOBS = 2

@@ -30,7 +30,7 @@ import numpy as np
 from bench_record_fit import LINK, NOISE_NM, PLANTS, wilson
 
 from analysis import fit, load, select
-from analysis.whole_record import Plant, RecordFit
+from analysis.identify import Plant, RecordFit
 from rigd.beam import Damping
 
 SIM = Path(__file__).parent.parent / "hw_profiles" / "sim.toml"

@@ -21,11 +21,11 @@ from bench_welch_aware import PLANTS
 from exact_sessions import BAND_HZ, LINK, RATE_HZ, SWEEP
 from numpy.typing import NDArray
 
-from analysis.fit_frf import fit_frf
-from analysis.structures import STRUCTURES
+from analysis.identify import Plant
+from analysis.identify.predictor import ResponseGrid
+from analysis.models import STRUCTURES
+from analysis.paper.fit import fit_frf
 from analysis.welch_aware import fit_welch_aware
-from analysis.whole_record import Plant
-from analysis.whole_record.response import ResponseGrid
 from rigd.spectral import FrequencyResponse, Segmentation, instrumental_response, welch_response
 
 SAMPLES = 136_000

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.optimize import differential_evolution, least_squares
 from timing import least_s
 
-from analysis.fit_frf import FrfFit, fit_frf, fit_many
-from analysis.structures import STRUCTURES, Structure
+from analysis.models import STRUCTURES, Structure
+from analysis.paper.fit import FrfFit, fit_frf, fit_many
 from rigd.beam import Beam, Damping, TransferGrid
 from rigd.session import read_session
 from rigd.spectral import FrequencyResponse, welch_response

@@ -70,13 +70,12 @@ from independent_records import (
 )
 
 from analysis.exchange.write_session import write_session
+from analysis.identify import BAND_HZ, Measurement, fit_record, select
+from analysis.models import STRUCTURES
 from analysis.record import Record, load_record
 from analysis.report.document import document
 from analysis.report.html import Subject
 from analysis.report.record_figure_bands import loss_factors
-from analysis.selection import select
-from analysis.structures import STRUCTURES
-from analysis.whole_record import BAND_HZ, Measurement, fit_record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

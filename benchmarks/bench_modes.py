@@ -26,8 +26,8 @@ import numpy as np
 from bench_record_fit import LINK, PLANTS, RATE_HZ, Session
 from numpy.typing import NDArray
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import Measurement, Plant, RecordFit, fit_record
+from analysis.identify import Measurement, Plant, RecordFit, fit_record
+from analysis.models import STRUCTURES
 from rigd.beam import transfer
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile

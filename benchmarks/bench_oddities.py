@@ -18,12 +18,11 @@ import oddities_figures as draw
 from exact_sessions import LINK, Session, session
 from numpy.typing import NDArray
 
-from analysis.fit_frf import fit_many
-from analysis.selection import Selection, select
-from analysis.structures import STRUCTURES
+from analysis.identify import Plant, RecordFit, Selection, fit_record, select
+from analysis.identify.predictor import ResponseGrid
+from analysis.models import STRUCTURES
+from analysis.paper.fit import fit_many
 from analysis.welch_aware import WelchAwareFit
-from analysis.whole_record import Plant, RecordFit, fit_record
-from analysis.whole_record.response import ResponseGrid
 from rigd.beam import Beam, Damping, modes
 from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, segment_count
 

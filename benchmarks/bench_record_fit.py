@@ -24,9 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.descent import descend
-from analysis.structures import STRUCTURES
-from analysis.whole_record import (
+from analysis.identify import (
     SETTINGS,
     Measurement,
     Plant,
@@ -34,11 +32,11 @@ from analysis.whole_record import (
     RecordFit,
     fit_record,
 )
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.free_decay import mode_poles
-from analysis.whole_record.objective import Objective
-from analysis.whole_record.steps import Steps
-from analysis.whole_record.unknowns import Unknowns
+from analysis.identify.free_decay import mode_poles
+from analysis.identify.optimizer import descend
+from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.problem import Comparison, Objective
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, transfer
 
 RATE_HZ = 1000.0

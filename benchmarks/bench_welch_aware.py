@@ -17,10 +17,10 @@ import time
 import numpy as np
 from exact_sessions import LINK, SWEEP, Session, session
 
-from analysis.fit_frf import fit_frf
-from analysis.structures import STRUCTURES
+from analysis.identify import SETTINGS, Plant, fit_record
+from analysis.models import STRUCTURES
+from analysis.paper.fit import fit_frf
 from analysis.welch_aware import WelchAwareFit, fit_welch_aware
-from analysis.whole_record import SETTINGS, Plant, fit_record
 from rigd.beam import Beam, Damping
 from rigd.spectral import Segmentation
 

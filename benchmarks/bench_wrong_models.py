@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from wrong_models import DEFECTS, RIGS, Record
 
-from analysis.selection import Quantity, Selection, select
+from analysis.identify import Quantity, Selection, select
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.structures import STRUCTURES
+from analysis.identify import Measurement, Plant
+from analysis.identify.predictor import ResponseGrid
+from analysis.models import STRUCTURES
 from analysis.welch_aware import WelchAwareFit, fit_welch_aware
-from analysis.whole_record import Measurement, Plant
-from analysis.whole_record.response import ResponseGrid
 from rigd.beam import Beam
 from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, Segmentation, welch_response
 

@@ -9,9 +9,9 @@ import numpy as np
 from exact_sessions import LINK
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from analysis.identify.predictor import ResponseGrid
 from analysis.report import style
 from analysis.report.record_figure_bands import loss_factors
-from analysis.whole_record.response import ResponseGrid
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.whole_record import RecordFit
+    from analysis.identify import RecordFit
     from rigd.spectral import FrequencyResponse
 
     Parameters = dict[tuple[str, str], dict[str, NDArray[np.float64]]]

@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.whole_record import Measurement
+from analysis.identify import Measurement
 from rigd.beam import Beam
 
 Real = NDArray[np.float64]

@@ -26,8 +26,7 @@ from analysis.campaigns.session import (
 from analysis.campaigns.validation import FEWEST, LeftOutError, LostTrial, validate
 from analysis.campaigns.verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns.workers import Lost, available_cores
-from analysis.settings import WelchSettings
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES, WelchSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.campaigns.workers import Workers
-    from analysis.whole_record import Setting
+    from analysis.identify import Setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +107,8 @@ def campaign(
 ) -> Campaign:
     """Analyse a campaign of sessions of one specimen on one rig.
 
-    Every session goes by Welch's method (`analysis.welch_route`), where that suits all of them, and
-    by the whole record (`analysis.selection`); each is then predicted from the others.
+    Every session goes by Welch's method (`analysis.paper.route`), where that suits all of them, and
+    by the whole record (`analysis.identify`); each is then predicted from the others.
 
     Parameters
     ----------

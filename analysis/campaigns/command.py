@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.campaigns.campaign import Campaign
-    from analysis.settings import WelchSettings
-    from analysis.whole_record import Setting
+    from analysis.identify import Setting
+    from analysis.models import WelchSettings
 
 _NAME: Final = "campaign"
 _TEXT_WIDTH: Final = 120

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.campaigns.session import SessionResult
-    from analysis.selection import Finding
+    from analysis.identify import Finding
 
 _FIGURE: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 """A number, but not that of a mode: it tells what is meant and not how much."""

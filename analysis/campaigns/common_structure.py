@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns.pooled import by_structure
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

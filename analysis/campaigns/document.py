@@ -12,7 +12,7 @@ import numpy as np
 import rigd
 from analysis.campaigns.headlines import headlines
 from analysis.campaigns.rows import all_tables
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.campaign import Campaign
     from analysis.campaigns.estimates import RecordEstimate, WelchFit
     from analysis.campaigns.session import SessionResult
-    from analysis.whole_record import ModeEstimate
+    from analysis.identify import ModeEstimate
 
 
 def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Any]:

@@ -33,9 +33,9 @@ class LoneSessionError(CampaignError):
 
 def task_errors() -> tuple[type[Exception], ...]:
     """Errors that concern one session and leave the others as they are."""
-    from analysis.estimate import EstimateError
+    from analysis.identify import MeasurementError
+    from analysis.paper.estimate import EstimateError
     from analysis.record import RecordError
-    from analysis.whole_record import MeasurementError
     from rigd.session import SessionError
 
     return SessionError, RecordError, EstimateError, MeasurementError

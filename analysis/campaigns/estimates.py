@@ -11,10 +11,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.indices import Indices
-    from analysis.selection import Candidate
-    from analysis.welch_route import FittedModel
-    from analysis.whole_record import ModeEstimate, Plant
+    from analysis.identify import Candidate, ModeEstimate, Plant
+    from analysis.paper.route import FittedModel, Indices
     from rigd.beam import Damping
 
 
@@ -34,7 +32,7 @@ class WelchFit:
     at_bounds : tuple of str
         Free parameters that rest on the edge of the range searched.
     std : dict or None
-        See `analysis.fit_frf.FrfFit`.
+        See `analysis.paper.fit.FrfFit`.
     indices : Indices or None
         Distance of this fit from the session's own response.
     """
@@ -78,7 +76,7 @@ class RecordEstimate:
         What follows the structure in its name: nothing on a uniform beam without more.
     plant : Plant
     parameters : dict of str to float
-        See `analysis.whole_record.RecordFit`, as for the following.
+        See `analysis.identify.RecordFit`, as for the following.
     std : dict of str to (float or None)
     determined : tuple of str
     covariance : ndarray, shape (k, k)

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.campaigns.random_effects import t_quantile
-from analysis.selection import Quantity, Size, headline_json
-from analysis.selection.headline import Mode, Numbers, Simpler
-from analysis.selection.orders import STRONG
-from analysis.structures import COEFFICIENT_OF, PARAMETERS, STRUCTURES
+from analysis.identify import Quantity, Size, headline_json
+from analysis.identify.headline import Mode, Numbers, Simpler
+from analysis.identify.verdict import STRONG
+from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.ranking import RankedStructure
     from analysis.campaigns.verdict import CampaignVerdict
-    from analysis.selection.headline import StructureStatus
+    from analysis.identify.headline import StructureStatus
 
 _UNEXPLAINED: Final = "part of the records is unexplained"
 _MIXTURE: Final = "the mean of a mixture: sessions differ in it in kind"

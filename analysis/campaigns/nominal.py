@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.parameter_statistics import fits_by_model
-from analysis.indices import fit_indices, peak_deviation, resonant_peaks
-from analysis.model import FrequencyResponseModel
-from analysis.structures import PARAMETERS, STRUCTURES
+from analysis.models import PARAMETERS, STRUCTURES, FrequencyResponseModel
+from analysis.paper.route import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -24,8 +23,8 @@ if TYPE_CHECKING:
 
     from analysis.campaigns.estimates import WelchFit
     from analysis.campaigns.session import SessionResult
-    from analysis.indices import Indices, Peak
-    from analysis.structures import Parameter
+    from analysis.models import Parameter
+    from analysis.paper.route import Indices, Peak
     from rigd.beam import Beam, Damping
 
 

@@ -12,9 +12,9 @@ from analysis.campaigns.labels import label, probability, with_unit
 from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
 from analysis.campaigns.tables import NOT_POOLED, role, used
 from analysis.campaigns.validation import by_model
+from analysis.models import STRUCTURES
 from analysis.report.html.reported import footnotes, greyed, marked, unreported
 from analysis.report.html.table import Column, Table, count, estimate, number
-from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Collection

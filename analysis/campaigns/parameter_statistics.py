@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,9 +9,9 @@ import numpy as np
 from analysis.campaigns.labels import label, probability, with_unit
 from analysis.campaigns.specimen_sentences import MIXTURE_MARK, title
 from analysis.campaigns.tables import used
+from analysis.models import STRUCTURES
 from analysis.report import style
 from analysis.report.html.reported import MARK, unreported
-from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,18 +8,17 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.common_structure import freest_estimate
 from analysis.campaigns.random_effects import t_quantile
-from analysis.selection.orders import STRONG
-from analysis.selection.profile import WIDEST_SHARE
-from analysis.structures import STRUCTURES
-from analysis.unknowns import ORDER_RANGE
+from analysis.identify.profile_likelihood import WIDEST_SHARE
+from analysis.identify.verdict import STRONG
+from analysis.models import ORDER_RANGE, STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from analysis.campaigns.homogeneity import Homogeneity
     from analysis.campaigns.pooled import PooledEstimate, PooledParameter
-    from analysis.selection import Verdict
-    from analysis.selection.profile import Order
+    from analysis.identify import Verdict
+    from analysis.identify.profile_likelihood import Order
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 

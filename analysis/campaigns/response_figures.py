@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.campaigns.nominal import best_models
+from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import style
 from analysis.report.frf_figure import line_styles
-from analysis.settings import ESTIMATOR_WORDS
-from analysis.structures import STRUCTURES
 from rigd.view.frequency_charts import magnitude_db, phase_deg
 
 if TYPE_CHECKING:

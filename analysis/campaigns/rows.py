@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from analysis.campaigns import paper
 from analysis.campaigns.nominal import best_models
 from analysis.campaigns.session_list import session_list_rows
+from analysis.models import STRUCTURES
 from analysis.report.html.reported import unreported
-from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.labels import label
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled_modes import PooledMode
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.validation import LeftOutError, LostTrial
-    from analysis.selection.profile import Order
+    from analysis.identify.profile_likelihood import Order
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")

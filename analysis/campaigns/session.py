@@ -11,8 +11,8 @@ import numpy as np
 from analysis.campaigns.errors import task_errors
 from analysis.campaigns.estimates import RecordEstimate, WelchFit
 from analysis.campaigns.experiment import Experiment
-from analysis.indices import Indices, fit_indices
-from analysis.settings import RECORD_BAND_HZ, WelchSettings
+from analysis.models import RECORD_BAND_HZ, WelchSettings
+from analysis.paper.route import Indices, fit_indices
 from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.indices import Peak
+    from analysis.identify import Candidate, Setting, Verdict
+    from analysis.paper.route import Peak
     from analysis.record import Record
-    from analysis.selection import Candidate, Verdict
-    from analysis.whole_record import Setting
     from rigd.beam import Beam
 
 
@@ -201,11 +200,10 @@ def _whole_record(
     record: Record, task: SessionTask, measured: FrequencyResponse
 ) -> tuple[tuple[RecordEstimate, ...], Verdict, dict[str, Any]]:
     """Select a structure on the whole record; of all fits, keep it and those asked for."""
-    from analysis.selection import headline_json, select
-    from analysis.structures import STRUCTURES
+    from analysis.identify import Measurement, headline_json, select
+    from analysis.identify.predictor import ResponseGrid
+    from analysis.models import STRUCTURES
     from analysis.suited import record_band_hz
-    from analysis.whole_record import Measurement
-    from analysis.whole_record.response import ResponseGrid
 
     measurement = Measurement.of_record(record)
     band_hz = record_band_hz(record, task.band_hz)

@@ -16,9 +16,9 @@ from analysis.campaigns.session_list import session_list_text
 from analysis.campaigns.specimen_sentences import MIXTURE_MARK, MIXTURE_NOTE, title
 from analysis.campaigns.text_table import text_table
 from analysis.campaigns.validation import by_model
+from analysis.models import STRUCTURES
 from analysis.report.html.reported import MARK, footnotes, unreported
 from analysis.report.tables import with_spread
-from analysis.structures import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Collection

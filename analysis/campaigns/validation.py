@@ -11,7 +11,7 @@ from analysis.campaigns.errors import CampaignError, task_errors
 from analysis.campaigns.nominal import mean_damping
 from analysis.campaigns.pooled import pooled_estimates
 from analysis.campaigns.workers import Lost
-from analysis.whole_record import Measurement, Plant
+from analysis.identify import Measurement, Plant
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -125,9 +125,9 @@ def left_out_errors(
 
     A session that the whole-record estimator cannot use is told, not raised: it is one of many.
     """
+    from analysis.identify.problem import Comparison
     from analysis.record import load_record
     from analysis.suited import record_band_hz
-    from analysis.whole_record.comparison import Comparison
 
     try:
         record = load_record(path)

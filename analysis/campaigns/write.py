@@ -123,9 +123,9 @@ def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
 
 def _signals(campaign: Campaign) -> Figure:
     """Draw the first session's signals as an example, as the paper does."""
+    from analysis.paper.route import analyse
     from analysis.record import load_record
     from analysis.report.signals_figure import signals_figure
-    from analysis.welch_route import analyse
 
     record = load_record(campaign.sessions[0].path)
     return signals_figure(analyse(record, replace(campaign.settings, types=())))

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from analysis.identify import Setting
+    from analysis.models import WelchSettings
+    from analysis.paper.route import WelchAnalysis
     from analysis.record import Record
     from analysis.report.html import Subject
-    from analysis.settings import WelchSettings
-    from analysis.welch_route import WelchAnalysis
-    from analysis.whole_record import Setting
 
     _Found = tuple[WelchAnalysis | None, Subject | None]
 
@@ -142,10 +142,10 @@ def _analyse_all(
     from numpy.linalg import LinAlgError
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from analysis.estimate import EstimateError, SettingsError
+    from analysis.identify import MeasurementError
+    from analysis.paper.estimate import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError
-    from analysis.whole_record import MeasurementError
     from rigd.session import SessionError
 
     found: list[_Found] = []
@@ -210,11 +210,11 @@ def _analyse_file(
     on_step: Callable[[str], None],
     warn: Callable[[str], None],
 ) -> _Found:
+    from analysis.identify import MeasurementError
     from analysis.record import load_record
     from analysis.report.folder import new_folder
     from analysis.report.write import write_report
     from analysis.suited import check_record_band, remarks, welch_analysis
-    from analysis.whole_record import MeasurementError
 
     record = load_record(file)
     record = _with_warnings(record, remarks(record, routes.band_hz))
@@ -254,10 +254,9 @@ def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
 
 
 def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis | None) -> Subject:
+    from analysis.identify import Measurement, select
     from analysis.report.html import Subject
-    from analysis.selection import select
     from analysis.suited import record_band_hz
-    from analysis.whole_record import Measurement
 
     band_hz = record_band_hz(record, routes.band_hz)
     selection = select(Measurement.of_record(record), fixed=routes.fixed, band_hz=band_hz)

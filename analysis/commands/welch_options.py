@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.settings import WelchSettings
+    from analysis.models import WelchSettings
 
 _MAX_NFFT: Final = 2**22
 """Longest transform: 26 times the paper's, still a matter of seconds and of a few 100 MB."""
@@ -60,7 +60,7 @@ def welch_settings(
 
     The band is the default: what suits a record, `analysis.suited` knows.
     """
-    from analysis.settings import WelchSettings
+    from analysis.models import WelchSettings
     from rigd.spectral import Estimator as FrfEstimator
 
     if segment is not None and overlap is not None and overlap >= segment:
@@ -110,7 +110,7 @@ def band_hz(text: str | None) -> tuple[float, float] | None:
 
 
 def _types(text: str) -> tuple[str, ...]:
-    from analysis.structures import STRUCTURES
+    from analysis.models import STRUCTURES
 
     names = _listed(text.upper())
     unknown = [name for name in names if name not in STRUCTURES]
@@ -124,7 +124,7 @@ def _types(text: str) -> tuple[str, ...]:
 
 
 def _weightings(text: str) -> tuple[str, ...]:
-    from analysis.weights import WeightingError, weighting_name
+    from analysis.models import WeightingError, weighting_name
 
     try:
         names = tuple(weighting_name(name) for name in _listed(text))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
     from analysis.exchange.table import Table
-    from analysis.settings import WelchSettings
+    from analysis.models import WelchSettings
 
 _UNIVERSAL: Final = (".uff", ".unv", ".uf58")
 SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL)

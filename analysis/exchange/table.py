@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 import rigd
-from analysis.estimate import estimate
 from analysis.exchange.errors import ExchangeError
+from analysis.paper.estimate import estimate
 from analysis.record import load_record
 from analysis.suited import welch_settings
 from rigd.session import read_session
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.settings import WelchSettings
+    from analysis.models import WelchSettings
 
 _UNITS: Final = {"_rad": "rad", "_nm": "N.m", "_n": "N"}
 """Suffix of a field → its unit as it is written into files, in ASCII."""
@@ -122,7 +122,7 @@ def frf_table(
 
     Raises
     ------
-    rigd.session.SessionError, analysis.record.RecordError, analysis.estimate.EstimateError
+    rigd.session.SessionError, analysis.record.RecordError, analysis.paper.estimate.EstimateError
         As the analysis raises them.
     """
     record = load_record(path)

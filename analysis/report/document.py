@@ -17,9 +17,9 @@ from analysis.report.record_indices import whole_record_indices
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from analysis.paper.route import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report.html import Subject
-    from analysis.welch_route import FittedModel, WelchAnalysis
 
 
 def document(

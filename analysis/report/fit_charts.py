@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rerun import RecordingStream
 
-    from analysis.welch_route import FittedModel, WelchAnalysis
+    from analysis.paper.route import FittedModel, WelchAnalysis
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]

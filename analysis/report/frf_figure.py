@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from analysis.models import ESTIMATOR_WORDS
 from analysis.report import style
-from analysis.settings import ESTIMATOR_WORDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.welch_route import FittedModel, WelchAnalysis
+    from analysis.paper.route import FittedModel, WelchAnalysis
 
 _COLUMNS: Final = 500
 _LEGEND_COLUMNS: Final = 4

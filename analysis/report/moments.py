@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from analysis.paper.route import loudest_moment_s
 from analysis.report import style
-from analysis.time_response import loudest_moment_s
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:

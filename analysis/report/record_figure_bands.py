@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.whole_record.plant import LOGARITHMIC
-from analysis.whole_record.response import ResponseGrid
+from analysis.identify.predictor import LOGARITHMIC, ResponseGrid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.whole_record import Plant, RecordFit
+    from analysis.identify import Plant, RecordFit
 
     Real = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from analysis.identify import ModeEstimate, RecordFit
     from analysis.report.record_figure_bands import ResponseBand
-    from analysis.whole_record import ModeEstimate, RecordFit
     from rigd.spectral import FrequencyResponse
 
 _BAND: Final = "#8CC4E8"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.whole_record import RecordFit
+    from analysis.identify import RecordFit
 
 _POINTS: Final = 400
 _LOOKS: Final = {

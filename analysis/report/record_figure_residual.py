@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.whole_record import RecordAnalysis, RecordFit
+    from analysis.identify import RecordAnalysis, RecordFit
 
 _KOLMOGOROV_95: Final = 1.358
 """95 % quantile of Kolmogorov's distribution: the bounds' half-width is that over √bins."""

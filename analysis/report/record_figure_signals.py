@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.identify import Measurement
+from analysis.identify.predictor import Prediction
+from analysis.paper.route import band_limited
 from analysis.report import style
 from analysis.report.moments import enlarge, mark, resonance_moments
-from analysis.time_response import band_limited
-from analysis.whole_record import Measurement
-from analysis.whole_record.prediction import Prediction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from analysis.identify import Plant, RecordFit
     from analysis.record import Record
-    from analysis.whole_record import Plant, RecordFit
 
 
 @dataclass(frozen=True, slots=True)

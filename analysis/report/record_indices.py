@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.indices import fit_indices
-from analysis.model import FrequencyResponseModel
-from analysis.whole_record.response import ResponseGrid
+from analysis.identify.predictor import ResponseGrid
+from analysis.models import FrequencyResponseModel
+from analysis.paper.route import fit_indices
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.welch_route import WelchAnalysis
-    from analysis.whole_record import RecordFit
+    from analysis.identify import RecordFit
+    from analysis.paper.route import WelchAnalysis
     from rigd.spectral import FrequencyResponse
 
     IndexValues = dict[str, float | None]

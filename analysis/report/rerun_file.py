@@ -11,7 +11,7 @@ from rigd.view.recorded import RrdFileError, check_new, new_rrd_file
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from analysis.welch_route import WelchAnalysis
+    from analysis.paper.route import WelchAnalysis
 
 
 def check_rerun_file(path: Path) -> None:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 if TYPE_CHECKING:
+    from analysis.identify import RecordAnalysis
     from analysis.record import Record
     from analysis.report.html.subject import Subject
-    from analysis.whole_record import RecordAnalysis
 
     Band = tuple[float, float]
 

@@ -11,16 +11,15 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from analysis.paper.route import LARGEST_SHIFT
 from analysis.report.html.reported import MARK, footnotes, unreported
-from analysis.welch_route import LARGEST_SHIFT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
     from rich.console import RenderableType
 
-    from analysis.indices import Peak
-    from analysis.welch_route import FittedModel, WelchAnalysis
+    from analysis.paper.route import FittedModel, Peak, WelchAnalysis
     from rigd.beam import Mode
 
 _COLUMNS: Final = (("zeta", "ζ (1e-5)", 1e5), ("alpha", "α", 1.0), ("gamma", "γ (1e-2)", 1e2),

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
+    from analysis.paper.route import WelchAnalysis
     from analysis.report.html import Subject
-    from analysis.welch_route import WelchAnalysis
 
 _FIGURES: Final = ("signals", "frf", "torque")
 _FIGURES_BESIDE_RECORD: Final = ("frf",)

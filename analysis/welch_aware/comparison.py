@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.weights import weights
+from analysis.identify.data import Decimation
+from analysis.identify.predictor import Prediction
+from analysis.models import weights
 from analysis.welch_aware.estimator import WelchAwareError, WelchEstimator, bins_of
-from analysis.whole_record.decimation import Decimation
-from analysis.whole_record.prediction import Prediction
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import segment_count
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.weights import Weighting
-    from analysis.whole_record import Plant
+    from analysis.identify import Plant
+    from analysis.models import Weighting
     from rigd.beam import Beam
     from rigd.spectral import Segmentation
 

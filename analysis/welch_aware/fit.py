@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.descent import Box, descend
-from analysis.structures import STRUCTURES
-from analysis.weights import Weighting, weighting_name, weights
+from analysis.identify import SETTINGS, Plant
+from analysis.identify.optimizer import Box, descend
+from analysis.identify.parametrization import Unknowns
+from analysis.models import STRUCTURES, Weighting, weighting_name, weights
 from analysis.welch_aware.comparison import Measured
 from analysis.welch_aware.estimator import WelchAwareError
 from analysis.welch_aware.objective import Objective
 from analysis.welch_aware.starting import PlainResponse, starting_points
 from analysis.welch_aware.summary import summary
-from analysis.whole_record import SETTINGS, Plant
-from analysis.whole_record.unknowns import Unknowns
 from rigd.beam import Damping
 
 if TYPE_CHECKING:
@@ -23,10 +22,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.descent import Minimum
-    from analysis.structures import Structure
+    from analysis.identify import Setting
+    from analysis.identify.optimizer import Minimum
+    from analysis.models import Structure
     from analysis.welch_aware.result import WelchAwareFit
-    from analysis.whole_record import Setting
     from rigd.beam import Beam
     from rigd.spectral import Segmentation
 
@@ -60,7 +59,7 @@ def fit_welch_aware(
     exact model predicts for the angle is divided, windowed and averaged as the measured one was,
     and Eq. (26) compares the two estimates. The windows' effect is then the same on both sides.
 
-    Where the torque itself is at hand, `analysis.whole_record.fit_record` is more precise.
+    Where the torque itself is at hand, `analysis.identify.fit_record` is more precise.
 
     Parameters
     ----------
@@ -79,9 +78,9 @@ def fit_welch_aware(
         Nominal: where the search for density and stiffness starts.
     structures : iterable of Structure
     weighting : str or callable
-        See `analysis.weights.weights`.
+        See `analysis.models.weights`.
     fixed : iterable of str
-        Settings (`analysis.whole_record.SETTINGS`) that stay at the nominal values.
+        Settings (`analysis.identify.SETTINGS`) that stay at the nominal values.
     delay_s : float
         By how much the torque in the estimate is older than the angle, nominally.
     tool_inertia_kg_m2 : float
@@ -117,11 +116,11 @@ def fit_welch_aware(
     fit to the response itself makes of it:
 
     >>> import numpy as np
-    >>> from analysis.fit_frf import fit_frf
-    >>> from analysis.structures import STRUCTURES
+    >>> from analysis.paper.fit import fit_frf
+    >>> from analysis.models import STRUCTURES
     >>> from analysis.welch_aware import fit_welch_aware
-    >>> from analysis.whole_record import Plant
-    >>> from analysis.whole_record.prediction import Prediction
+    >>> from analysis.identify import Plant
+    >>> from analysis.identify.predictor import Prediction
     >>> from rigd.beam import Beam, Damping
     >>> from rigd.spectral import Segmentation, welch_response
     >>> rate_hz, time_s = 125.0, np.arange(7500) / 125.0

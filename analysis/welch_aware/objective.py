@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.descent import NormalEquations
-from analysis.recent import Recent
+from analysis.identify.optimizer import NormalEquations, Recent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.identify.parametrization import Unknowns
     from analysis.welch_aware.comparison import Comparison
-    from analysis.whole_record.unknowns import Unknowns
 
     _Linearised = tuple[NDArray[np.complex128], NDArray[np.complex128]]
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from analysis.estimate import SettingsError, estimate, moving_reference_rad
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
+from analysis.paper.estimate import SettingsError, estimate, moving_reference_rad
 from analysis.welch_aware.fit import fit_welch_aware
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from analysis.identify import Setting
+    from analysis.models import WelchSettings
     from analysis.record import Record
-    from analysis.settings import WelchSettings
     from analysis.welch_aware.result import WelchAwareFit
-    from analysis.whole_record import Setting
 
 
 def fit_record_welch_aware(

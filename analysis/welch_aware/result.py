@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.structures import Structure
-    from analysis.whole_record import DampingSize, ModeEstimate, Plant
+    from analysis.identify import DampingSize, ModeEstimate, Plant
+    from analysis.models import Structure
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.descent import Box, Minimum, NormalEquations, descend
-from analysis.starts import starts
-from analysis.thinning import thinned
-from analysis.whole_record.resonance_shift import resonance_shift
-from analysis.whole_record.response import ResponseGrid
+from analysis.identify.optimizer import Box, Minimum, NormalEquations, descend
+from analysis.identify.predictor import ResponseGrid
+from analysis.identify.search import resonance_shift
+from analysis.paper.fit import starts, thinned
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.whole_record.plant import Plant
-    from analysis.whole_record.unknowns import Unknowns
+    from analysis.identify.parametrization import Unknowns
+    from analysis.identify.predictor import Plant
 
 _POINTS: Final = 400
 _TOLERANCE: Final = 1e-2

@@ -6,18 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.identify.free_decay import Pole, mode_poles
+from analysis.identify.uncertainty import mode_table, parameter_uncertainty
 from analysis.welch_aware.result import WelchAwareFit
 from analysis.welch_aware.uncertainty import covariance_of_unknowns
-from analysis.whole_record.free_decay import Pole, mode_poles
-from analysis.whole_record.parameter_uncertainty import parameter_uncertainty
-from analysis.whole_record.uncertainty import mode_table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from analysis.identify import ModeEstimate
     from analysis.welch_aware.comparison import Comparison
     from analysis.welch_aware.objective import Objective
-    from analysis.whole_record import ModeEstimate
 
 
 def summary(

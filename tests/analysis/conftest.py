@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import read_session
 from rigd.spectral import FrequencyResponse, welch_response

@@ -9,10 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from analysis.fit_frf import FitError, fit_frf, fit_many
-from analysis.model import FrequencyResponseModel
-from analysis.structures import STRUCTURES
-from analysis.weights import WeightingError, weights
+from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
+from analysis.paper.fit import FitError, fit_frf, fit_many
 from rigd.beam import TransferGrid
 
 WEIGHTINGS = ("const", "omega")

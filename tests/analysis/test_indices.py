@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.indices import Peak, fit_indices, peak_deviation, resonant_peaks
-from analysis.model import FrequencyResponseModel
+from analysis.models import FrequencyResponseModel
+from analysis.paper.route import Peak, fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import Damping
 
 

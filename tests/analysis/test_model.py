@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from analysis.model import FrequencyResponseModel
+from analysis.models import FrequencyResponseModel
 from rigd.beam import transfer, transfer_and_gradient
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from analysis.starts import starts
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
+from analysis.paper.fit import starts
 
 
 def test_one_valley_one_start():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.structures import PARAMETERS, STRUCTURES
+from analysis.models import PARAMETERS, STRUCTURES
 from rigd.beam import Damping
 
 TABLE_2 = {

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.model import FrequencyResponseModel
-from analysis.thinning import thinned
-from analysis.weights import weights
+from analysis.models import FrequencyResponseModel, weights
+from analysis.paper.fit import thinned
 
 
 @given(n=st.integers(3, 900), count=st.integers(2, 900), seed=st.integers(0, 2**32 - 1))

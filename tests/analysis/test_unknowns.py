@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.structures import STRUCTURES
-from analysis.unknowns import Unknowns
+from analysis.models import STRUCTURES, Unknowns
 from rigd.beam import undamped_frequencies_rad_s
 
 

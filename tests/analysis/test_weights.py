@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.weights import WeightingError, weighting_name, weights
+from analysis.models import WeightingError, weighting_name, weights
 
 OMEGA = 2 * np.pi * np.arange(94, 8001) / 160
 

@@ -10,11 +10,10 @@ import pytest
 
 import analysis
 from analysis import api
-from analysis.estimate import estimate
+from analysis.identify import Measurement, fit_record
+from analysis.models import STRUCTURES, WelchSettings
+from analysis.paper.estimate import estimate
 from analysis.record import RecordError, load_record
-from analysis.settings import WelchSettings
-from analysis.structures import STRUCTURES
-from analysis.whole_record import Measurement, fit_record
 from rigd.session import SessionError
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "python_api.md").read_text(encoding="utf-8")

@@ -13,8 +13,8 @@ from independent_records import (
     exact,
 )
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import Measurement, fit_record
+from analysis.identify import Measurement, fit_record
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, modes, transfer
 
 LINK = Beam(LENGTH_M, DENSITY_KG_PER_M, STIFFNESS_N_M2)

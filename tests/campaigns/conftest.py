@@ -9,10 +9,9 @@ import pytest
 from analysis.campaigns.estimates import RecordEstimate, WelchFit
 from analysis.campaigns.experiment import Experiment
 from analysis.campaigns.session import SessionResult
-from analysis.indices import Indices, Peak
-from analysis.settings import WelchSettings
-from analysis.structures import STRUCTURES
-from analysis.whole_record import ModeEstimate, Plant
+from analysis.identify import ModeEstimate, Plant
+from analysis.models import STRUCTURES, WelchSettings
+from analysis.paper.route import Indices, Peak
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionWriter
 from rigd.session.format import SAMPLE_SIZE, pack_sample_into

@@ -15,8 +15,8 @@ from analysis.campaigns.session import SessionTask, analyse_session
 from analysis.campaigns.tables import campaign_tables, tables_text
 from analysis.campaigns.validation import forecasts, left_out_errors
 from analysis.campaigns.write import write_campaign
-from analysis.model import FrequencyResponseModel
-from analysis.whole_record import BAND_HZ, Plant
+from analysis.identify import BAND_HZ, Plant
+from analysis.models import FrequencyResponseModel
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from analysis.campaigns.page import campaign_page
 from analysis.campaigns.tables import tables_text
 from analysis.campaigns.validation import LostTrial, left_out_errors, validate
 from analysis.campaigns.validation_figure import validation_figure
-from analysis.whole_record import BAND_HZ
+from analysis.identify import BAND_HZ
 
 
 def ends_at_one(path, tried, band_hz):

@@ -13,7 +13,7 @@ from analysis.campaigns.homogeneity import Heterogeneity, Homogeneity
 from analysis.campaigns.pooled import pooled
 from analysis.campaigns.pooled_orders import pooled_order
 from analysis.campaigns.verdict import campaign_verdict
-from analysis.selection import Finding
+from analysis.identify import Finding
 
 ALIKE = Homogeneity((), ())
 

@@ -12,7 +12,7 @@ from analysis.campaigns.campaign import _of_one_experiment
 from analysis.campaigns.session import SessionFailure, SessionTask, analyse_session
 from analysis.campaigns.tables import tables_text
 from analysis.campaigns.write import write_campaign
-from analysis.settings import WelchSettings
+from analysis.models import WelchSettings
 
 
 @pytest.fixture(scope="module")

@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 from processes import children, eventually, has_ended, listeners
 
-from analysis.estimate import estimate
+from analysis.models import WelchSettings
+from analysis.paper.estimate import estimate
 from analysis.record import load_record
-from analysis.settings import WelchSettings
 from rigd.session import SessionError, SessionWriter, Status, read_session
 from rigd.session.format import (
     SAMPLE_SIZE,

@@ -7,16 +7,16 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.estimate import estimate
 from analysis.exchange.export import export_frf, export_record
 from analysis.exchange.import_plan import ImportPlan
 from analysis.exchange.import_record import import_record
 from analysis.exchange.mapping import QUANTITIES, parse_choice
 from analysis.exchange.source import read_source
 from analysis.exchange.specimen import Specimen
+from analysis.models import WelchSettings
+from analysis.paper.estimate import estimate
+from analysis.paper.route import analyse
 from analysis.record import load_record
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
 from rigd.beam import Beam
 from rigd.session import read_session
 

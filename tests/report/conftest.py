@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from analysis.models import WelchSettings
+from analysis.paper.route import analyse
 from analysis.record import load_record
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionWriter
 from rigd.session.format import SAMPLE_SIZE, pack_sample_into

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from analysis.models import WelchSettings
+from analysis.paper.route import analyse
 from analysis.record import load_record
 from analysis.report import style
 from analysis.report.frf_figure import frf_figure
 from analysis.report.signals_figure import signals_figure
 from analysis.report.torque_figure import best_model, torque_figure
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
 
 
 def pixels(figure, path):

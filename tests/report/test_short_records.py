@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.estimate import estimate_warnings
+from analysis.models import WelchSettings
+from analysis.paper.estimate import estimate_warnings
+from analysis.paper.route import analyse
 from analysis.record import RecordError, load_record
 from analysis.report import style
 from analysis.report.document import document_text
 from analysis.report.folder import write_new
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
 
 ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
 

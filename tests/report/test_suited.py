@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.estimate import EstimateError, SettingsError
+from analysis.identify import Measurement
+from analysis.identify.problem import Comparison
+from analysis.models import WelchSettings
+from analysis.paper.estimate import EstimateError, SettingsError
 from analysis.record import load_record
-from analysis.settings import WelchSettings
 from analysis.suited import (
     against_welch,
     record_band_hz,
@@ -19,8 +21,6 @@ from analysis.suited import (
     welch_analysis,
     welch_settings,
 )
-from analysis.whole_record import Measurement
-from analysis.whole_record.comparison import Comparison
 
 
 @pytest.fixture

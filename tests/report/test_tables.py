@@ -4,11 +4,11 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
+from analysis.models import WelchSettings
+from analysis.paper.route import analyse
 from analysis.record import load_record
 from analysis.report.tables import summary_table, with_spread
 from analysis.report.write import tables_text
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
 from rigd.beam import modes
 
 

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.estimate import EstimateError, SettingsError
+from analysis.models import WelchSettings
+from analysis.paper.estimate import EstimateError, SettingsError
+from analysis.paper.route import analyse
 from analysis.record import load_record
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
 from rigd.beam import transfer
 from rigd.spectral import Segmentation
 

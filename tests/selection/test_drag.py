@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from analysis.selection import select
-from analysis.selection.candidates import Field
-from analysis.selection.drag import with_air_drag
+from analysis.identify import select
+from analysis.identify.candidates import Field
+from analysis.identify.drag import with_air_drag
 
 NOISE_NM = 5e-3
 DRAG_M = 2.3e-3

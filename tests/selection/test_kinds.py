@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.selection.candidates import Field
-from analysis.selection.headline import structures
-from analysis.selection.orders import order_verdict
-from analysis.selection.profile import Profile
-from analysis.selection.rig_findings import of_rig
-from analysis.structures import STRUCTURES
+from analysis.identify.candidates import Field
+from analysis.identify.headline import structures
+from analysis.identify.profile_likelihood import Profile
+from analysis.identify.rivals import of_rig
+from analysis.identify.verdict import order_verdict
+from analysis.models import STRUCTURES
 
 CLAMP = ("root_compliance_rad_per_nm",)
 ALPHA = Profile(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.selection.nonlinear import ModalForces, Term
-from analysis.whole_record import Measurement, Plant
-from analysis.whole_record.comparison import Comparison
+from analysis.identify import Measurement, Plant
+from analysis.identify.nonlinear import ModalForces, Term
+from analysis.identify.problem import Comparison
 
 MODE_1 = Term("cubic stiffness", 1)
 

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.estimate import EstimateError
-from analysis.settings import WelchSettings
-from analysis.welch_route import analyse
+from analysis.models import WelchSettings
+from analysis.paper.estimate import EstimateError
+from analysis.paper.route import analyse
 
 
 @pytest.mark.parametrize(

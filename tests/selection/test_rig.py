@@ -6,15 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from analysis.identify import Measurement, select
+from analysis.identify.candidates import Field
+from analysis.identify.channel_checks import clipping, stops, wrong_scale
+from analysis.identify.headline import MISREAD
+from analysis.identify.leakage import repeats_after_s
+from analysis.identify.problem import Comparison
 from analysis.report.html.damping_sentences import damping_sentences
-from analysis.selection import select
-from analysis.selection.candidates import Field
-from analysis.selection.channel_checks import clipping, stops
-from analysis.selection.headline import MISREAD
-from analysis.selection.hum import repeats_after_s
-from analysis.selection.scale import wrong_scale
-from analysis.whole_record import Measurement
-from analysis.whole_record.comparison import Comparison
 from rigd.beam import Beam
 
 RATE_HZ = 500.0

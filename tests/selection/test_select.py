@@ -5,16 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from analysis.selection import headline_json, select
-from analysis.selection.candidates import Field
-from analysis.selection.orders import EVEN
-from analysis.selection.restart import resonances_kept, vector
-from analysis.selection.valleys import CHI_SQUARE_95
-from analysis.structures import STRUCTURES, Structure
-from analysis.whole_record import SETTINGS
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.free_decay import mode_poles
-from analysis.whole_record.noise import Noise
+from analysis.identify import SETTINGS, headline_json, select
+from analysis.identify.candidates import Field
+from analysis.identify.free_decay import mode_poles
+from analysis.identify.noise import Noise
+from analysis.identify.problem import Comparison
+from analysis.identify.profile_likelihood import CHI_SQUARE_95
+from analysis.identify.refit import resonances_kept, vector
+from analysis.identify.verdict import EVEN
+from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam
 
 OTHER = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.selection import cumulative_periodogram
-from analysis.selection.chance import kolmogorov, of_chi_square
-from analysis.selection.harmonics import harmonics, in_time
-from analysis.selection.whiteness import input_relation, whiteness
+from analysis.identify import cumulative_periodogram
+from analysis.identify.residual_tests import (
+    harmonics,
+    in_time,
+    input_relation,
+    kolmogorov,
+    of_chi_square,
+    whiteness,
+)
 
 BINS = 4000
 HZ = np.arange(1, BINS + 1) / 80

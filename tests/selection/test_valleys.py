@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from analysis.selection.profile import Profile
-from analysis.selection.valleys import CHI_SQUARE_95, admitted, crossing, dips, gaps, valleys
+from analysis.identify.profile_likelihood import (
+    CHI_SQUARE_95,
+    Profile,
+    admitted,
+    crossing,
+    dips,
+    gaps,
+    valleys,
+)
 
 VALUES = np.linspace(0.1, 1.9, 361)
 

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.selection.experiments import experiments
-from analysis.selection.visible import driven, visible_modes
-from analysis.structures import STRUCTURES
-from analysis.whole_record import fit_record
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.noise import Noise
+from analysis.identify import fit_record
+from analysis.identify.noise import Noise
+from analysis.identify.problem import Comparison
+from analysis.identify.select import experiments
+from analysis.identify.visible_modes import driven, visible_modes
+from analysis.models import STRUCTURES
 
 STRONG_NM = 0.05
 

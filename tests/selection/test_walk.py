@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.selection.valleys import admitted, valleys
-from analysis.selection.walk import Walk
+from analysis.identify.profile_likelihood import Walk, admitted, valleys
 
 COUNT = 1000
 BOTTOMS = {0.6: 0.0, 1.4: 1.0}

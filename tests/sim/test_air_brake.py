@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.whole_record import Measurement, Plant
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.drag import DragLaw, DragResponse
+from analysis.identify import Measurement, Plant
+from analysis.identify.drag_torque import DragLaw, DragResponse
+from analysis.identify.problem import Comparison
 from rigd.beam import Damping
 from rigd.profile import load_profile
 from rigd.sim.plant import SimulatedPlant

@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.settings import WelchSettings
+from analysis.models import WelchSettings
 from rigd.spectral import Segmentation, segment_count, segment_lengths, segmentation_of
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.estimate import estimate
+from analysis.models import PAPER_BAND_HZ, WelchSettings
+from analysis.paper.estimate import estimate
 from analysis.record import load_record
-from analysis.settings import PAPER_BAND_HZ, WelchSettings
 from rigd.beam import Damping
 from rigd.session import Status, read_session
 from rigd.session.format import TIMING_DTYPE

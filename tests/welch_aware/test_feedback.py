@@ -5,7 +5,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
 from analysis.welch_aware import WelchAwareError
 from rigd.beam import transfer
 from rigd.spectral import Segmentation, instrumental_response, segment_lengths

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import analysis.welch_aware.fit
-from analysis.fit_frf import fit_frf
-from analysis.structures import STRUCTURES
-from analysis.weights import WeightingError
-from analysis.whole_record import SETTINGS
+from analysis.identify import SETTINGS
+from analysis.models import STRUCTURES, WeightingError
+from analysis.paper.fit import fit_frf
 from rigd.beam import Beam, Damping
 
 OFF = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)

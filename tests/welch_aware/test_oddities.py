@@ -6,8 +6,8 @@
 import numpy as np
 import pytest
 
-from analysis.fit_frf import fit_many
-from analysis.structures import STRUCTURES
+from analysis.models import STRUCTURES
+from analysis.paper.fit import fit_many
 from rigd.beam import Damping, modes, transfer
 from rigd.spectral import segment_count
 

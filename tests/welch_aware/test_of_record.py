@@ -2,9 +2,9 @@
 
 import pytest
 
-from analysis.estimate import SettingsError
+from analysis.models import WelchSettings
+from analysis.paper.estimate import SettingsError
 from analysis.record import load_record
-from analysis.settings import WelchSettings
 from analysis.welch_aware import fit_record_welch_aware
 
 TRUTH = {"zeta": 7.1e-5, "alpha": 0.996, "gamma": 5.5e-2, "lambda": 0.594}

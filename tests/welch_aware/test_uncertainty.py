@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
+from analysis.identify import SETTINGS, Plant
+from analysis.identify.parametrization import Unknowns
+from analysis.models import STRUCTURES
 from analysis.welch_aware.comparison import Measured
 from analysis.welch_aware.objective import Objective
 from analysis.welch_aware.uncertainty import covariance_of_unknowns, noise_power
-from analysis.whole_record import SETTINGS, Plant
-from analysis.whole_record.unknowns import Unknowns
 from rigd.beam import Damping
 from rigd.spectral import Segmentation
 

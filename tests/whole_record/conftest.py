@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.whole_record import Measurement
+from analysis.identify import Measurement
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues, participation, transfer
 
 RATE_HZ = 1000.0

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.whole_record import Measurement, Plant
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.drag import DragError, DragLaw, DragResponse
-from analysis.whole_record.free_decay import mode_poles
+from analysis.identify import Measurement, Plant
+from analysis.identify.drag_torque import DragError, DragLaw, DragResponse
+from analysis.identify.free_decay import mode_poles
+from analysis.identify.problem import Comparison
 from rigd.beam import Beam, Damping
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

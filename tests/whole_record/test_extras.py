@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.selection.restart import vector
-from analysis.structures import STRUCTURES
-from analysis.whole_record import EXTRAS, SETTINGS, Plant
-from analysis.whole_record.free_decay import mode_poles
-from analysis.whole_record.plant import LOGARITHMIC
-from analysis.whole_record.prediction import Prediction
-from analysis.whole_record.unknowns import Unknowns
+from analysis.identify import EXTRAS, SETTINGS, Plant
+from analysis.identify.free_decay import mode_poles
+from analysis.identify.parametrization import Unknowns
+from analysis.identify.predictor import LOGARITHMIC, Prediction
+from analysis.identify.refit import vector
+from analysis.models import STRUCTURES
 from rigd.beam import PARAMETERS, Beam, Damping
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)

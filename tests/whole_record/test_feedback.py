@@ -6,10 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import fit_record
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.feedback import following
+from analysis.identify import fit_record
+from analysis.identify.problem import Comparison, following
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, transfer
 
 RATE_HZ = 1000.0

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from analysis.descent import descend
-from analysis.structures import STRUCTURES
-from analysis.whole_record import SETTINGS, MeasurementError, Plant, fit_record
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.objective import Objective
-from analysis.whole_record.steps import Steps
-from analysis.whole_record.unknowns import Unknowns
+from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
+from analysis.identify.optimizer import descend
+from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.problem import Comparison, Objective
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, modes
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.whole_record import Measurement, MeasurementError
+from analysis.identify import Measurement, MeasurementError
 from rigd.beam import Beam
 
 RECORD = SimpleNamespace(

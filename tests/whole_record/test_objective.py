@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import SETTINGS, Plant
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.objective import Objective
-from analysis.whole_record.unknowns import Unknowns
+from analysis.identify import SETTINGS, Plant
+from analysis.identify.parametrization import Unknowns
+from analysis.identify.problem import Comparison, Objective
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())

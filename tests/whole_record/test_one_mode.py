@@ -7,8 +7,8 @@ response that no beam has: other modes and the fixture.
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import Measurement, fit_record
+from analysis.identify import Measurement, fit_record
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 RATE_HZ = 500.0

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from analysis.whole_record import Plant
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.decimation import Decimation
-from analysis.whole_record.prediction import Prediction
+from analysis.identify import Plant
+from analysis.identify.data import Decimation
+from analysis.identify.predictor import Prediction
+from analysis.identify.problem import Comparison
 from rigd.beam import PARAMETERS, Beam, Damping
 
 OFFSETS = ("stiffness_offset_2", "stiffness_offset_3")

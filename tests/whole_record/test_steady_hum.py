@@ -8,12 +8,12 @@ cost over its degrees of freedom (0.1).
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import Plant, fit_record
-from analysis.whole_record.comparison import Comparison
-from analysis.whole_record.free_decay import Pole
-from analysis.whole_record.noise import noise_of
-from analysis.whole_record.steady_hum import hum_beside_modes
+from analysis.identify import Plant, fit_record
+from analysis.identify.free_decay import Pole
+from analysis.identify.hum import hum_beside_modes
+from analysis.identify.noise import noise_of
+from analysis.identify.problem import Comparison
+from analysis.models import STRUCTURES
 from rigd.beam import Damping
 
 MODE_2_HZ = 16.011

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import SETTINGS, Plant
-from analysis.whole_record.steps import Steps
-from analysis.whole_record.unknowns import Unknowns
+from analysis.identify import SETTINGS, Plant
+from analysis.identify.parametrization import Steps, Unknowns
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())

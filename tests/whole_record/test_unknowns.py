@@ -3,10 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from analysis.structures import STRUCTURES
-from analysis.whole_record import SETTINGS, Plant
-from analysis.whole_record.plant import LOGARITHMIC
-from analysis.whole_record.unknowns import Unknowns
+from analysis.identify import SETTINGS, Plant
+from analysis.identify.parametrization import Unknowns
+from analysis.identify.predictor import LOGARITHMIC
+from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
 
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping(), 1e-4, 1e-5)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from analysis.identify.headline import MISREAD
 from analysis.report.html.table import estimate
-from analysis.selection.headline import MISREAD
 
 if TYPE_CHECKING:
-    from analysis.selection import Headline, Quantity, Size
-    from analysis.selection.headline import Mode
+    from analysis.identify import Headline, Quantity, Size
+    from analysis.identify.headline import Mode
 
 _SMALL: Final = 1e-3
 """Sizes below are told in the power of ten that zeta has in the paper."""

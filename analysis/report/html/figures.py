@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.identify.data import fast_length
 from analysis.report.supported_band import supported_band_hz
-from analysis.whole_record.decimation import fast_length
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
 

@@ -10,16 +10,16 @@ import matplotlib as mpl
 import numpy as np
 
 import rigd
+from analysis.models import ESTIMATOR_WORDS
 from analysis.report.html.markup import Markup, element
-from analysis.settings import ESTIMATOR_WORDS
 
 if TYPE_CHECKING:
     from datetime import datetime
     from pathlib import Path
 
+    from analysis.paper.route import WelchAnalysis
     from analysis.record import Record
     from analysis.report.html.subject import Subject
-    from analysis.welch_route import WelchAnalysis
 
 _SHOWN_ALREADY = frozenset(
     (

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.identify import headline_json
 from analysis.report.html.reported import unreported
 from analysis.report.record_figure_bands import loss_factors, response_band
 from analysis.report.record_indices import NOT_COMPARED, indices_of_record_fit
 from analysis.report.supported_band import supported_band_hz
-from analysis.selection import headline_json
 
 if TYPE_CHECKING:
+    from analysis.identify import DampingSize
     from analysis.report.html.subject import Subject
     from analysis.report.record_figure_bands import LossFactor
-    from analysis.whole_record import DampingSize
 
 _CURVE_POINTS = 200
 

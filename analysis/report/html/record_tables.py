@@ -11,8 +11,8 @@ from analysis.report.html.table import Cell, Column, Table, count, estimate, num
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from analysis.identify import Headline, Quantity, Size
     from analysis.report.html.subject import Subject
-    from analysis.selection import Headline, Quantity, Size
 
 PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
     "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),

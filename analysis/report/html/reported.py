@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.structures import COEFFICIENT_OF
+from analysis.models import COEFFICIENT_OF
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from analysis.models import Structure
     from analysis.report.html.table import Number
-    from analysis.structures import Structure
 
 MARK: Final = "†"
 

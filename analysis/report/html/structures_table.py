@@ -12,8 +12,8 @@ from analysis.report.html.table import ABSENT, Cell, Column, Number, Table, coun
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from analysis.identify import RecordFit
     from analysis.report.html.subject import Subject
-    from analysis.whole_record import RecordFit
 
 _DAMPING = ("zeta", "alpha", "gamma", "lambda")
 

@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from analysis.identify import (
+        Finding,
+        Headline,
+        OrderVerdict,
+        RecordAnalysis,
+        RecordFit,
+        Selection,
+        Setting,
+    )
+    from analysis.identify.drag import DampingAt
+    from analysis.paper.route import WelchAnalysis
     from analysis.record import Record
-    from analysis.selection import Finding, Headline, OrderVerdict, Selection
-    from analysis.selection.amplitude import DampingAt
-    from analysis.welch_route import WelchAnalysis
-    from analysis.whole_record import RecordAnalysis, RecordFit, Setting
 
 _ORDERS: Final = frozenset({"alpha", "lambda"})
 
@@ -46,7 +53,7 @@ class Verdict:
 
     @classmethod
     def of(cls, selection: Selection) -> Verdict:
-        """Take over what `analysis.selection` says."""
+        """Take over what `analysis.identify` says."""
         said, best = selection.verdict, selection.candidates[0]
         return cls(
             sentences=said.sentences,

@@ -4,14 +4,12 @@ from datetime import UTC, datetime
 
 import pytest
 
+from analysis.identify import Measurement, fit_record, of_fit
+from analysis.models import STRUCTURES, WelchSettings
+from analysis.paper.route import analyse
 from analysis.record import load_record
 from analysis.report.html import Subject, Verdict
 from analysis.report.html.write import write_html_report
-from analysis.selection import of_fit
-from analysis.settings import WelchSettings
-from analysis.structures import STRUCTURES
-from analysis.welch_route import analyse
-from analysis.whole_record import Measurement, fit_record
 
 TYPES = ("I", "III", "VI", "VII")
 HOSTILE = "<script>alert('note')</script> & \"quotes\" $x^2$"

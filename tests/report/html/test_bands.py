@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis.identify import Measurement, fit_record
+from analysis.identify.predictor import LOGARITHMIC
+from analysis.models import STRUCTURES
 from analysis.report.record_figure_bands import loss_factors, response_band
-from analysis.structures import STRUCTURES
-from analysis.whole_record import Measurement, fit_record
-from analysis.whole_record.plant import LOGARITHMIC
 from rigd.beam import Beam, Damping, transfer
 
 FREQUENCY_HZ = np.array([1.0, 2.5, 2.57, 8.0, 11.3, 16.01, 30.0, 44.8])

@@ -10,6 +10,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from analysis.identify import of_fit
+from analysis.identify.headline import Simpler
 from analysis.report import style
 from analysis.report.document import _finite
 from analysis.report.folder import OutputError
@@ -20,8 +22,6 @@ from analysis.report.html.page import page
 from analysis.report.html.record_entries import record_entries
 from analysis.report.html.table import Number
 from analysis.report.html.write import FIGURES, report_tables, write_html_report
-from analysis.selection import of_fit
-from analysis.selection.headline import Simpler
 
 VOID = {"meta", "br", "img"}
 LIMIT_BYTES = 2_000_000

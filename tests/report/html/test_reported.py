@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from analysis.identify import of_fit
+from analysis.models import STRUCTURES
 from analysis.report import style
 from analysis.report.document import document
 from analysis.report.html.damping_sentences import damping_sentences
@@ -21,8 +23,6 @@ from analysis.report.html.write import report_tables
 from analysis.report.record_text import record_text
 from analysis.report.supported_band import excited_band_hz, supported_band_hz
 from analysis.report.write import tables_text
-from analysis.selection import of_fit
-from analysis.structures import STRUCTURES
 
 ALPHA = frozenset({"alpha"})
 REASON = "order 1 on another beam explains as much"

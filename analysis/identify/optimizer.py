@@ -1,0 +1,298 @@
+"""What was computed last: a descent ends at one of the last points that it looked at.
+
+Descent to a minimum of a sum of squares within bounds: damped steps on the normal equations.
+
+For problems of a few unknowns and thousands of residuals, where forming the normal equations is
+cheap and a general solver's overhead (and its import, longer than all the fits of a session) is
+not. Steps are damped after H. B. Nielsen, "Damping parameter in Marquardt's method",
+IMM-REP-1999-05.
+
+The Hessian of a sum of squares is ``J'J`` and a second part: the residuals times their own second
+derivatives. Gauss-Newton and Levenberg-Marquardt leave the second part out. Where the residual
+stays large, because the model cannot follow the data, they creep: each step shortens the way that
+remains by the same share. Here the second part is learned from how the gradient changes from step
+to step (J. E. Dennis, D. M. Gay and R. E. Welsch, ACM TOMS 7 (1981) 348-368: NL2SOL), and used when
+it would have foretold the last step better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final, Generic, Protocol, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+_Value = TypeVar("_Value")
+
+_KEPT: Final = 2
+"""The last step of a descent may have been taken back."""
+
+
+class Recent(Generic[_Value]):
+    """Values at the last two points, for an objective that is asked for them again.
+
+    Covariances are asked for where a descent ended, and the next one begins there.
+    """
+
+    __slots__ = ("_values",)
+
+    def __init__(self) -> None:
+        self._values: dict[bytes, _Value] = {}
+
+    def at(
+        self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
+    ) -> _Value:
+        """Value at `x`, computed if it is not one of the last."""
+        key = x.tobytes()
+        if key not in self._values:
+            if len(self._values) == _KEPT:
+                del self._values[next(iter(self._values))]
+            self._values[key] = compute(x)
+        return self._values[key]
+
+
+_FIRST_DAMPING: Final = 1e-3
+_LARGEST_DAMPING: Final = 1e16
+_LEAST_RELIEF: Final = 0.1
+"""Share of the damping that a step which kept its promise leaves."""
+
+_LEAST_RELIEF_STRAIGHT: Final = 1 / 3
+
+_SHORTEST_STEP: Final = 1e-13
+_FLOOR: Final = 1e-14
+"""Least curvature, relative to the largest: an unknown without effect takes no huge step."""
+
+
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """A sum of squares at one point, with what a Gauss-Newton step needs.
+
+    Attributes
+    ----------
+    cost : float
+        Sum of ``|r|²``.
+    gradient : ndarray, shape (k,)
+        Half the gradient of the cost, ``Re(Jᴴ r)``.
+    hessian : ndarray, shape (k, k)
+        Half its Gauss-Newton Hessian, ``Re(Jᴴ J)``.
+    """
+
+    cost: float
+    gradient: NDArray[np.float64]
+    hessian: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum:
+    """Where a descent ended.
+
+    Attributes
+    ----------
+    x : ndarray, shape (k,)
+    equations : NormalEquations
+        There.
+    evaluations : int
+    second_part : ndarray, shape (k, k), or None
+        What it learned of half the Hessian beyond Gauss-Newton's; None if it was not to learn.
+    """
+
+    x: NDArray[np.float64]
+    equations: NormalEquations
+    evaluations: int
+    second_part: NDArray[np.float64] | None
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares there."""
+        return self.equations.cost
+
+
+class Region(Protocol):
+    """Bounds of the unknowns, shape (k,), and the way of a step within them."""
+
+    @property
+    def straight(self) -> bool:
+        """Whether steps go straight, and are cut off at the bounds."""
+
+    @property
+    def lower(self) -> NDArray[np.float64]:
+        """Least values."""
+
+    @property
+    def upper(self) -> NDArray[np.float64]:
+        """Largest values."""
+
+    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest step from `x` in each unknown, shape (k,)."""
+
+    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Point within the bounds that a step leads to, shape (k,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Bounds between which steps go straight: an unknown that one would push through rests there.
+
+    To make the best of it with the other unknowns within the same step is no gain here: among
+    straight steps it was found to end in corners, where the damping has no effect.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    straight: ClassVar[bool] = True
+
+    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest step: any, cut off by `end`."""
+        return np.full(x.size, -np.inf), np.full(x.size, np.inf)
+
+    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Go straight, to the bounds at most."""
+        return np.clip(x + step, self.lower, self.upper)
+
+
+def descend(
+    problem: Callable[[NDArray[np.float64]], NormalEquations],
+    start: NDArray[np.float64],
+    region: Region,
+    *,
+    relative_tolerance: float,
+    max_evaluations: int = 200,
+    second_part: NDArray[np.float64] | None = None,
+    learns: bool = True,
+) -> Minimum:
+    """Descend to a local minimum.
+
+    Parameters
+    ----------
+    problem : callable
+        Normal equations at a point of shape (k,).
+    start : ndarray, shape (k,)
+        Unknowns scaled so that a change of 1 is large.
+    region : Region
+        Where steps lead, and the bounds; a `Box` if nothing is known but these.
+    relative_tolerance : float
+        Stop when a step promises less than this fraction of the cost, or is too short to be told
+        from rounding.
+    max_evaluations : int
+        Of `problem`, after which the best point so far is returned.
+    second_part : ndarray, shape (k, k), optional
+        As a descent on nearly the same problem has learned it; used from the first step on.
+    learns : bool
+        Whether to learn the second part of the Hessian; otherwise steps are Gauss-Newton's.
+    """
+    x = np.clip(start, region.lower, region.upper)
+    here = problem(x)
+    evaluations = 1
+    uses_second = second_part is not None
+    second = np.zeros_like(here.hessian) if second_part is None else second_part
+    damping, growth = _FIRST_DAMPING, 2.0
+    relief = _LEAST_RELIEF_STRAIGHT if region.straight else _LEAST_RELIEF
+    while evaluations < max_evaluations:
+        held = ((x <= region.lower) & (here.gradient > 0)) | (
+            (x >= region.upper) & (here.gradient < 0)
+        )
+        free = ~held & (here.hessian.diagonal() > 0)
+        if not free.any():
+            break
+        limits = region.limits(x)
+        model = here.hessian + second if uses_second else here.hessian
+        step = _step(model, here, free, damping, limits)
+        if step is None:  # not convex
+            uses_second, model = False, here.hessian
+            step = _step(model, here, free, damping, limits)
+        if step is None:
+            break
+        trial = region.end(x, step)
+        if region.straight:
+            step = trial - x
+        promised = -float(step @ (2 * here.gradient + model @ step))
+        if float(np.abs(step).max()) < _SHORTEST_STEP * (1 + float(np.abs(x).max())):
+            break
+        if 0 <= promised < relative_tolerance * here.cost and damping < 1:
+            break
+        there = problem(trial)
+        evaluations += 1
+        gained = here.cost - there.cost
+        if gained > 0:
+            if learns:
+                foretold = -float(step @ (2 * here.gradient + here.hessian @ step))
+                bend = float(step @ second @ step)
+                uses_second = abs(gained - (foretold - bend)) <= abs(gained - foretold)
+                second = _learned(second, trial - x, here, there)
+            quality = gained / promised if promised > 0 else 0.0
+            damping *= max(relief, 1 - (2 * quality - 1) ** 3)
+            growth = 2.0
+            x, here = trial, there
+        elif uses_second:
+            uses_second = False
+        else:
+            damping *= growth
+            growth *= 2
+            if damping > _LARGEST_DAMPING:
+                break
+    return Minimum(x, here, evaluations, second if learns else None)
+
+
+def _step(
+    model: NDArray[np.float64],
+    here: NormalEquations,
+    free: NDArray[np.bool_],
+    damping: float,
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> NDArray[np.float64] | None:
+    """Lowest point of the model within the limits, shape (k,); None if the model is not convex.
+
+    What would go beyond its limit stays there, and the others make the best of it.
+    """
+    least, most = limits
+    step = np.zeros(free.size)
+    curvature = here.hessian.diagonal()
+    damped = model + np.diag(damping * np.maximum(curvature, _FLOOR * curvature[free].max()))
+    moving = np.flatnonzero(free)
+    while moving.size:
+        block = damped[moving[:, None], moving]
+        step[moving] = 0.0
+        pull = here.gradient[moving] + model[moving] @ step
+        try:
+            np.linalg.cholesky(block)
+            found = np.linalg.solve(block, -pull)
+        except np.linalg.LinAlgError:
+            return None
+        step[moving] = np.clip(found, least[moving], most[moving])
+        beyond = step[moving] != found
+        if not beyond.any():
+            break
+        moving = moving[~beyond]
+    return step
+
+
+def _learned(
+    second: NDArray[np.float64],
+    step: NDArray[np.float64],
+    here: NormalEquations,
+    there: NormalEquations,
+) -> NDArray[np.float64]:
+    """Second part of the Hessian after a step, by the symmetric secant update of NL2SOL, (k, k)."""
+    change = there.gradient - here.gradient
+    along = float(change @ step)
+    if along <= 0:
+        return second
+    bend = change - (here.hessian + there.hessian) @ step / 2
+    turned = second @ step
+    size = abs(float(step @ turned))
+    if size > 0:  # what was learned farther up may be too large here
+        share = min(1.0, abs(float(step @ bend)) / size)
+        second, turned = share * second, share * turned
+    miss = bend - turned
+    both = np.outer(miss, change)
+    return (
+        second
+        + (both + both.T) / along
+        - (float(miss @ step) / along**2) * np.outer(change, change)
+    )

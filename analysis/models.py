@@ -1,0 +1,389 @@
+"""Model structures and what is fitted: damping parameters, weights of the cost, settings, unknowns.
+
+The model structures: which damping parameters are fitted and which stay fixed.
+
+Types I to VI with the fixed values of the paper's Table 2. Type VII is the one its conclusions
+point to: internal damping of integer order (alpha = 1) with external damping of fractional order.
+
+The unknowns in which damping is fitted, and the way to and from its parameters.
+
+A coefficient and its order are all but interchangeable near the frequencies where they act:
+fitting ``zeta`` and ``alpha`` themselves means descending a curved valley (their correlation is
+-0.99). The unknowns here are the logarithm of the damping's size at one frequency, and the order:
+
+* ``ln(zeta omega_2^alpha)``: internal damping relative to the stiffness at the undamped second
+  mode, and ``alpha``;
+* ``ln(gamma omega_1^lambda / (rho/EI omega_1²))``: external damping relative to the inertia at the
+  undamped first mode, and ``lambda``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import Beam, Damping, TransferGrid, undamped_frequencies_rad_s
+from rigd.spectral import (
+    PAPER_NFFT,
+    PAPER_OVERLAP,
+    PAPER_OVERLAP_FRACTION,
+    PAPER_RATE_HZ,
+    PAPER_SEGMENT_LENGTH,
+    Segmentation,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rigd.spectral import Estimator
+
+Parameter = Literal["zeta", "alpha", "gamma", "lambda"]
+PARAMETERS: Final[tuple[Parameter, ...]] = ("zeta", "alpha", "gamma", "lambda")
+COEFFICIENT_OF: Final[Mapping[str, Parameter]] = MappingProxyType(
+    {"alpha": "zeta", "lambda": "gamma"}
+)
+"""The coefficient that belongs to an order of the damping, and means nothing without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """One choice of free and fixed damping parameters.
+
+    Attributes
+    ----------
+    name : str
+        "I" to "VII".
+    free : tuple of str
+        Parameters to be fitted, in the order of `PARAMETERS`.
+    fixed : mapping of str to float
+        The others with their values. An order of 0 belongs to a coefficient of 0: absent damping.
+    """
+
+    name: str
+    free: tuple[Parameter, ...]
+    fixed: Mapping[Parameter, float]
+
+    @property
+    def internal(self) -> bool:
+        """Whether the structure has internal damping (of the material)."""
+        return "zeta" in self.free
+
+    @property
+    def external(self) -> bool:
+        """Whether the structure has external damping (of the environment)."""
+        return "gamma" in self.free
+
+    def has(self, name: str) -> bool:
+        """Whether a parameter means anything in the structure: of a beam or a rig any does.
+
+        Parameters
+        ----------
+        name : str
+            Of `PARAMETERS`, or of beam and rig.
+        """
+        if name in ("zeta", "alpha"):
+            return self.internal
+        if name in ("gamma", "lambda"):
+            return self.external
+        return True
+
+    def damping(self, values: Mapping[Parameter, float]) -> Damping:
+        """Complete the free parameters' `values` with the fixed ones."""
+        every = {**self.fixed, **{name: values[name] for name in self.free}}
+        return Damping(
+            zeta=every["zeta"],
+            alpha=every["alpha"],
+            gamma=every["gamma"],
+            lambda_=every["lambda"],
+        )
+
+
+def _structure(name: str, fixed: dict[Parameter, float]) -> Structure:
+    free = tuple(p for p in PARAMETERS if p not in fixed)
+    return Structure(name, free, MappingProxyType(fixed))
+
+
+STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
+    {
+        structure.name: structure
+        for structure in (
+            _structure("I", {"alpha": 1.0, "gamma": 0.0, "lambda": 0.0}),
+            _structure("II", {"zeta": 0.0, "alpha": 0.0, "lambda": 1.0}),
+            _structure("III", {"alpha": 1.0, "lambda": 1.0}),
+            _structure("IV", {"gamma": 0.0, "lambda": 0.0}),
+            _structure("V", {"zeta": 0.0, "alpha": 0.0}),
+            _structure("VI", {}),
+            _structure("VII", {"alpha": 1.0}),
+        )
+    }
+)
+
+
+class FrequencyResponseModel:
+    """Measured torque per motor angle, ``G(j omega) + J_tool (j omega)²``, on one frequency grid.
+
+    The torque sensor sits under the clamp, so what it measures holds the clamp's inertia too; it
+    is added to the model, and never taken from the data.
+
+    Parameters
+    ----------
+    frequency_hz : ndarray, shape (n,)
+    beam : Beam
+    tool_inertia_kg_m2 : float
+        Inertia between the sensor and the beam about the motor's axis.
+    """
+
+    __slots__ = ("_grid", "_tool", "beam")
+
+    def __init__(
+        self, frequency_hz: NDArray[np.float64], beam: Beam, tool_inertia_kg_m2: float = 0.0
+    ) -> None:
+        s = 2j * np.pi * frequency_hz
+        self.beam = beam
+        self._grid = TransferGrid(s)
+        self._tool = tool_inertia_kg_m2 * s * s
+
+    def evaluate(self, damping: Damping) -> NDArray[np.complex128]:
+        """Response in N·m/rad, shape (n,)."""
+        return self._grid.evaluate(self.beam, damping) + self._tool
+
+    def evaluate_with_gradient(
+        self, damping: Damping, wrt: Sequence[str]
+    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Response, shape (n,), and its derivatives by the parameters `wrt`, shape (k, n)."""
+        response, gradient = self._grid.evaluate_with_gradient(self.beam, damping, wrt)
+        return response + self._tool, gradient
+
+
+WeightingFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Weighting = str | WeightingFunction
+
+_LARGEST_POWER = 10
+"""Beyond it, a handful of points at one end of the band would have all the weight."""
+
+
+class WeightingError(ValueError):
+    """A weighting that does not exist, or that is not positive and finite where it is used."""
+
+
+def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[np.float64]:
+    """Weights ``W_p = p(omega_p) / sum_i p(omega_i)`` on an evenly spaced grid (A5).
+
+    Parameters
+    ----------
+    omega_rad_s : ndarray, shape (n,)
+        Positive.
+    weighting : str or callable
+        ``"const"``: p = 1, the mean square error. ``"omega"``: p = 1/omega, the mean over a
+        logarithmic frequency axis. ``"omega^K"`` with a number K: p = omega**K, so that
+        ``"omega"`` is ``"omega^-1"`` by another name. A callable is p itself: omega in rad/s,
+        shape (n,), to values of that shape that are not negative.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Not negative, of sum 1.
+
+    Raises
+    ------
+    WeightingError
+        If there is no such weighting, or its values are negative, not finite or all zero.
+    """
+    name = weighting_name(weighting)
+    if callable(weighting):
+        p = np.asarray(weighting(omega_rad_s), dtype=np.float64)
+        if p.shape != omega_rad_s.shape:
+            raise WeightingError(
+                f"The weighting {name} gave values of shape {p.shape} for {omega_rad_s.shape} "
+                "frequencies; it must give one value for each."
+            )
+    else:
+        p = omega_rad_s ** _exponent(weighting)
+    total = float(p.sum())
+    if not (math.isfinite(total) and total > 0 and float(p.min()) >= 0):
+        raise WeightingError(
+            f"The weighting {name} must be finite, not negative and not all zero over "
+            f"{float(omega_rad_s.min()):g} to {float(omega_rad_s.max()):g} rad/s."
+        )
+    return p / total
+
+
+def weighting_name(weighting: Weighting) -> str:
+    """Return what a weighting is called in results: its name, or its function's.
+
+    Raises
+    ------
+    WeightingError
+        If there is no weighting of that name.
+    """
+    if callable(weighting):
+        return str(getattr(weighting, "__name__", type(weighting).__name__))
+    _exponent(weighting)
+    return weighting
+
+
+def _exponent(weighting: str) -> float:
+    if weighting == "const":
+        return 0.0
+    if weighting == "omega":
+        return -1.0
+    base, separator, power = weighting.partition("^")
+    try:
+        exponent = float(power)
+    except ValueError:
+        exponent = math.nan
+    if base != "omega" or not separator or not abs(exponent) <= _LARGEST_POWER:
+        raise WeightingError(
+            f"There is no weighting {weighting!r}; choose const, omega (which is 1/omega) or "
+            f"omega^K with a number K from -{_LARGEST_POWER} to {_LARGEST_POWER}, such as "
+            "omega^-0.5."
+        )
+    return exponent
+
+
+RECORD_BAND_HZ: Final = (0.0, 50.0)
+"""Of the whole-record fits, where the record's rate holds it."""
+
+LARGEST_SHARE_OF_RATE: Final = 0.4
+"""Highest frequency that is fitted, over the sampling rate: filters need room up to half of it."""
+
+PAPER_BAND_HZ: Final = (0.5875, 50.0)
+PAPER_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
+PAPER_WEIGHTINGS: Final = ("const", "omega")
+
+ESTIMATOR_WORDS: Final[Mapping[Estimator, str]] = {
+    "h1": "Welch's H1",
+    "h2": "Welch's H2",
+    "hv": "Welch's Hv",
+    "iv": "Welch's Hiv",
+    "fft": "whole-record FFT",
+}
+"""What reports and figures call an estimator."""
+
+
+@dataclass(frozen=True, slots=True)
+class WelchSettings:
+    """How the frequency response is estimated and what is fitted to it.
+
+    Attributes
+    ----------
+    estimator : {"h1", "h2", "hv", "iv", "fft"}
+        "iv" is Hiv, with the reference as instrument; "fft" is the ratio of two
+        transforms of the whole record.
+    segment_length, overlap, nfft : int, optional
+        In samples; None takes the paper's durations at the record's rate, or with a segment given
+        15 % of it as overlap and a transform no shorter than it.
+    band_hz : tuple of float
+        First and last frequency fitted, both included.
+    types : tuple of str
+        Names of `analysis.models.STRUCTURES`.
+    weightings : tuple of str
+        Names that `analysis.models.weights` knows.
+    """
+
+    estimator: Estimator = "h1"
+    segment_length: int | None = None
+    overlap: int | None = None
+    nfft: int | None = None
+    band_hz: tuple[float, float] = PAPER_BAND_HZ
+    types: tuple[str, ...] = PAPER_TYPES
+    weightings: tuple[str, ...] = PAPER_WEIGHTINGS
+
+    @property
+    def are_usual(self) -> bool:
+        """Whether estimator and segments are the paper's, not chosen for one record."""
+        chosen = self.segment_length or self.overlap or self.nfft
+        return self.estimator == "h1" and not chosen
+
+    def segmentation(self, rate_hz: float) -> Segmentation:
+        """Fill in what was left open: the paper's durations, in samples at this rate."""
+        scale = rate_hz / PAPER_RATE_HZ
+        length, overlap, nfft = self.segment_length, self.overlap, self.nfft
+        if overlap is None:
+            overlap = round(
+                PAPER_OVERLAP * scale if length is None else PAPER_OVERLAP_FRACTION * length
+            )
+        if length is None:
+            length = round(PAPER_SEGMENT_LENGTH * scale)
+        if nfft is None:
+            nfft = max(round(PAPER_NFFT * scale), length)
+        return Segmentation(length, overlap, nfft)
+
+
+# Orders as the paper sweeps them, inside (0, 2). Sizes run from what no response could show to
+# far beyond what lets a beam vibrate, much wider than the paper's sweep, which its own results
+# leave (type IV with 1/omega weights has zeta = 2.4e-3, the sweep ends at 3.05e-4).
+ORDER_RANGE: Final = (0.001, 1.999)
+SIZE_RANGE: Final = (1e-9, 1e3)
+
+
+@dataclass(frozen=True, slots=True)
+class Unknowns:
+    """Vector of unknowns of one structure on one beam, in the order of ``structure.free``."""
+
+    structure: Structure
+    ln_internal_rad_s: float
+    ln_external_rad_s: float
+    ln_external_unit: float
+
+    @classmethod
+    def of(cls, structure: Structure, beam: Beam) -> Unknowns:
+        """Take the beam's own modes as the frequencies at which damping is measured."""
+        first, second = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
+        return cls(
+            structure=structure,
+            ln_internal_rad_s=math.log(second),
+            ln_external_rad_s=math.log(first),
+            ln_external_unit=math.log(beam.density_over_stiffness * first**2),
+        )
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bounds, shape (k,)."""
+        ranges = [
+            ORDER_RANGE if name in ("alpha", "lambda") else tuple(map(math.log, SIZE_RANGE))
+            for name in self.structure.free
+        ]
+        return np.array([low for low, _ in ranges]), np.array([high for _, high in ranges])
+
+    def parameters(self, x: NDArray[np.float64]) -> dict[Parameter, float]:
+        """All four damping parameters at `x`."""
+        free: dict[Parameter, float] = dict(zip(self.structure.free, map(float, x), strict=True))
+        every = {**self.structure.fixed, **free}
+        if self.structure.internal:
+            every["zeta"] = math.exp(free["zeta"] - every["alpha"] * self.ln_internal_rad_s)
+        if self.structure.external:
+            every["gamma"] = math.exp(
+                free["gamma"] + self.ln_external_unit - every["lambda"] * self.ln_external_rad_s
+            )
+        return every
+
+    def damping(self, x: NDArray[np.float64]) -> Damping:
+        """Damping at `x`."""
+        return self.structure.damping(self.parameters(x))
+
+    def derivative_of_parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Differentiate the free parameters by the unknowns, shape (k, k): [parameter, unknown].
+
+        An order moves its coefficient too, since the size stays.
+        """
+        parameters = self.parameters(x)
+        row = {name: i for i, name in enumerate(self.structure.free)}
+        derivative = np.eye(len(row))
+        if "zeta" in row:
+            derivative[row["zeta"], row["zeta"]] = parameters["zeta"]
+            if "alpha" in row:
+                derivative[row["zeta"], row["alpha"]] = -parameters["zeta"] * self.ln_internal_rad_s
+        if "gamma" in row:
+            derivative[row["gamma"], row["gamma"]] = parameters["gamma"]
+            if "lambda" in row:
+                derivative[row["gamma"], row["lambda"]] = (
+                    -parameters["gamma"] * self.ln_external_rad_s
+                )
+        return derivative

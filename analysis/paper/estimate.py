@@ -1,0 +1,202 @@
+"""From a record to its frequency response, as the paper estimates it or by another estimator."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigd.beam import undamped_frequencies_rad_s
+from rigd.spectral import (
+    PAPER_OVERLAP_FRACTION,
+    PAPER_SEGMENTS,
+    FrequencyResponse,
+    SpectralError,
+    fft_response,
+    instrumental_response,
+    segment_count,
+    segment_lengths,
+    welch_response,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from analysis.models import WelchSettings
+    from analysis.record import Record
+    from rigd.spectral import Segmentation
+
+
+class EstimateError(ValueError):
+    """A record from which the estimate asked for cannot be made."""
+
+
+class SettingsError(EstimateError):
+    """Settings that make no sense, or none for this record's rate."""
+
+
+def estimate(
+    record: Record, settings: WelchSettings
+) -> tuple[FrequencyResponse, FrequencyResponse]:
+    """Estimate the response that is to be fitted, and the whole-record one to compare it with.
+
+    Returns
+    -------
+    response, whole_record : FrequencyResponse
+        Both in the band of the settings and without the channels' delays; one and the same with
+        the estimator "fft".
+
+    Raises
+    ------
+    SettingsError
+        The segments or the band make no sense at the record's rate.
+    EstimateError
+        The record is too short for the segments, or its angle does not move.
+    """
+    segmentation = settings.segmentation(record.rate_hz)
+    _check_band(record, settings.band_hz)
+    if settings.estimator != "fft":
+        _check_segmentation(record, segmentation)
+    # A constant angle asks no torque of the beam, but would leak into the lowest bins of both.
+    angle = record.angle_rad - (record.rest_angle_rad or 0.0)
+    try:
+        whole_record = fft_response(
+            angle, record.torque_nm, record.rate_hz, max(segmentation.nfft, len(angle))
+        )
+        if settings.estimator == "fft":
+            response = whole_record
+        elif settings.estimator == "iv":
+            response = instrumental_response(
+                moving_reference_rad(record)[record.sweep],
+                angle[record.sweep],
+                record.torque_nm[record.sweep],
+                record.rate_hz,
+                **asdict(segmentation),
+            )
+        else:
+            response = welch_response(
+                angle[record.sweep],
+                record.torque_nm[record.sweep],
+                record.rate_hz,
+                **asdict(segmentation),
+                estimator=settings.estimator,
+            )
+    except SpectralError as error:
+        raise EstimateError(f"{record.path}: {error}") from error
+    try:
+        response, whole_record = (
+            each.band(*settings.band_hz).without_delays(
+                input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
+            )
+            for each in (response, whole_record)
+        )
+    except SpectralError as error:
+        raise SettingsError(f"{record.path}: {error}") from error
+    unknown = np.flatnonzero(~np.isfinite(response.response))
+    if unknown.size:
+        raise EstimateError(
+            f"{record.path}: the angle has no power at {response.frequency_hz[unknown[0]]:g} Hz, "
+            "so there is no frequency response there; choose a --band that was excited."
+        )
+    return response, whole_record
+
+
+def moving_reference_rad(record: Record) -> NDArray[np.float64]:
+    """Movement asked for, from where it began, shape (n,); `EstimateError` if there is none.
+
+    An imported record may lack it.
+    """
+    reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
+    if not reference[record.sweep].any():
+        raise EstimateError(
+            f"{record.path}: the record has no reference that moves, which --frf iv needs; "
+            "choose --frf h1."
+        )
+    return reference
+
+
+def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
+    nyquist_hz = record.rate_hz / 2
+    if band_hz[1] > nyquist_hz:
+        raise SettingsError(
+            f"{record.path}: the band reaches {band_hz[1]:g} Hz, but samples at "
+            f"{record.rate_hz:g} Hz tell nothing beyond {nyquist_hz:g} Hz; lower --band."
+        )
+
+
+def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
+    """Say in terms of the options what `welch_response` would refuse."""
+    length, overlap, nfft = segmentation.segment_length, segmentation.overlap, segmentation.nfft
+    if overlap >= length:
+        raise SettingsError(
+            f"The overlap of {overlap} samples must be shorter than a segment of {length}; "
+            "lower --overlap."
+        )
+    if nfft < length:
+        raise SettingsError(
+            f"nfft of {nfft} samples is shorter than a segment of {length}, which is padded and "
+            "never cut; raise --nfft."
+        )
+    samples = record.sweep_samples
+    if segment_count(samples, length, overlap) == 0:
+        raise EstimateError(
+            f"{record.path}: the sweep has {samples} samples ({samples / record.rate_hz:g} s), "
+            f"fewer than one Welch segment of {length}{_remedy(samples)}"
+        )
+
+
+def _remedy(samples: int) -> str:
+    """Say what would fit a sweep of so many samples, as the end of a sentence."""
+    try:
+        length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
+    except SpectralError:
+        return "; that is too little for any estimate."
+    return (
+        f"; --segment {length} --overlap {overlap} makes {PAPER_SEGMENTS} segments of it, "
+        "and --frf fft needs none."
+    )
+
+
+def estimate_warnings(
+    record: Record, settings: WelchSettings, response: FrequencyResponse
+) -> tuple[str, ...]:
+    """Sentences on what makes an estimate doubtful."""
+    found = []
+    is_welch = settings.estimator != "fft"
+    length = (
+        settings.segmentation(record.rate_hz).segment_length if is_welch else len(record.time_s)
+    )
+    if is_welch and response.segments < PAPER_SEGMENTS:
+        found.append(
+            f"Only {response.segments} Welch segment(s) of {length} samples fit "
+            f"the sweep of {record.sweep_samples}{_remedy(record.sweep_samples)}"
+        )
+    resolution_hz = record.rate_hz / length
+    first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
+    if resolution_hz > first_mode_hz:
+        found.append(
+            f"A transform of {1 / resolution_hz:.3g} s resolves {resolution_hz:.3g} Hz and cannot "
+            f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
+            "longer."
+        )
+    excited_hz = _excited_band_hz(record.metadata)
+    first_hz, last_hz = settings.band_hz
+    if excited_hz is not None and (excited_hz[0] > first_hz or excited_hz[1] < last_hz):
+        found.append(
+            f"The band {first_hz:g} to {last_hz:g} Hz reaches beyond the excitation "
+            f"({excited_hz[0]:g} to {excited_hz[1]:g} Hz): what was not excited is noise; "
+            "narrow --band."
+        )
+    return tuple(found)
+
+
+def _excited_band_hz(metadata: Mapping[str, str]) -> tuple[float, float] | None:
+    """Band of the excitation, which may have swept it either way; None if the file lacks it."""
+    try:
+        start_hz, stop_hz = float(metadata["start_hz"]), float(metadata["stop_hz"])
+    except (KeyError, ValueError):
+        return None
+    return min(start_hz, stop_hz), max(start_hz, stop_hz)
