@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import Campaign
     from analysis.identify import RecordAnalysis, Selection, Setting
     from analysis.models import WelchSettings
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
     from analysis.record import Record
     from analysis.welch_aware import WelchAwareFit
     from rigd.spectral import FrequencyResponse
@@ -69,7 +69,7 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
         The settings do not suit the record, or its angle does not move.
     """
     from analysis.models import WelchSettings
-    from analysis.paper.estimate import estimate
+    from analysis.paper import estimate
     from analysis.suited import welch_settings
 
     return estimate(record, welch_settings(record, settings or WelchSettings()))[0]
@@ -171,7 +171,7 @@ def fit(
         )
     if method == "welch":
         from analysis.models import PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
-        from analysis.paper.route import analyse
+        from analysis.paper import analyse
         from analysis.suited import welch_settings
 
         settings = WelchSettings(

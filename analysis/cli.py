@@ -27,7 +27,7 @@ from analysis.commands.welch_options import (
     choice,
     welch_settings,
 )
-from rigd.runtime.signals import raise_on
+from rigd.runtime import raise_on
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

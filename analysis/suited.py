@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from analysis.models import WelchSettings
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
     from analysis.record import Record
 
 Band = tuple[float, float]
@@ -53,7 +53,7 @@ def check_record_band(record: Record, asked_hz: Band | None) -> None:
     SettingsError
         It ends too high.
     """
-    from analysis.paper.estimate import SettingsError
+    from analysis.paper import SettingsError
 
     limit_hz = LARGEST_SHARE_OF_RATE * record.rate_hz
     if asked_hz is not None and asked_hz[1] > limit_hz:
@@ -138,8 +138,7 @@ def welch_analysis(
     EstimateError
         They were to be run, and cannot be.
     """
-    from analysis.paper.estimate import EstimateError, SettingsError
-    from analysis.paper.route import analyse
+    from analysis.paper import EstimateError, SettingsError, analyse
 
     optional = optional and settings.are_usual
     reason = against_welch(record, asked_hz) if optional else None

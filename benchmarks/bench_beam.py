@@ -13,7 +13,7 @@ import numpy as np
 from timing import least_s
 
 from rigd.beam import Beam, Damping, TransferGrid, couple, propagator, realise
-from rigd.sim.plant import SimulatedPlant
+from rigd.sim import SimulatedPlant
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 DAMPING = Damping(7.1e-5, 0.996, 0.055, 0.594)

@@ -31,7 +31,7 @@ from analysis.campaigns.session import SessionTask, analyse_session
 from analysis.campaigns.write import write_campaign
 from analysis.identify import BAND_HZ
 from analysis.models import STRUCTURES, FrequencyResponseModel, Unknowns, WelchSettings, weights
-from analysis.paper.fit import fit_many
+from analysis.paper import fit_many
 
 SESSIONS = 20
 JOBS = 2

@@ -21,10 +21,9 @@ from bench_welch_aware import PLANTS
 from exact_sessions import BAND_HZ, LINK, RATE_HZ, SWEEP
 from numpy.typing import NDArray
 
-from analysis.identify import Plant
-from analysis.identify.predictor import ResponseGrid
+from analysis.identify import Plant, ResponseGrid
 from analysis.models import STRUCTURES
-from analysis.paper.fit import fit_frf
+from analysis.paper import fit_frf
 from analysis.welch_aware import fit_welch_aware
 from rigd.spectral import FrequencyResponse, Segmentation, instrumental_response, welch_response
 

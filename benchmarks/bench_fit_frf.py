@@ -21,7 +21,7 @@ from scipy.optimize import differential_evolution, least_squares
 from timing import least_s
 
 from analysis.models import STRUCTURES, Structure
-from analysis.paper.fit import FrfFit, fit_frf, fit_many
+from analysis.paper import FrfFit, fit_frf, fit_many
 from rigd.beam import Beam, Damping, TransferGrid
 from rigd.session import read_session
 from rigd.spectral import FrequencyResponse, welch_response

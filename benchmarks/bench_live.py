@@ -15,14 +15,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench import loops
-from rigd.bench.measure import Measurement, figures, measurement
-from rigd.engine.ipc import LIVE, SINGLE_THREADED
-from rigd.engine.shared_state import Phase
-from rigd.excitation.named import make_excitation
+from rigd.bench import Measurement, figures, loops, measurement
+from rigd.engine import LIVE, SINGLE_THREADED, Phase
+from rigd.excitation import make_excitation
 from rigd.profile import load_profile
-from rigd.runner.request import Order
-from rigd.runtime.signals import StopRequest
+from rigd.runner import Order
+from rigd.runtime import StopRequest
 from rigd.session import read_session
 
 RATE_HZ = 1000.0

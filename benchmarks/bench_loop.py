@@ -14,11 +14,19 @@ import statistics
 import sys
 from pathlib import Path
 
-from rigd.bench import cyclictest, loops
-from rigd.bench.measure import HELD, Figures, Measurement, figures
-from rigd.bench.program import HIGHEST_HZ, core_of, cores_beside
-from rigd.checks.machine import settings_granted
-from rigd.engine.ipc import SINGLE_THREADED
+from rigd.bench import (
+    HELD,
+    HIGHEST_HZ,
+    Figures,
+    Measurement,
+    core_of,
+    cores_beside,
+    cyclictest,
+    figures,
+    loops,
+)
+from rigd.checks import settings_granted
+from rigd.engine import SINGLE_THREADED
 from rigd.profile import load_profile
 
 RATE_HZ = 1000.0

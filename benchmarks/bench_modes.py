@@ -31,7 +31,7 @@ from analysis.models import STRUCTURES
 from rigd.beam import transfer
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
-from rigd.runner.planning import Foresight
+from rigd.runner import Foresight
 
 POLE_RAD_S = 80.0
 

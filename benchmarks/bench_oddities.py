@@ -18,10 +18,9 @@ import oddities_figures as draw
 from exact_sessions import LINK, Session, session
 from numpy.typing import NDArray
 
-from analysis.identify import Plant, RecordFit, Selection, fit_record, select
-from analysis.identify.predictor import ResponseGrid
+from analysis.identify import Plant, RecordFit, ResponseGrid, Selection, fit_record, select
 from analysis.models import STRUCTURES
-from analysis.paper.fit import fit_many
+from analysis.paper import fit_many
 from analysis.welch_aware import WelchAwareFit
 from rigd.beam import Beam, Damping, modes
 from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, segment_count

@@ -26,16 +26,18 @@ from numpy.typing import NDArray
 
 from analysis.identify import (
     SETTINGS,
+    Comparison,
     Measurement,
+    Objective,
     Plant,
     RecordAnalysis,
     RecordFit,
+    Steps,
+    Unknowns,
+    descend,
     fit_record,
+    mode_poles,
 )
-from analysis.identify.free_decay import mode_poles
-from analysis.identify.optimizer import descend
-from analysis.identify.parametrization import Steps, Unknowns
-from analysis.identify.problem import Comparison, Objective
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, transfer
 

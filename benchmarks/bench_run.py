@@ -14,9 +14,8 @@ import numpy as np
 from timing import least_s
 
 from rigd.control import PidController, design_pid
-from rigd.devices.registry import open_devices
-from rigd.engine.cycle import Cycle, make_watch
-from rigd.engine.timing import Metronome, VirtualClock
+from rigd.devices import open_devices
+from rigd.engine import Cycle, Metronome, VirtualClock, make_watch
 from rigd.profile import load_profile
 
 RIGD = Path(sys.executable).with_name("rigd")

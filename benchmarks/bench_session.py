@@ -13,15 +13,18 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from rigd.session import SessionWriter, read_session
-from rigd.session.format import (
+from rigd.session import (
     CONTROL_SIZE,
     SAMPLE_FIELDS,
+    SAMPLE_SCHEMA,
     SAMPLE_SIZE,
+    SessionWriter,
+    message_class,
     pack_control_into,
     pack_sample_into,
+    read_session,
+    schema_data,
 )
-from rigd.session.schema import SAMPLE_SCHEMA, message_class, schema_data
 
 SAMPLES = 120_000
 CONTROL_EVERY = 10

@@ -19,7 +19,7 @@ from exact_sessions import LINK, SWEEP, Session, session
 
 from analysis.identify import SETTINGS, Plant, fit_record
 from analysis.models import STRUCTURES
-from analysis.paper.fit import fit_frf
+from analysis.paper import fit_frf
 from analysis.welch_aware import WelchAwareFit, fit_welch_aware
 from rigd.beam import Beam, Damping
 from rigd.spectral import Segmentation

@@ -24,14 +24,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.devices.ati.can_sensor import AtiCanSensor
-from rigd.devices.ati.serial_sensor import AtiSerialSensor
-from rigd.devices.canbus import CanExchange
-from rigd.devices.canbus.port import SocketPort
-from rigd.devices.cia402.drive import Cia402Drive
-from rigd.devices.contracts import Wrench, WrenchSensor
-from rigd.devices.simulator import SimulatorAddress, find_simulator
-from rigd.engine.realtime import collect_no_garbage, obtain
+from rigd.devices import SimulatorAddress, Wrench, WrenchSensor, find_simulator
+from rigd.devices.ati import AtiCanSensor, AtiSerialSensor
+from rigd.devices.canbus import CanExchange, SocketPort
+from rigd.devices.cia402 import Cia402Drive
+from rigd.engine import collect_no_garbage, obtain
 from rigd.profile import load_profile
 
 BLOCKS, TICKS, SETTLING = 20, 250, 20

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import Measurement, Plant
-from analysis.identify.predictor import ResponseGrid
+from analysis.identify import Measurement, Plant, ResponseGrid
 from analysis.models import STRUCTURES
 from analysis.welch_aware import WelchAwareFit, fit_welch_aware
 from rigd.beam import Beam

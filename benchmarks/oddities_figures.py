@@ -9,7 +9,7 @@ import numpy as np
 from exact_sessions import LINK
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from analysis.identify.predictor import ResponseGrid
+from analysis.identify import ResponseGrid
 from analysis.report import style
 from analysis.report.record_figure_bands import loss_factors
 from rigd.beam import Damping, transfer

@@ -12,7 +12,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, _end)
     _fill_standard_descriptors()
     from rigd.cli.app import main as run
-    from rigd.runtime.signals import let_pass
+    from rigd.runtime import let_pass
 
     try:
         run()

@@ -34,7 +34,7 @@ class LoneSessionError(CampaignError):
 def task_errors() -> tuple[type[Exception], ...]:
     """Errors that concern one session and leave the others as they are."""
     from analysis.identify import MeasurementError
-    from analysis.paper.estimate import EstimateError
+    from analysis.paper import EstimateError
     from analysis.record import RecordError
     from rigd.session import SessionError
 

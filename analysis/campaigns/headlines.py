@@ -6,9 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.campaigns.random_effects import t_quantile
-from analysis.identify import Quantity, Size, headline_json
-from analysis.identify.headline import Mode, Numbers, Simpler
-from analysis.identify.verdict import STRONG
+from analysis.identify import STRONG, Mode, Numbers, Quantity, Simpler, Size, headline_json
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
 
 if TYPE_CHECKING:
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.ranking import RankedStructure
     from analysis.campaigns.verdict import CampaignVerdict
-    from analysis.identify.headline import StructureStatus
+    from analysis.identify import StructureStatus
 
 _UNEXPLAINED: Final = "part of the records is unexplained"
 _MIXTURE: Final = "the mean of a mixture: sessions differ in it in kind"

@@ -15,7 +15,7 @@ import numpy as np
 
 from analysis.campaigns.common_structure import common_structure, freest_estimate
 from analysis.campaigns.random_effects import chance_of, random_effects
-from analysis.identify.predictor import LOGARITHMIC
+from analysis.identify import LOGARITHMIC
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -13,7 +13,7 @@ import numpy as np
 
 from analysis.campaigns.parameter_statistics import fits_by_model
 from analysis.models import PARAMETERS, STRUCTURES, FrequencyResponseModel
-from analysis.paper.route import fit_indices, peak_deviation, resonant_peaks
+from analysis.paper import fit_indices, peak_deviation, resonant_peaks
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.estimates import WelchFit
     from analysis.campaigns.session import SessionResult
     from analysis.models import Parameter
-    from analysis.paper.route import Indices, Peak
+    from analysis.paper import Indices, Peak
     from rigd.beam import Beam, Damping
 
 

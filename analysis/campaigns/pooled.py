@@ -10,9 +10,7 @@ import numpy as np
 
 from analysis.campaigns.pooled_modes import PooledMode, pooled_modes
 from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile
-from analysis.identify import SETTINGS, Plant
-from analysis.identify.predictor import LOGARITHMIC
-from analysis.identify.uncertainty import damping_size
+from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
@@ -23,8 +21,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns.estimates import RecordEstimate
     from analysis.campaigns.session import SessionResult
-    from analysis.identify.headline import Damping
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify import Damping, Order
 
 _FEWEST: Final = 2
 _DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.common_structure import freest_estimate
 from analysis.campaigns.random_effects import t_quantile
-from analysis.identify.profile_likelihood import WIDEST_SHARE
-from analysis.identify.verdict import STRONG
+from analysis.identify import STRONG, WIDEST_SHARE
 from analysis.models import ORDER_RANGE, STRUCTURES
 
 if TYPE_CHECKING:
@@ -17,8 +16,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns.homogeneity import Homogeneity
     from analysis.campaigns.pooled import PooledEstimate, PooledParameter
-    from analysis.identify import Verdict
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify import Order, Verdict
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 

@@ -10,7 +10,7 @@ from analysis.campaigns.nominal import best_models
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import style
 from analysis.report.frf_figure import line_styles
-from rigd.view.frequency_charts import magnitude_db, phase_deg
+from rigd.view import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

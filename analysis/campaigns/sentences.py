@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.campaigns.pooled_modes import PooledMode
     from analysis.campaigns.pooled_orders import PooledOrder
     from analysis.campaigns.validation import LeftOutError, LostTrial
-    from analysis.identify.profile_likelihood import Order
+    from analysis.identify import Order
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")

@@ -12,7 +12,7 @@ from analysis.campaigns.errors import task_errors
 from analysis.campaigns.estimates import RecordEstimate, WelchFit
 from analysis.campaigns.experiment import Experiment
 from analysis.models import RECORD_BAND_HZ, WelchSettings
-from analysis.paper.route import Indices, fit_indices
+from analysis.paper import Indices, fit_indices
 from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import Candidate, Setting, Verdict
-    from analysis.paper.route import Peak
+    from analysis.paper import Peak
     from analysis.record import Record
     from rigd.beam import Beam
 
@@ -200,8 +200,7 @@ def _whole_record(
     record: Record, task: SessionTask, measured: FrequencyResponse
 ) -> tuple[tuple[RecordEstimate, ...], Verdict, dict[str, Any]]:
     """Select a structure on the whole record; of all fits, keep it and those asked for."""
-    from analysis.identify import Measurement, headline_json, select
-    from analysis.identify.predictor import ResponseGrid
+    from analysis.identify import Measurement, ResponseGrid, headline_json, select
     from analysis.models import STRUCTURES
     from analysis.suited import record_band_hz
 

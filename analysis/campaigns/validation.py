@@ -125,7 +125,7 @@ def left_out_errors(
 
     A session that the whole-record estimator cannot use is told, not raised: it is one of many.
     """
-    from analysis.identify.problem import Comparison
+    from analysis.identify import Comparison
     from analysis.record import load_record
     from analysis.suited import record_band_hz
 

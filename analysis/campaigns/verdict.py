@@ -10,7 +10,7 @@ from analysis.campaigns import sentences, specimen_sentences
 from analysis.campaigns.common_findings import CommonFinding, common_findings
 from analysis.campaigns.common_structure import freest_estimate
 from analysis.campaigns.pooled_orders import PooledOrder, pooled_order, rivals
-from analysis.identify.verdict import EVEN, STRONG
+from analysis.identify import EVEN, STRONG
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

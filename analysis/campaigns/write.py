@@ -123,7 +123,7 @@ def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
 
 def _signals(campaign: Campaign) -> Figure:
     """Draw the first session's signals as an example, as the paper does."""
-    from analysis.paper.route import analyse
+    from analysis.paper import analyse
     from analysis.record import load_record
     from analysis.report.signals_figure import signals_figure
 

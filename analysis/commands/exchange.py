@@ -234,7 +234,7 @@ def export_frf_command(
 def _explained(run: Callable[[], None]) -> int:
     """Run a command and return its exit code; what went wrong is said in a sentence or two."""
     from analysis.exchange.errors import ExchangeError, TargetError
-    from analysis.paper.estimate import EstimateError, SettingsError
+    from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError, OutputExistsError
     from rigd.session import SessionError, SessionExistsError

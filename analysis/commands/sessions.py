@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import Setting
     from analysis.models import WelchSettings
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
     from analysis.record import Record
     from analysis.report.html import Subject
 
@@ -143,7 +143,7 @@ def _analyse_all(
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from analysis.identify import MeasurementError
-    from analysis.paper.estimate import EstimateError, SettingsError
+    from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
     from analysis.report.folder import OutputError
     from rigd.session import SessionError

@@ -9,11 +9,10 @@ import numpy as np
 
 import rigd
 from analysis.exchange.errors import ExchangeError
-from analysis.paper.estimate import estimate
+from analysis.paper import estimate
 from analysis.record import load_record
 from analysis.suited import welch_settings
-from rigd.session import read_session
-from rigd.session.format import SAMPLE_FIELDS
+from rigd.session import SAMPLE_FIELDS, read_session
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.session import SessionWriter
-from rigd.session.format import SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
+from rigd.session import SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, SessionWriter, field_tag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify import SETTINGS, fit_record
 from analysis.identify.channel_checks import wrong_scale
+from analysis.identify.fit import fit_record
 from analysis.identify.leakage import without_leakage
 from analysis.identify.noise import Noise
 from analysis.identify.parametrization import Unknowns
+from analysis.identify.predictor import SETTINGS
 from analysis.identify.problem import Comparison
 from analysis.identify.refit import Refit, adapted, resonances_kept, vector
 from analysis.identify.residual_tests import whiteness
@@ -26,9 +27,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Measurement, Plant, RecordAnalysis, RecordFit, Setting
+    from analysis.identify.data import Measurement
     from analysis.identify.drag import DragEstimate
     from analysis.identify.finding import Finding
+    from analysis.identify.predictor import Plant, Setting
+    from analysis.identify.result import RecordAnalysis, RecordFit
     from analysis.models import Structure
 
 Kind = tuple[bool, tuple[str, ...]]

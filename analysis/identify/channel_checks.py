@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Measurement
     from analysis.identify.candidates import Field
+    from analysis.identify.data import Measurement
     from analysis.identify.problem import Comparison
 
 _FEWEST_FLAT: Final = 4

@@ -17,10 +17,11 @@ from analysis.identify.verdict import EVEN, STRONG, rivals
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.identify import ModeEstimate, Setting
     from analysis.identify.candidates import Field
     from analysis.identify.nonlinear import NonlinearForce
+    from analysis.identify.predictor import Setting
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
+    from analysis.identify.result import ModeEstimate
 
 _MANY: Final = 40
 """Evaluations of a descent that is to end."""

@@ -36,9 +36,9 @@ from rigd.beam import mode_shape
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify import Plant
     from analysis.identify.candidates import Field
     from analysis.identify.noise import Noise
+    from analysis.identify.predictor import Plant
     from analysis.identify.problem import Comparison
     from analysis.models import Structure
 

@@ -50,8 +50,7 @@ import numpy as np
 from analysis.identify.data import fast_length
 from analysis.identify.free_decay import mode_poles
 from analysis.identify.predictor import FIRST_OFFSET, eigenvalues, torque_channel
-from rigd.beam.air_drag import AIR_DENSITY_KG_PER_M3, DragGrid
-from rigd.beam.modes import poles_for_eigenvalues
+from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify.predictor import FIRST_OFFSET, eigenvalues, offset_name
-from rigd.beam import LoadedBeam
-from rigd.beam.modes import poles_for_eigenvalues
+from rigd.beam import LoadedBeam, poles_for_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -19,9 +19,9 @@ from analysis.models import COEFFICIENT_OF
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
 
-    from analysis.identify import DampingSize, ModeEstimate, RecordFit
     from analysis.identify.candidates import Candidate, Field
     from analysis.identify.finding import Finding
+    from analysis.identify.result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify.verdict import OrderVerdict
 
 _NORMAL_95: Final = 1.959963984540054

@@ -13,8 +13,8 @@ import numpy as np
 from analysis.identify.noise import Noise, noise_of, smooth_power
 
 if TYPE_CHECKING:
-    from analysis.identify import RecordFit
     from analysis.identify.problem import Comparison
+    from analysis.identify.result import RecordFit
 
 _NEAR_HZ: Final = 5.0
 _SAME_HZ: Final = 0.1

@@ -38,8 +38,8 @@ from rigd.beam import clamped_free_eigenvalues, participation
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify import Plant
     from analysis.identify.candidates import Candidate, Field
+    from analysis.identify.predictor import Plant
     from analysis.identify.problem import Comparison
 
 Kind = Literal["cubic stiffness", "quadratic stiffness", "quadratic drag"]

@@ -15,8 +15,8 @@ from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify import Plant
     from analysis.identify.candidates import Candidate, Field
+    from analysis.identify.predictor import Plant
     from analysis.models import Structure
 
 _FAR: Final = 25.0

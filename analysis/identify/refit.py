@@ -27,10 +27,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import ModeEstimate, Plant, RecordFit
     from analysis.identify.optimizer import NormalEquations
     from analysis.identify.parametrization import Unknowns
+    from analysis.identify.predictor import Plant
     from analysis.identify.problem import Comparison
+    from analysis.identify.result import ModeEstimate, RecordFit
     from analysis.models import Structure
 
 _SMALL: Final = 1e-5

@@ -22,7 +22,7 @@ from analysis.identify.optimizer import NormalEquations, descend
 from analysis.identify.parametrization import Steps
 from analysis.identify.predictor import ResponseGrid
 from analysis.identify.problem import Objective
-from analysis.paper.fit import thinned
+from analysis.paper import thinned
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

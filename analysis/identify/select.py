@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify import RecordAnalysis
 from analysis.identify.candidates import Field
 from analysis.identify.diagnostics import findings, unexplained
 from analysis.identify.drag import damping_with_amplitude, with_air_drag
@@ -23,6 +22,7 @@ from analysis.identify.residual_tests import (
     input_relation,
     whiteness,
 )
+from analysis.identify.result import RecordAnalysis
 from analysis.identify.time_varying import along_time, changing
 from analysis.identify.verdict import (
     EVEN,
@@ -39,10 +39,12 @@ from analysis.identify.visible_modes import driven, visible_modes
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from analysis.identify import Measurement, RecordFit, Setting
     from analysis.identify.candidates import Candidate, Field
+    from analysis.identify.data import Measurement
     from analysis.identify.finding import Finding
     from analysis.identify.headline import Headline, Quantity, Simpler
+    from analysis.identify.predictor import Setting
+    from analysis.identify.result import RecordFit
     from analysis.identify.time_varying import Change
     from analysis.identify.verdict import OrderVerdict
 

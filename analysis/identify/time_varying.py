@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Plant
     from analysis.identify.candidates import Candidate, Field
     from analysis.identify.finding import Kind
+    from analysis.identify.predictor import Plant
     from analysis.identify.problem import Comparison
 
 _PADDED: Final = 1.5

@@ -10,9 +10,9 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify import RecordFit
     from analysis.identify.noise import Noise
     from analysis.identify.problem import Comparison
+    from analysis.identify.result import RecordFit
 
 _EVIDENCE: Final = 400.0
 """Deviance by which a response with a resonance must be better than a smooth one: the resonance is

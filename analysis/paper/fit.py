@@ -37,7 +37,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.optimizer import Box, Minimum, NormalEquations, Recent, descend
+from analysis.identify import Box, Minimum, NormalEquations, Recent, descend
 from analysis.models import (
     PARAMETERS,
     STRUCTURES,

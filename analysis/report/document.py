@@ -17,7 +17,7 @@ from analysis.report.record_indices import whole_record_indices
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from analysis.paper.route import FittedModel, WelchAnalysis
+    from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report.html import Subject
 

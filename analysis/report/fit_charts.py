@@ -8,9 +8,23 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.view.chart import Axis, Chart, Key, Thinning, decades, steps
-from rigd.view.frequency_charts import magnitude_db, phase_deg
-from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
+from rigd.view import (
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY_BLUE,
+    VERMILION,
+    Axis,
+    Chart,
+    Color,
+    Key,
+    Thinning,
+    decades,
+    magnitude_db,
+    phase_deg,
+    steps,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -19,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rerun import RecordingStream
 
-    from analysis.paper.route import FittedModel, WelchAnalysis
+    from analysis.paper import FittedModel, WelchAnalysis
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]

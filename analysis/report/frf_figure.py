@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.paper.route import FittedModel, WelchAnalysis
+    from analysis.paper import FittedModel, WelchAnalysis
 
 _COLUMNS: Final = 500
 _LEGEND_COLUMNS: Final = 4

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from analysis.paper.route import loudest_moment_s
+from analysis.paper import loudest_moment_s
 from analysis.report import style
 from rigd.beam import undamped_frequencies_rad_s
 

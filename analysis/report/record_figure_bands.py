@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.predictor import LOGARITHMIC, ResponseGrid
+from analysis.identify import LOGARITHMIC, ResponseGrid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

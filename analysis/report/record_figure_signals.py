@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.identify import Measurement
-from analysis.identify.predictor import Prediction
-from analysis.paper.route import band_limited
+from analysis.identify import Measurement, Prediction
+from analysis.paper import band_limited
 from analysis.report import style
 from analysis.report.moments import enlarge, mark, resonance_moments
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.identify.predictor import ResponseGrid
+from analysis.identify import ResponseGrid
 from analysis.models import FrequencyResponseModel
-from analysis.paper.route import fit_indices
+from analysis.paper import fit_indices
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import RecordFit
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
     from rigd.spectral import FrequencyResponse
 
     IndexValues = dict[str, float | None]

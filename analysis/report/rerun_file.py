@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
-from rigd.view.recorded import RrdFileError, check_new, new_rrd_file
+from rigd.view import RrdFileError, check_new, new_rrd_file
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
 
 
 def check_rerun_file(path: Path) -> None:
@@ -40,7 +40,7 @@ def write_rerun_file(analysis: WelchAnalysis, path: Path) -> None:
     """
     from analysis.report import fit_charts
     from analysis.report.write import tables_text
-    from rigd.view.recorded import draw_session, recorded_blueprint
+    from rigd.view import draw_session, recorded_blueprint
 
     session = read_session(analysis.record.path)
     timings = read_timings(analysis.record.path)

@@ -10,7 +10,7 @@ from analysis.report.moments import enlarge, mark, resonance_moments
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
 
 
 def signals_figure(analysis: WelchAnalysis) -> Figure:

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from analysis.paper.route import LARGEST_SHIFT
+from analysis.paper import LARGEST_SHIFT
 from analysis.report.html.reported import MARK, footnotes, unreported
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from analysis.paper.route import FittedModel, Peak, WelchAnalysis
+    from analysis.paper import FittedModel, Peak, WelchAnalysis
     from rigd.beam import Mode
 
 _COLUMNS: Final = (("zeta", "ζ (1e-5)", 1e5), ("alpha", "α", 1.0), ("gamma", "γ (1e-2)", 1e2),

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.paper.route import band_limited, modelled_torque
+from analysis.paper import band_limited, modelled_torque
 from analysis.report import style
 from analysis.report.moments import enlarge, mark, resonance_moments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from analysis.paper.route import FittedModel, WelchAnalysis
+    from analysis.paper import FittedModel, WelchAnalysis
 
 
 def best_model(analysis: WelchAnalysis) -> FittedModel:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
     from analysis.report.html import Subject
 
 _FIGURES: Final = ("signals", "frf", "torque")

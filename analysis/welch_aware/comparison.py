@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.data import Decimation
-from analysis.identify.predictor import Prediction
+from analysis.identify import Decimation, Prediction
 from analysis.models import weights
 from analysis.welch_aware.estimator import WelchAwareError, WelchEstimator, bins_of
 from rigd.beam import undamped_frequencies_rad_s

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.spectral import segment_count
-from rigd.spectral.frf import window_named
+from rigd.spectral import segment_count, window_named
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

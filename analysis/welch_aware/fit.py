@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify import SETTINGS, Plant
-from analysis.identify.optimizer import Box, descend
-from analysis.identify.parametrization import Unknowns
+from analysis.identify import SETTINGS, Box, Plant, Unknowns, descend
 from analysis.models import STRUCTURES, Weighting, weighting_name, weights
 from analysis.welch_aware.comparison import Measured
 from analysis.welch_aware.estimator import WelchAwareError
@@ -22,8 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Setting
-    from analysis.identify.optimizer import Minimum
+    from analysis.identify import Minimum, Setting
     from analysis.models import Structure
     from analysis.welch_aware.result import WelchAwareFit
     from rigd.beam import Beam

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.identify.optimizer import NormalEquations, Recent
+from analysis.identify import NormalEquations, Recent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify.parametrization import Unknowns
+    from analysis.identify import Unknowns
     from analysis.welch_aware.comparison import Comparison
 
     _Linearised = tuple[NDArray[np.complex128], NDArray[np.complex128]]

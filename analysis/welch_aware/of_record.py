@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from analysis.models import STRUCTURES
-from analysis.paper.estimate import SettingsError, estimate, moving_reference_rad
+from analysis.paper import SettingsError, estimate, moving_reference_rad
 from analysis.welch_aware.fit import fit_welch_aware
 
 if TYPE_CHECKING:

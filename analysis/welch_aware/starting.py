@@ -11,16 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.optimizer import Box, Minimum, NormalEquations, descend
-from analysis.identify.predictor import ResponseGrid
-from analysis.identify.search import resonance_shift
-from analysis.paper.fit import starts, thinned
+from analysis.identify import Box, Minimum, NormalEquations, ResponseGrid, descend, resonance_shift
+from analysis.paper import starts, thinned
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify.parametrization import Unknowns
-    from analysis.identify.predictor import Plant
+    from analysis.identify import Plant, Unknowns
 
 _POINTS: Final = 400
 _TOLERANCE: Final = 1e-2

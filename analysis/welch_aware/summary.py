@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.identify.free_decay import Pole, mode_poles
-from analysis.identify.uncertainty import mode_table, parameter_uncertainty
+from analysis.identify import Pole, mode_poles, mode_table, parameter_uncertainty
 from analysis.welch_aware.result import WelchAwareFit
 from analysis.welch_aware.uncertainty import covariance_of_unknowns
 

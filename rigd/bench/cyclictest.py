@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigd.bench.measure import Measurement
-from rigd.engine.realtime import WAKE_UP_US
+from rigd.engine import WAKE_UP_US
 
 NAME = "cyclictest"
 _LARGEST_US = 50_000

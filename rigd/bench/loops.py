@@ -13,20 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from rigd.bench.measure import Measurement, UsageMeter, measurement
-from rigd.devices.parameters import Selection
-from rigd.engine.ipc import ChildError
-from rigd.engine.jobs import SessionJob
-from rigd.engine.ring import put_reference
-from rigd.engine.shared_state import Phase, Stop, Word
+from rigd.devices import Selection
+from rigd.engine import ChildError, Phase, SessionJob, Stop, Word, put_reference
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
-from rigd.runner.process_group import Crew
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig, RigError
-from rigd.runner.session import SessionFailedError, SessionProgress
-from rigd.runtime.signals import StopRequest
-from rigd.session import read_session
-from rigd.session.format import decode_samples
+from rigd.runner import Crew, Order, Rig, RigError, SessionFailedError, SessionProgress
+from rigd.runtime import StopRequest
+from rigd.session import decode_samples, read_session
 
 LOOK_S = 0.1
 AROUND_S = 3.5

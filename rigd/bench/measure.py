@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine.shared_state import Phase
+from rigd.engine import Phase
 
 
 @dataclass(frozen=True, slots=True)

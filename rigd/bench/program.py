@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 from rigd.bench import cyclictest, loops
 from rigd.bench.measure import HELD, Measurement, figures, pooled
-from rigd.checks.machine import settings_granted
-from rigd.engine.realtime import REFUSED
+from rigd.checks import settings_granted
+from rigd.engine import REFUSED
 from rigd.profile import Profile
 
 ROUNDS = 3

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rigd.bench.measure import HELD, STALL_US, Measurement, figures
 from rigd.bench.program import Results
-from rigd.engine.realtime import REFUSED
+from rigd.engine import REFUSED
 
 _FIRST_US, _LAST_US = 1.0, 100_000.0
 _STEPS = (1.0, 2.0, 5.0)

@@ -1,5 +1,5 @@
 """``rigd check``: everything that can be known of a rig before a torque acts, in rows."""
 
-from rigd.checks.rows import Row, Verdict, overall
+import lazy_loader as lazy
 
-__all__ = ["Row", "Verdict", "overall"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -15,13 +15,17 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from rigd.checks.rows import Row, Verdict, grade, name_of, value_of
-from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
-from rigd.devices.cia402.setup import Outfit
-from rigd.devices.contracts import DeviceError, Devices
-from rigd.devices.parameters import RigParameters
-from rigd.devices.registry import Reality, open_devices, reality
-from rigd.devices.simulator import find_simulator
-from rigd.engine.timing import RealClock
+from rigd.devices import (
+    DeviceError,
+    Devices,
+    Reality,
+    RigParameters,
+    find_simulator,
+    open_devices,
+    reality,
+)
+from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
+from rigd.engine import RealClock
 from rigd.profile import Profile
 
 _IN_HEX = ("vendor_id", "product_code", "supported_modes")

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rigd.checks.rows import Row, Verdict, grade
-from rigd.engine.realtime import LOCKED, REFUSED, isolated_cores
+from rigd.engine import LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
 
 _PATIENCE_S = 20.0

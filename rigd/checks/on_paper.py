@@ -36,18 +36,16 @@ from typing import TYPE_CHECKING
 
 from rigd.beam import RealisationError
 from rigd.checks.rows import Row, Verdict, grade
-from rigd.control import ControlDesignError, check_stability, close_loop
-from rigd.control.margins import Margins, loop_margins
-from rigd.devices.ati.serial_protocol import RECORD_BITS
-from rigd.devices.canbus.budget import MAX_LOAD, BusLoad, bus_load, check_identifiers
-from rigd.devices.cia402.suitability import Grade, judge
-from rigd.devices.eds import EdsError, read_eds
-from rigd.devices.parameters import AtiSerial, RigParameters
+from rigd.control import ControlDesignError, Margins, check_stability, close_loop, loop_margins
+from rigd.devices import AtiSerial, EdsError, RigParameters, read_eds
+from rigd.devices.ati import RECORD_BITS
+from rigd.devices.canbus import MAX_LOAD, BusLoad, bus_load, check_identifiers
+from rigd.devices.cia402 import Grade, judge
 from rigd.profile import Profile
 from rigd.safety import Limits
 
 if TYPE_CHECKING:
-    from rigd.devices.parameters import RigParameters
+    from rigd.devices import RigParameters
 
 TOLERANCE = 1.2
 """Factor that the gains of command and torque reading may be wrong by, up and down."""

@@ -20,7 +20,7 @@ from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
-from rigd.runtime.signals import raise_on
+from rigd.runtime import raise_on
 
 
 def _tell(asked: bool) -> None:

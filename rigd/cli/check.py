@@ -11,7 +11,7 @@ import typer
 
 from rigd.cli.daemon import reset_by_daemon
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, AsJson, ProfileName, fail, profile_named
-from rigd.runtime.signals import raise_on
+from rigd.runtime import raise_on
 
 if TYPE_CHECKING:
     from rigd.bench import Results
@@ -46,13 +46,13 @@ def check(
         _report(_rows_of(eds, profile), as_json=as_json, on_paper=True)
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
-    from rigd.checks.rig import check_rig
+    from rigd.checks import check_rig
 
     _report(check_rig(rig_profile), as_json=as_json, on_paper=False)
 
 
 def _rows_of(eds: Path, profile: str | None) -> "list[Row]":
-    from rigd.checks.on_paper import eds_rows
+    from rigd.checks import eds_rows
 
     if profile is None:
         return list(eds_rows(eds, None))
@@ -74,7 +74,7 @@ def _report(rows: "list[Row]", *, as_json: bool, on_paper: bool) -> None:
         document = {"verdict": verdict, "rows": [row.as_dict() for row in rows]}
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
-        from rigd.checks.rows import OF_A_RIG, OF_AN_EDS, print_table
+        from rigd.checks import OF_A_RIG, OF_AN_EDS, print_table
 
         print_table(rows, OF_AN_EDS if on_paper else OF_A_RIG)
     if verdict == "failed":
@@ -97,8 +97,7 @@ def reset(
     if reset_by_daemon(profile):
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
-    from rigd.devices.contracts import DeviceError
-    from rigd.devices.wired_rig import reset_drive
+    from rigd.devices import DeviceError, reset_drive
 
     try:
         typer.echo(reset_drive(rig_profile.rig))
@@ -108,10 +107,10 @@ def reset(
 
 def _openable_profile(name: str) -> "Profile":
     """Load a profile whose devices this installation can open; any other ends the command."""
-    from rigd.engine.ipc import SINGLE_THREADED
+    from rigd.engine import SINGLE_THREADED
 
     os.environ.update(SINGLE_THREADED)
-    from rigd.devices.registry import UnknownDeviceError, check_selection
+    from rigd.devices import UnknownDeviceError, check_selection
 
     profile = profile_named(name)
     try:
@@ -152,7 +151,7 @@ def bench(
     Example: rigd bench --seconds 10
     """
     raise_on(signal.SIGTERM, signal.SIGHUP)
-    from rigd.engine.ipc import SINGLE_THREADED
+    from rigd.engine import SINGLE_THREADED
 
     os.environ.update(SINGLE_THREADED)
     rig_profile = profile_named(profile)
@@ -171,10 +170,9 @@ def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) 
     from rich.console import Console
     from rich.status import Status
 
-    from rigd.bench import Bench
-    from rigd.bench.loops import LoopError
-    from rigd.devices.registry import Reality, reality
-    from rigd.runtime.locks import RigBusyError, RigLock
+    from rigd.bench import Bench, LoopError
+    from rigd.devices import Reality, reality
+    from rigd.runtime import RigBusyError, RigLock
 
     hardware = reality(profile.rig) is Reality.HARDWARE
     console = Console(stderr=True)

@@ -27,7 +27,7 @@ from rigd.cli.options import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rigd.daemon.client import Client
+    from rigd.daemon import Client
 
 
 def serve(
@@ -49,16 +49,14 @@ def serve(
 
     Example: rigd serve --profile antenna_can --output /data/sessions
     """
-    from rigd.engine.ipc import SINGLE_THREADED
+    from rigd.engine import SINGLE_THREADED
 
     os.environ.update(SINGLE_THREADED)
-    from rigd.daemon.address import AddressError, UnknownGroupError
-    from rigd.daemon.main import run_daemon
-    from rigd.devices.registry import UnknownDeviceError
+    from rigd.daemon import AddressError, UnknownGroupError, run_daemon
+    from rigd.devices import UnknownDeviceError
     from rigd.profile import ProfileError
-    from rigd.runner.planning import RefusedError
-    from rigd.runner.request import load_rig, make_folder
-    from rigd.runtime.locks import RigBusyError
+    from rigd.runner import RefusedError, load_rig, make_folder
+    from rigd.runtime import RigBusyError
 
     try:
         rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
@@ -84,7 +82,7 @@ DaemonOf = Annotated[
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
     """Connect to the daemon of a profile; whatever goes wrong with it ends the command."""
-    from rigd.daemon.client import Client
+    from rigd.daemon import Client
 
     with _failing_by_the_daemon(), Client(_socket_of(profile)) as client:
         yield client
@@ -93,8 +91,7 @@ def daemon_of(profile: str | None) -> "Iterator[Client]":
 @contextmanager
 def _failing_by_the_daemon() -> Iterator[None]:
     """End the command with what a daemon says, or with what is known of one that is gone."""
-    from rigd.daemon.address import AddressError
-    from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError
+    from rigd.daemon import AddressError, DaemonGoneError, RefusedByDaemonError
 
     try:
         yield
@@ -107,7 +104,7 @@ def _failing_by_the_daemon() -> Iterator[None]:
 
 
 def _socket_of(profile: str | None) -> "Path":
-    from rigd.daemon.address import find
+    from rigd.daemon import find
 
     return find(rig_name(profile))
 
@@ -116,7 +113,7 @@ def rig_name(profile: str | None) -> str | None:
     """Return the name by which the daemon of a profile is found."""
     if profile is None:
         return None
-    from rigd.daemon.address import running, socket_path
+    from rigd.daemon import running, socket_path
 
     # Reading a profile takes a while, and is of no use where its daemon is known by that name.
     if any(path.name == socket_path(profile).name for path in running()):
@@ -169,7 +166,7 @@ def stop(
 
     Example: rigd stop
     """
-    from rigd.daemon.client import await_end, stop_session
+    from rigd.daemon import await_end, stop_session
 
     with _failing_by_the_daemon():
         path = _socket_of(profile)
@@ -241,7 +238,7 @@ def reset_by_daemon(profile: str | None) -> bool:
 
     A refusal or a failure ends the command.
     """
-    from rigd.daemon.address import running, socket_path
+    from rigd.daemon import running, socket_path
 
     sockets = running()
     if profile is None:
@@ -269,8 +266,7 @@ def _watch(profile: str | None) -> None:
     from rich.live import Live
 
     from rigd.cli.status_view import status_table
-    from rigd.daemon.address import AddressError, find
-    from rigd.daemon.client import Client, DaemonGoneError, RefusedByDaemonError
+    from rigd.daemon import AddressError, Client, DaemonGoneError, RefusedByDaemonError, find
 
     name = rig_name(profile)
     with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:

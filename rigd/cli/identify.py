@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rigd.excitation import Excitation
-    from rigd.identification.estimate import MotorEstimate
-    from rigd.identification.proposal import Proposal
+    from rigd.identification import MotorEstimate, Proposal
     from rigd.profile import Profile
 
     Session = Callable[..., Excitation]
@@ -126,9 +125,8 @@ def _run_sessions(
     stop, crew = start_crew(live=False)
     from rigd.identification import experiments
     from rigd.identification import proposal as tuning
-    from rigd.runner.foreground import ForegroundError, run_in_foreground
-    from rigd.runner.process_group import Crew
-    from rigd.runtime.signals import ignore
+    from rigd.runner import Crew, ForegroundError, run_in_foreground
+    from rigd.runtime import ignore
 
     def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
         def build(profile: "Profile") -> "Excitation":
@@ -177,9 +175,7 @@ def _run_sessions(
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
-    from rigd.identification.estimate import EstimateError, estimate_motor
-    from rigd.identification.proposal import propose
-    from rigd.identification.records import read_recording
+    from rigd.identification import EstimateError, estimate_motor, propose, read_recording
     from rigd.session import SessionError
 
     profile = profile_named(profile_name)

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, progress
-from rigd.runtime.signals import raise_on
-from rigd.view.recorded import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
+from rigd.runtime import raise_on
+from rigd.view import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
 
 if TYPE_CHECKING:
-    from rigd.live.server import LiveAddress
-    from rigd.live.viewer import Viewer
+    from rigd.live import LiveAddress, Viewer
 
 
 def has_screen() -> bool:
@@ -110,7 +109,7 @@ def live(
 
 def _rig_name(profile: str) -> str:
     """Return the name of a profile's rig; a profile that cannot be used ends the command."""
-    from rigd.daemon.client import find_views
+    from rigd.daemon import find_views
 
     if find_views(profile):
         return profile
@@ -121,7 +120,7 @@ def _rig_name(profile: str) -> str:
 
 def _only_one(rig: str | None) -> "LiveAddress | None":
     """Return the live view of a rig, if there is one; several end the command."""
-    from rigd.daemon.client import find_views
+    from rigd.daemon import find_views
 
     views = find_views(rig)
     if len(views) > 1:
@@ -138,7 +137,7 @@ def _await(rig: str | None) -> "LiveAddress":
 
 
 def _how_to_start(profile: str | None) -> str:
-    from rigd.daemon.client import daemons
+    from rigd.daemon import daemons
 
     of_rig = "" if profile is None else f" of the rig {profile}"
     name = profile or "NAME"
@@ -162,8 +161,7 @@ def _how_to_start(profile: str | None) -> str:
 
 def _show(view: "LiveAddress") -> None:
     """Keep a window open, on the live view that there is, until it is closed."""
-    from rigd.live.server import RerunError
-    from rigd.live.viewer import Viewer
+    from rigd.live import RerunError, Viewer
 
     with ended_gently(), scratch_folder() as scratch:
         try:
@@ -194,7 +192,7 @@ def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
     int
         The viewer's exit code, once the window is closed.
     """
-    from rigd.daemon.client import find_views
+    from rigd.daemon import find_views
 
     there = True
     while (code := viewer.exit_code) is None:
@@ -256,7 +254,7 @@ def replay(
             f"rigd replay {path} --web prints an address for a browser; {elsewhere}.",
             EXIT_FAILED,
         )
-    from rigd.live.server import RerunError
+    from rigd.live import RerunError
 
     with ended_gently(), scratch_folder() as scratch:
         recording = _as_recording(path, scratch)
@@ -300,7 +298,7 @@ def _check_shown(path: Path) -> None:
 def _convert(path: Path, out: Path) -> None:
     """Write a session as a recording for Rerun; what keeps it from that ends the command."""
     from rigd.session import SessionError, read_session, read_timings
-    from rigd.view.recorded import draw_session
+    from rigd.view import draw_session
 
     try:
         session, timings = read_session(path), read_timings(path)
@@ -324,7 +322,7 @@ def _as_recording(path: Path, scratch: Path) -> Path:
 
 
 def _open_window(recording: Path, scratch: Path, path: Path) -> None:
-    from rigd.live.viewer import Window
+    from rigd.live import Window
 
     with Window(recording, scratch) as window:
         typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
@@ -337,7 +335,7 @@ def _open_window(recording: Path, scratch: Path, path: Path) -> None:
 
 
 def _serve(recording: Path, scratch: Path, path: Path) -> None:
-    from rigd.live.viewer import PageOfFile
+    from rigd.live import PageOfFile
 
     with PageOfFile(recording, scratch) as page:
         typer.echo(page.address.page_url)

@@ -16,7 +16,7 @@ from rigd.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from rigd.profile.from_eds import Draft
+    from rigd.profile import Draft
 
 profiles_app = typer.Typer(
     help="List the hardware profiles, or write a new one from a drive's EDS file.",
@@ -39,8 +39,7 @@ def list_profiles() -> None:
 
     Example: rigd profiles list
     """
-    from rigd.profile import ProfileError, load_profile
-    from rigd.profile.load import known_profiles
+    from rigd.profile import ProfileError, known_profiles, load_profile
 
     for name in known_profiles():
         try:
@@ -70,10 +69,8 @@ def new(
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
-    from rigd.devices.eds import EdsError, read_eds
-    from rigd.profile import ProfileError
-    from rigd.profile.from_eds import Draft, UnusableDriveError
-    from rigd.profile.write import check_new, write_new
+    from rigd.devices import EdsError, read_eds
+    from rigd.profile import Draft, ProfileError, UnusableDriveError, check_new, write_new
 
     base = profile_named(start_from)
     try:

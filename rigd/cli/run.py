@@ -35,8 +35,8 @@ from rigd.cli.options import (
 from rigd.cli.start import CrewGroup, start_crew, start_sessions
 
 if TYPE_CHECKING:
-    from rigd.excitation.named import Value
-    from rigd.runner.session import SessionResult
+    from rigd.excitation import Value
+    from rigd.runner import SessionResult
 
 run_app = typer.Typer(
     name="run",
@@ -113,9 +113,8 @@ def run_sessions(
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note)
     stop, crew = start_crew(live=live)
-    from rigd.runner.foreground import ForegroundError, run_in_foreground
-    from rigd.runner.planning import excitation_for
-    from rigd.runtime.signals import ignore
+    from rigd.runner import ForegroundError, excitation_for, run_in_foreground
+    from rigd.runtime import ignore
 
     try:
         results = run_in_foreground(

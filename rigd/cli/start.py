@@ -29,10 +29,10 @@ from rigd.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from rigd.daemon.client import Client
-    from rigd.excitation.named import Value
-    from rigd.runner.process_group import Crew
-    from rigd.runtime.signals import StopRequest
+    from rigd.daemon import Client
+    from rigd.excitation import Value
+    from rigd.runner import Crew
+    from rigd.runtime import StopRequest
 
 
 class CrewGroup(TyperGroup):
@@ -57,9 +57,9 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.engine.ipc import SINGLE_THREADED, ChildError
-    from rigd.runner.process_group import Crew
-    from rigd.runtime.signals import StopRequest
+    from rigd.engine import SINGLE_THREADED, ChildError
+    from rigd.runner import Crew
+    from rigd.runtime import StopRequest
 
     stop = StopRequest()
     stop.catch()
@@ -243,7 +243,7 @@ class _ProgressView:
 
     def update(self, progress: dict[str, Any]) -> None:
         """Show where the session is."""
-        from rigd.engine.shared_state import Phase
+        from rigd.engine import Phase
 
         number = f" {progress['session']}/{progress['repeat']}" if progress["repeat"] > 1 else ""
         left = progress["time_left_s"]

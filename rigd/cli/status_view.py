@@ -9,7 +9,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rigd.engine.shared_state import Phase
+from rigd.engine import Phase
 
 _STYLES = {
     "idle": "dim",

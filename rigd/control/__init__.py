@@ -1,29 +1,5 @@
 """The motor's controller: design by pole placement, discrete step, and its closed loop."""
 
-from rigd.control.closed_loop import (
-    ClosedLoop,
-    LoopModel,
-    LoopResponse,
-    check_stability,
-    close_loop,
-)
-from rigd.control.pid import (
-    ControlDesignError,
-    ControlSettings,
-    PidController,
-    PidGains,
-    design_pid,
-)
+import lazy_loader as lazy
 
-__all__ = [
-    "ClosedLoop",
-    "ControlDesignError",
-    "ControlSettings",
-    "LoopModel",
-    "LoopResponse",
-    "PidController",
-    "PidGains",
-    "check_stability",
-    "close_loop",
-    "design_pid",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from rigd.runtime.folder import runtime_folder
+from rigd.runtime import runtime_folder
 
 COMMON = Path("/run/rigd")
 """For a daemon that a group may use: a user's own runtime folder is closed to others."""

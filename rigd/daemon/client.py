@@ -15,8 +15,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from rigd.daemon.address import peer_of, running
+from rigd.live import LiveAddress
 from rigd.live import server as addresses
-from rigd.live.server import LiveAddress
 
 Document = dict[str, Any]
 
@@ -392,7 +392,7 @@ def _sees_other_users() -> bool:
 
 def _control_processes(pid: int) -> Iterator[int]:
     """Return the control processes of a supervisor: its number is their only argument."""
-    from rigd.engine.ipc import CONTROL  # which takes a while, and is seldom needed
+    from rigd.engine import CONTROL
 
     wanted = [b"-m", CONTROL.module.encode(), str(pid).encode()]
     for entry in Path("/proc").iterdir():

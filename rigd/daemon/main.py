@@ -15,10 +15,10 @@ from rigd.daemon.log import NAME, Log
 from rigd.daemon.server import Server
 from rigd.daemon.service import Service
 from rigd.daemon.states import look_up_user
-from rigd.devices.registry import Reality, reality, simulated_differently, what_moves
+from rigd.devices import Reality, reality, simulated_differently, what_moves
 from rigd.profile import Profile
-from rigd.runner.rig import Rig
-from rigd.runtime.locks import RigLock
+from rigd.runner import Rig
+from rigd.runtime import RigLock
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 

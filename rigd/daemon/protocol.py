@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from rigd.excitation.named import FROM_THE_RIG, KINDS, Value
+from rigd.excitation import FROM_THE_RIG, KINDS, Value
 
 LONGEST_LINE = 65_536
 """Bytes of a request, its newline included."""

@@ -34,22 +34,29 @@ from rigd.daemon.states import (
     rig_document,
     transition_document,
 )
-from rigd.devices.registry import Reality, what_moves
-from rigd.engine.shared_state import Event
+from rigd.devices import Reality, what_moves
+from rigd.engine import Event
 from rigd.excitation import Excitation, ExcitationError
 from rigd.profile import Profile
-from rigd.runner.planning import Plan, RefusedError, excitation_for, plan_session
-from rigd.runner.request import NoRoomError, Order, choose_path, make_room, what_is_kept
-from rigd.runner.rig import RigError
-from rigd.runner.session import (
+from rigd.runner import (
+    NoRoomError,
+    Order,
+    Plan,
+    RefusedError,
+    RigError,
+    RigStatus,
     SessionFailedError,
     SessionProgress,
     SessionResult,
     Watcher,
     always,
+    choose_path,
+    excitation_for,
+    make_room,
+    plan_session,
+    what_is_kept,
 )
-from rigd.runner.status import RigStatus
-from rigd.runtime.signals import StopRequest
+from rigd.runtime import StopRequest
 
 LOOK_S = 0.2
 """From one look at the rig to the next."""

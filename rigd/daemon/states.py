@@ -11,11 +11,9 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any
 
-from rigd.engine.ipc import PROCESSES
-from rigd.engine.shared_state import Phase
-from rigd.live.server import LiveAddress
-from rigd.runner.planning import Plan
-from rigd.runner.status import ProcessStatus, RigStatus
+from rigd.engine import PROCESSES, Phase
+from rigd.live import LiveAddress
+from rigd.runner import Plan, ProcessStatus, RigStatus
 
 _REMEMBERED = 50
 

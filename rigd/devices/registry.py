@@ -95,7 +95,7 @@ def objections(rig: RigParameters) -> list[str]:
     """Say why the devices of a rig cannot share their bus, before anything is sent."""
     if rig.can is None:
         return []
-    from rigd.devices.canbus.budget import MAX_LOAD, bus_load, check_identifiers
+    from rigd.devices.canbus import MAX_LOAD, bus_load, check_identifiers
 
     found = check_identifiers(rig)
     load = bus_load(rig).worst

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.runtime.folder import runtime_folder
+from rigd.runtime import runtime_folder
 
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters

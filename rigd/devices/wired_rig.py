@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from rigd.devices.canbus import CanLink
-from rigd.devices.cia402.drive import Cia402Drive
+from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
 from rigd.devices.parameters import RigParameters
 from rigd.devices.registry import Reality, objections, open_devices
@@ -48,10 +48,10 @@ def open_wired_rig(rig: RigParameters) -> Devices:
 
 def _sensor(rig: RigParameters, link: CanLink, simulator: SimulatorAddress | None) -> WrenchSensor:
     if rig.devices.sensor == "ati_serial":
-        from rigd.devices.ati.serial_sensor import AtiSerialSensor
+        from rigd.devices.ati import AtiSerialSensor
 
         return AtiSerialSensor(rig, simulator)
-    from rigd.devices.ati.can_sensor import AtiCanSensor
+    from rigd.devices.ati import AtiCanSensor
 
     return AtiCanSensor(rig, link)
 

@@ -1,1 +1,5 @@
 """The control process and the recorder process, and the shared memory between them."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

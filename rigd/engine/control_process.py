@@ -11,8 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
-from rigd.devices.contracts import DeviceError, Devices, StatedDrive
-from rigd.devices.registry import open_devices
+from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
 from rigd.engine.cycle import (
     AXES,
     Cycle,
@@ -32,7 +31,7 @@ from rigd.engine.session_sequence import Procedure, SessionEnd
 from rigd.engine.shared_state import Channels, Event, Phase, Word, attach_channels, write_event
 from rigd.engine.timing import Clock, Metronome, RealClock, VirtualClock
 from rigd.profile import Profile
-from rigd.runtime.signals import StopRequest
+from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
 
 _SILENCE_S = 1.0

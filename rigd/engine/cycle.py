@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.control import PidController
-from rigd.devices.contracts import DeviceError, Devices, Wrench
+from rigd.devices import DeviceError, Devices, Wrench
 from rigd.engine.timing import Metronome
 from rigd.profile import Profile
-from rigd.runtime.folder import runtime_folder
+from rigd.runtime import runtime_folder
 from rigd.safety import LimitWatch, Violation
-from rigd.session.format import Status
+from rigd.session import Status
 
 
 def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rigd.engine.shared_state import Word
-from rigd.runtime.signals import held_back
+from rigd.runtime import held_back
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rigd.devices.registry import Reality
+from rigd.devices import Reality
 from rigd.engine.ring import ReferenceSpec
 from rigd.engine.shared_state import ChannelSpecs
 from rigd.profile import Profile, RealtimeSettings

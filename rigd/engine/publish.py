@@ -4,18 +4,13 @@ import time
 from dataclasses import dataclass
 from math import isfinite
 
-from rigd.devices.contracts import Devices, LineHealth
+from rigd.devices import Devices, LineHealth
 from rigd.engine.cycle import Cycle
 from rigd.engine.ipc import Pulse
 from rigd.engine.ring import Ring
 from rigd.engine.shared_state import CONTROL, UNKNOWN, Board, Channels, Word
 from rigd.engine.timing import Clock, Metronome
-from rigd.session.format import (
-    Status,
-    pack_control_into,
-    pack_sample_into,
-    pack_timing_into,
-)
+from rigd.session import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 
 class Display:

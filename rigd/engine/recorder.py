@@ -31,8 +31,7 @@ from rigd.engine.shared_state import (
     read_events,
 )
 from rigd.runtime import signals
-from rigd.session import SessionError, SessionExistsError, SessionWriter
-from rigd.session.format import SAMPLE_SIZE
+from rigd.session import SAMPLE_SIZE, SessionError, SessionExistsError, SessionWriter
 
 _BLOCK = 250
 _IDLE_S = 0.005

@@ -11,7 +11,7 @@ from math import inf
 
 import numpy as np
 
-from rigd.devices.contracts import DeviceError
+from rigd.devices import DeviceError
 from rigd.engine.cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine.ipc import Parent
 from rigd.engine.publish import Display, SampleLog
@@ -19,9 +19,8 @@ from rigd.engine.realtime import page_faults
 from rigd.engine.shared_state import Channels, Event, Level, Phase, Stop, Word, write_event
 from rigd.engine.timing import SUSPENDED_S, Clock, Metronome, SuspendWatch
 from rigd.profile import Profile
-from rigd.runtime.signals import StopRequest
-from rigd.safety import LOOK_EVERY
-from rigd.safety.limits import BY_NAME, OVERLOADED
+from rigd.runtime import StopRequest
+from rigd.safety import BY_NAME, LOOK_EVERY, OVERLOADED
 
 _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002

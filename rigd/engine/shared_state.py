@@ -26,8 +26,8 @@ from math import ceil
 from typing import Literal, Self
 
 from rigd.engine.ring import Ring, RingSpec, reserve
-from rigd.safety.limits import BUFFERED_S
-from rigd.session.format import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
+from rigd.safety import BUFFERED_S
+from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 
 class Phase(IntEnum):

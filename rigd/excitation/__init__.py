@@ -4,17 +4,6 @@ A reference is relative to the angle at which the session starts. Every excitati
 three segments: rest (reference zero), sweep, ring-down (the sweep's last value held).
 """
 
-from rigd.excitation.from_file import from_csv
-from rigd.excitation.narrow_sweeps import modes
-from rigd.excitation.signals import Excitation, ExcitationError, chirp, hold, multisine, step
+import lazy_loader as lazy
 
-__all__ = [
-    "Excitation",
-    "ExcitationError",
-    "chirp",
-    "from_csv",
-    "hold",
-    "modes",
-    "multisine",
-    "step",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

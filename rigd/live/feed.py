@@ -16,7 +16,7 @@ from rigd.view import APPLICATION_ID
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
-    from rigd.view.scene import Drawing
+    from rigd.view import Drawing
 
 _PATIENCE_S: Final = 0.2
 _STALLED_PATIENCE_S: Final = 0.02

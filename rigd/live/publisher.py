@@ -15,18 +15,16 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
-from rigd.engine.ipc import Message, Parent
-from rigd.engine.shared_state import SAMPLE, TOPICS, Channels, Word, attach_channels
+from rigd.engine import SAMPLE, TOPICS, Channels, Message, Parent, Word, attach_channels
 from rigd.live.feed import Feed
 from rigd.live.ring_reader import Intake, LiveEnd
 from rigd.live.server import Outlet, RerunError
 from rigd.runtime import signals
-from rigd.view.recorded import settle_sdk
-from rigd.view.session_info import Health, outcome_note
+from rigd.view import Health, outcome_note, settle_sdk
 
 if TYPE_CHECKING:
     from rigd.live.ring_reader import LiveJob, LiveSession
-    from rigd.view.scene import Drawing
+    from rigd.view import Drawing
 
 _MOST_OWED: Final = 1000
 

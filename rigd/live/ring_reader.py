@@ -4,22 +4,22 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
-from rigd.engine.ring import Observer, Ring
-from rigd.engine.shared_state import (
+from rigd.engine import (
     EVENT,
     SAMPLE,
     TIMING,
     TOPICS,
     Channels,
     ChannelSpecs,
+    Observer,
+    Ring,
     read_events,
 )
-from rigd.session.format import decode_samples, decode_timings
-from rigd.view.scene import Picture
-from rigd.view.session_info import Note, Subject
+from rigd.session import decode_samples, decode_timings
+from rigd.view import Note, Picture, Subject
 
 if TYPE_CHECKING:
-    from rigd.view.scene import Drawing
+    from rigd.view import Drawing
 
 
 @dataclass(frozen=True, slots=True)

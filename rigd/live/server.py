@@ -43,8 +43,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final, Self
 
-from rigd.runtime.folder import runtime_folder
-from rigd.view.recorded import without_settings
+from rigd.runtime import runtime_folder
+from rigd.view import without_settings
 
 LOOPBACK: Final = "127.0.0.1"
 

@@ -15,7 +15,7 @@ from rigd.live.server import (
     proxy_url,
     serve_page,
 )
-from rigd.runtime.folder import runtime_folder
+from rigd.runtime import runtime_folder
 
 _MOST_MEMORY: Final = "4GiB"
 """Then the oldest is forgotten: a session of some hours has room."""

@@ -4,18 +4,6 @@ The loader is imported on first use: the control process is handed a profile tha
 and does not pay for the validation.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING
+import lazy_loader as lazy
 
-from rigd.profile.schema import Profile, RealtimeSettings, SessionSettings
-
-if TYPE_CHECKING:
-    from rigd.profile.load import ProfileError, load_profile
-
-__all__ = ["Profile", "ProfileError", "RealtimeSettings", "SessionSettings", "load_profile"]
-
-
-def __getattr__(name: str) -> object:
-    if name in ("ProfileError", "load_profile"):
-        return getattr(import_module("rigd.profile.load"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -10,12 +10,11 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
-from rigd.devices.ati.serial_protocol import RECORD_BITS
-from rigd.devices.cia402.assignments import parse_assignment
-from rigd.devices.cia402.requirements import ACCEPTABLE
-from rigd.devices.parameters import AtiSerial
+from rigd.devices import AtiSerial
+from rigd.devices.ati import RECORD_BITS
+from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
 from rigd.profile.schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
-from rigd.safety.limits import BUFFERED_S
+from rigd.safety import BUFFERED_S
 
 # Longest endings first: the first that fits is the key's unit.
 _UNITS = {

@@ -9,10 +9,16 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from rigd.devices.cia402 import protocol
-from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
-from rigd.devices.cia402.suitability import Finding, Grade, judge
-from rigd.devices.eds import Eds
+from rigd.devices import Eds
+from rigd.devices.cia402 import (
+    TORQUE_FEEDBACK,
+    TORQUE_LIMIT,
+    WATCHDOG,
+    Finding,
+    Grade,
+    judge,
+    protocol,
+)
 from rigd.profile.load import ProfileError, profile_of
 from rigd.profile.schema import Profile, keys
 from rigd.profile.write import Setting, SettingValue, with_head, with_settings

@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from rigd.devices.parameters import RigParameters
+from rigd.devices import RigParameters
 from rigd.profile import diagnostics as complaints
 from rigd.profile import diagnostics as wiring
 from rigd.profile.schema import (

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 
 from rigd.beam import Beam, Damping
 from rigd.control import ControlSettings, LoopModel
-from rigd.devices.parameters import (
+from rigd.devices import (
     Acquisition,
     Actuation,
     AtiCan,
@@ -22,8 +22,8 @@ from rigd.devices.parameters import (
     Selection,
     ServoDrive,
     Simulation,
-    WrenchSensor,
 )
+from rigd.devices.parameters import WrenchSensor
 from rigd.safety import Limits
 
 

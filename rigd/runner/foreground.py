@@ -10,13 +10,8 @@ import typer
 
 from rigd.beam import RealisationError
 from rigd.control import ControlDesignError
-from rigd.devices.registry import (
-    Reality,
-    UnknownDeviceError,
-    simulated_differently,
-    what_moves,
-)
-from rigd.engine.shared_state import Event
+from rigd.devices import Reality, UnknownDeviceError, simulated_differently, what_moves
+from rigd.engine import Event
 from rigd.excitation import Excitation, ExcitationError
 from rigd.profile import Profile, ProfileError
 from rigd.runner.planning import Plan, RefusedError, plan_session
@@ -31,8 +26,7 @@ from rigd.runner.request import (
 )
 from rigd.runner.rig import Rig, RigError
 from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
-from rigd.runtime.locks import RigBusyError, RigLock
-from rigd.runtime.signals import StopRequest
+from rigd.runtime import RigBusyError, RigLock, StopRequest
 
 _TERMINAL_PATIENCE_S = 2.0
 

@@ -4,14 +4,12 @@ import time
 import uuid
 from collections.abc import Callable
 
-from rigd.engine.ipc import LIVE, ChildError, Message, Pulse
-from rigd.engine.shared_state import Event, Level, Word
-from rigd.live.ring_reader import LiveEnd, LiveJob, LiveSession
-from rigd.live.server import LiveAddress
+from rigd.engine import LIVE, ChildError, Event, Level, Message, Pulse, Word
+from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession
 from rigd.runner.process_group import Crew
 from rigd.runner.request import Order
-from rigd.runtime.signals import StopRequest
-from rigd.view.session_info import Subject
+from rigd.runtime import StopRequest
+from rigd.view import Subject
 
 _PATIENCE_S = 10.0
 """It takes its time to start: a session waits so long for it."""

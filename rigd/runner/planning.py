@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, tip_motion
 from rigd.control import ClosedLoop, LoopResponse, check_stability, close_loop
-from rigd.excitation import Excitation
-from rigd.excitation.named import Value, make_excitation
+from rigd.excitation import Excitation, Value, make_excitation
 from rigd.profile import Profile
 
 Real = NDArray[np.float64]

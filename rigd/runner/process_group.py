@@ -9,11 +9,19 @@ import os
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from rigd.engine.ipc import CONTROL, LIVE, PROCESSES, RECORDER, Child, ChildError, Process
-from rigd.engine.ring import shared_memory_fd
+from rigd.engine import (
+    CONTROL,
+    LIVE,
+    PROCESSES,
+    RECORDER,
+    Child,
+    ChildError,
+    Process,
+    shared_memory_fd,
+)
 
 if TYPE_CHECKING:
-    from rigd.engine.shared_state import Channels
+    from rigd.engine import Channels
 
 _DESCRIPTORS = 6
 
@@ -114,8 +122,8 @@ class Crew:
         OSError
             If there is not enough shared memory.
         """
-        from rigd.engine.shared_state import HURRIED_BUFFERED_S, create_channels
-        from rigd.safety.limits import BUFFERED_S
+        from rigd.engine import HURRIED_BUFFERED_S, create_channels
+        from rigd.safety import BUFFERED_S
 
         buffered_s = HURRIED_BUFFERED_S if fast and self.live else BUFFERED_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)

@@ -16,22 +16,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from rigd import __version__
-from rigd.devices.registry import (
+from rigd.devices import (
     Reality,
     check_selection,
     objections,
     reality,
     simulated_differently,
+    unreachable_simulators,
     what_moves,
 )
-from rigd.devices.simulator import unreachable_simulators
-from rigd.engine.ipc import Message
+from rigd.engine import Message
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import RefusedError
 from rigd.safety import Limits
-from rigd.session.writer import PART_SUFFIX
+from rigd.session import PART_SUFFIX
 
 # Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.
 _BYTES_PER_TICK = 260

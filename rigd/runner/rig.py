@@ -8,20 +8,26 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices.contracts import DeviceError
-from rigd.devices.registry import Reality
-from rigd.devices.wired_rig import reset_drive
-from rigd.engine.ipc import CONTROL, LIVE, ChildError, Message, Pulse
-from rigd.engine.jobs import ControlJob
-from rigd.engine.realtime import Precedence
-from rigd.engine.shared_state import Board, Stop, Word
+from rigd.devices import DeviceError, Reality, reset_drive
+from rigd.engine import (
+    CONTROL,
+    LIVE,
+    Board,
+    ChildError,
+    ControlJob,
+    Message,
+    Precedence,
+    Pulse,
+    Stop,
+    Word,
+)
 from rigd.profile import Profile
 from rigd.runner.live_view import LiveView
 from rigd.runner.process_group import Crew
 from rigd.runner.request import Order
 from rigd.runner.session import Session, SessionFailedError, SessionResult, Watcher, always
 from rigd.runner.status import RigStatus, StatusWatch
-from rigd.runtime.signals import StopRequest
+from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0

@@ -12,15 +12,27 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from rigd.engine.ipc import CONTROL, RECORDER, ChildError, Message, Pulse
-from rigd.engine.jobs import RecorderJob, SessionJob
-from rigd.engine.realtime import REFUSED
-from rigd.engine.ring import Observer, put_reference
-from rigd.engine.shared_state import Event, Phase, Stop, Word, read_events
+from rigd.engine import (
+    CONTROL,
+    RECORDER,
+    REFUSED,
+    ChildError,
+    Event,
+    Message,
+    Observer,
+    Phase,
+    Pulse,
+    RecorderJob,
+    SessionJob,
+    Stop,
+    Word,
+    put_reference,
+    read_events,
+)
 from rigd.runner.live_view import LiveView
 from rigd.runner.process_group import Crew
 from rigd.runner.request import Order, another_path, file_header, part_of
-from rigd.runtime.signals import StopRequest
+from rigd.runtime import StopRequest
 
 _POLL_S = 0.05
 _PATIENCE_S = 5.0

@@ -10,12 +10,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.engine.ipc import PROCESSES, SUPERVISOR, Pulse
-from rigd.engine.ring import Observer, Ring
-from rigd.engine.shared_state import TOPICS, Phase, Word
-from rigd.live.server import LiveAddress
+from rigd.engine import PROCESSES, SUPERVISOR, TOPICS, Observer, Phase, Pulse, Ring, Word
+from rigd.live import LiveAddress
 from rigd.runner.process_group import Crew
-from rigd.session.format import decode_samples
+from rigd.session import decode_samples
 
 _WINDOW_S: Final = 1.0
 """Of samples by which lateness and rate are told."""

@@ -4,16 +4,6 @@ The software stops a session that leaves its limits; it is no safety function. T
 STO of the drive (docs/safety.md).
 """
 
-from rigd.safety.limits import INTERLOCKS, Action, Checked, Interlock, Limits, Violation
-from rigd.safety.monitor import LOOK_EVERY, LimitWatch
+import lazy_loader as lazy
 
-__all__ = [
-    "INTERLOCKS",
-    "LOOK_EVERY",
-    "Action",
-    "Checked",
-    "Interlock",
-    "LimitWatch",
-    "Limits",
-    "Violation",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

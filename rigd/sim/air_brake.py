@@ -11,8 +11,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, CoupledModel, Damping, DragGrid, Realisation, clamped_free_eigenvalues
-from rigd.beam.air_drag import AIR_DENSITY_KG_PER_M3
+from rigd.beam import (
+    AIR_DENSITY_KG_PER_M3,
+    Beam,
+    CoupledModel,
+    Damping,
+    DragGrid,
+    Realisation,
+    clamped_free_eigenvalues,
+)
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

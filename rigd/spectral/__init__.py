@@ -4,45 +4,6 @@ Welch's also while the record grows (`rigd.spectral.running`), and a spectrogram
 (`rigd.spectral.spectrogram`).
 """
 
-from rigd.spectral.frf import (
-    PAPER_NFFT,
-    PAPER_OVERLAP,
-    PAPER_OVERLAP_FRACTION,
-    PAPER_RATE_HZ,
-    PAPER_SEGMENT_LENGTH,
-    PAPER_SEGMENTS,
-    Estimator,
-    FrequencyResponse,
-    Segmentation,
-    SpectralError,
-    fft_response,
-    instrumental_response,
-    segment_count,
-    segment_lengths,
-    segmentation_of,
-    welch_response,
-)
-from rigd.spectral.running import RunningEstimate, RunningResponse
-from rigd.spectral.spectrogram import RunningSpectrogram
+import lazy_loader as lazy
 
-__all__ = [
-    "PAPER_NFFT",
-    "PAPER_OVERLAP",
-    "PAPER_OVERLAP_FRACTION",
-    "PAPER_RATE_HZ",
-    "PAPER_SEGMENTS",
-    "PAPER_SEGMENT_LENGTH",
-    "Estimator",
-    "FrequencyResponse",
-    "RunningEstimate",
-    "RunningResponse",
-    "RunningSpectrogram",
-    "Segmentation",
-    "SpectralError",
-    "fft_response",
-    "instrumental_response",
-    "segment_count",
-    "segment_lengths",
-    "segmentation_of",
-    "welch_response",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -3,5 +3,6 @@
 Rerun takes half a second to import, so it is imported by the functions that need it.
 """
 
-APPLICATION_ID = "rigd"
-"""Rerun keeps one layout for each application."""
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

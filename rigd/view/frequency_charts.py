@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Damping, transfer
-from rigd.session.format import Status
+from rigd.session import Status
 from rigd.spectral import RunningEstimate, RunningResponse
 from rigd.view.chart import Axis, Chart, Key, Thinning, decades, steps
 from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE, TIMELINE

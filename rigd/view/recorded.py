@@ -14,9 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
-from rigd.session import Session, SessionError
-from rigd.session.format import Status
-from rigd.session.writer import rename_new
+from rigd.session import Session, SessionError, Status, rename_new
 from rigd.view import APPLICATION_ID
 from rigd.view.layout import blueprint
 from rigd.view.plots import TIMELINE

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify.headline import MISREAD
+from analysis.identify import MISREAD
 from analysis.report.html.table import estimate
 
 if TYPE_CHECKING:
-    from analysis.identify import Headline, Quantity, Size
-    from analysis.identify.headline import Mode
+    from analysis.identify import Headline, Mode, Quantity, Size
 
 _SMALL: Final = 1e-3
 """Sizes below are told in the power of ten that zeta has in the paper."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.identify.data import fast_length
+from analysis.identify import fast_length
 from analysis.report.supported_band import supported_band_hz
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response

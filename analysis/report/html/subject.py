@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.identify import (
+        DampingAt,
         Finding,
         Headline,
         OrderVerdict,
@@ -17,8 +18,7 @@ if TYPE_CHECKING:
         Selection,
         Setting,
     )
-    from analysis.identify.drag import DampingAt
-    from analysis.paper.route import WelchAnalysis
+    from analysis.paper import WelchAnalysis
     from analysis.record import Record
 
 _ORDERS: Final = frozenset({"alpha", "lambda"})

@@ -11,7 +11,7 @@ from analysis.report.html.table import Cell, Column, Number, Table, estimate, nu
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from analysis.paper.route import FittedModel, WelchAnalysis
+    from analysis.paper import FittedModel, WelchAnalysis
 
 _FACTORS = {"zeta": 1e5, "alpha": 1.0, "gamma": 1e2, "lambda": 1.0}
 _HEADINGS = {"zeta": "ζ (1e-5)", "alpha": "α", "gamma": "γ (1e-2)", "lambda": "λ"}

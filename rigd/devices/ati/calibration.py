@@ -17,7 +17,7 @@ from struct import pack, unpack
 
 import numpy as np
 
-from rigd.devices.contracts import Wrench
+from rigd.devices import Wrench
 
 CAN_WATCHDOG_RESET = 0x0001
 CAN_BAD_CALIBRATION = 0x0040

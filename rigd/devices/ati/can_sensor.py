@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 from math import ceil
 
+from rigd.devices import DeviceError, LineHealth, RigParameters, Wrench
 from rigd.devices.ati import netcanoem
 from rigd.devices.ati.calibration import (
     CAN_BAD_CALIBRATION,
@@ -19,8 +20,6 @@ from rigd.devices.ati.calibration import (
 )
 from rigd.devices.ati.netcanoem import REPLY_LENGTHS, Answer, GaugePolls, identifier
 from rigd.devices.canbus import CanExchange, CanLink
-from rigd.devices.contracts import DeviceError, LineHealth, Wrench
-from rigd.devices.parameters import RigParameters
 
 _REPLY_TIMEOUT_S = 0.2
 _TRIES = 3

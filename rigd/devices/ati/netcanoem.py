@@ -15,10 +15,9 @@ is in doubt whose they are, a tick is left without a poll.
 import time
 from struct import Struct, unpack
 
+from rigd.devices import DeviceError
 from rigd.devices.ati.calibration import text_of
-from rigd.devices.canbus import CanExchange, pack_frame
-from rigd.devices.canbus.exchange import ReplyPairing
-from rigd.devices.contracts import DeviceError
+from rigd.devices.canbus import CanExchange, ReplyPairing, pack_frame
 
 GAUGES = 0x0
 GAUGES_REST = 0x1

@@ -11,12 +11,10 @@ from struct import Struct
 
 import numpy as np
 
+from rigd.devices import DeviceError, LineHealth, RigParameters, SimulatorAddress, Wrench
 from rigd.devices.ati.calibration import SERIAL_CRITICAL, CalibrationBlock, serial_status
 from rigd.devices.ati.serial_protocol import ERROR_BIT, RECORD_BITS, RECORD_SIZE, RecordStream
 from rigd.devices.ati.serial_setup import SILENCE_S, SerialLine, SerialSetup
-from rigd.devices.contracts import DeviceError, LineHealth, Wrench
-from rigd.devices.parameters import RigParameters
-from rigd.devices.simulator import SimulatorAddress
 
 _FIRST_RECORDS_TIMEOUT_S = 0.5
 # The error bit is not covered by the checksum; one flipped bit must not end a session.

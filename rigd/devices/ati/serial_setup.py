@@ -14,6 +14,7 @@ from itertools import chain
 
 import serial
 
+from rigd.devices import AtiSerial, DeviceError
 from rigd.devices.ati import serial_protocol as modbus
 from rigd.devices.ati.calibration import (
     BLOCK_REGISTERS,
@@ -22,8 +23,6 @@ from rigd.devices.ati.calibration import (
     parse_block,
     same_serial_number,
 )
-from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import AtiSerial
 
 _READ_SIZE = 65_536
 

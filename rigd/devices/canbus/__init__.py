@@ -5,23 +5,6 @@ CAN sockets it is one of those; the bus of ``rigd simulate`` is a Unix socket th
 16 bytes; every other adapter goes through python-can. The drivers see no difference.
 """
 
-from rigd.devices.canbus.exchange import CanExchange, CanLink
-from rigd.devices.canbus.port import (
-    BUS_OFF_FRAME,
-    FRAME_SIZE,
-    CanPort,
-    open_port,
-    pack_frame,
-    unpack_frame,
-)
+import lazy_loader as lazy
 
-__all__ = [
-    "BUS_OFF_FRAME",
-    "FRAME_SIZE",
-    "CanExchange",
-    "CanLink",
-    "CanPort",
-    "open_port",
-    "pack_frame",
-    "unpack_frame",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ resets the sensor (base 0x20 is RPDO1 of the nodes 1 to 15): no device may be ta
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rigd.devices.parameters import AtiCan, RigParameters, ServoDrive
+from rigd.devices import AtiCan, RigParameters, ServoDrive
 
 _FREE_BASE = 0x68
 """Base of a sensor whose identifiers the predefined set leaves free, whatever the nodes are."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from rigd.devices import CanBus, DeviceError, SimulatorAddress
 from rigd.devices.canbus.budget import FRAME_BITS
 from rigd.devices.canbus.port import (
     BUS_OFF,
@@ -24,10 +25,7 @@ from rigd.devices.canbus.port import (
     open_port,
     read_head,
 )
-from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import CanBus
-from rigd.devices.simulator import SimulatorAddress
-from rigd.runtime.locks import HeldError, HeldFile
+from rigd.runtime import HeldError, HeldFile
 
 _STEADY_PERIODS = 3
 """Periods with one reply each after which what is missing is given up where there is no pause."""

@@ -12,9 +12,7 @@ from contextlib import suppress
 from struct import Struct
 from typing import TYPE_CHECKING, Protocol
 
-from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import CanBus
-from rigd.devices.simulator import SimulatorAddress
+from rigd.devices import CanBus, DeviceError, SimulatorAddress
 
 if TYPE_CHECKING:
     import can

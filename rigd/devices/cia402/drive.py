@@ -8,6 +8,7 @@ refused by :meth:`Cia402Drive.connect` already.
 from collections.abc import Callable
 from math import isnan
 
+from rigd.devices import DeviceError, LineHealth, RigParameters
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.cia402.node import Inbox, Node
 from rigd.devices.cia402.protocol import (
@@ -34,8 +35,6 @@ from rigd.devices.cia402.transitions import (
     step_up,
     switch_off,
 )
-from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.devices.parameters import RigParameters
 
 _HALF_TURN = 1 << 31
 _ALL_COUNTS = (1 << 32) - 1

@@ -14,11 +14,11 @@ from enum import Enum, Flag, auto
 from math import ceil, tau
 from typing import TYPE_CHECKING, Final
 
+from rigd.devices import DeviceError
 from rigd.devices.cia402 import protocol
-from rigd.devices.contracts import DeviceError
 
 if TYPE_CHECKING:
-    from rigd.devices.parameters import RigParameters, ServoDrive
+    from rigd.devices import RigParameters, ServoDrive
 
 WATCHDOG: Final = "watchdog"
 TORQUE_LIMIT: Final = "torque_limit"

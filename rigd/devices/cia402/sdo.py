@@ -24,12 +24,11 @@ from canopen.objectdictionary import (
 )
 from canopen.sdo.base import SdoVariable
 
+from rigd.devices import DeviceError, EdsError, read_eds
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import protocol
 from rigd.devices.cia402.assignments import Assignment
 from rigd.devices.cia402.protocol import NMT_PRE_OPERATIONAL
-from rigd.devices.contracts import DeviceError
-from rigd.devices.eds import EdsError, read_eds
 
 EVERY_BIT = 0xFFFF_FFFF
 """Mask of an object all of whose bits count."""

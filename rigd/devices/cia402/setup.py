@@ -7,6 +7,7 @@ its row there.
 
 from dataclasses import dataclass
 
+from rigd.devices import DeviceError, RigParameters, ServoDrive
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import protocol
 from rigd.devices.cia402.assignments import parse_assignment
@@ -23,8 +24,6 @@ from rigd.devices.cia402.requirements import (
 )
 from rigd.devices.cia402.sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
 from rigd.devices.cia402.standing import command_off, require_off, still_on, wait_for
-from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import RigParameters, ServoDrive
 
 _MODE_PATIENCE_S = 0.3
 _RATED_TORQUE_TOLERANCE = 0.02

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+from rigd.devices import DeviceError, RigParameters
 from rigd.devices.canbus import CanPort
 from rigd.devices.cia402 import protocol
 from rigd.devices.cia402.protocol import (
@@ -22,8 +23,6 @@ from rigd.devices.cia402.protocol import (
     state_of,
 )
 from rigd.devices.cia402.sdo import SdoAccess, SdoRefusal
-from rigd.devices.contracts import DeviceError
-from rigd.devices.parameters import RigParameters
 
 _POLL_S = 0.01
 _OFF_S = 0.2

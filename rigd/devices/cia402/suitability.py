@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
+from rigd.devices import Eds, EdsEntry
 from rigd.devices.cia402 import protocol
 from rigd.devices.cia402.requirements import (
     MAY_BE_WRITE_ONLY,
@@ -23,10 +24,9 @@ from rigd.devices.cia402.requirements import (
     wanted_values,
     watchdog,
 )
-from rigd.devices.eds import Eds, EdsEntry
 
 if TYPE_CHECKING:
-    from rigd.devices.parameters import RigParameters, ServoDrive
+    from rigd.devices import RigParameters, ServoDrive
 
 
 class Grade(Enum):

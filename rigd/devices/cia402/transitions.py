@@ -6,6 +6,7 @@ from contextlib import suppress
 from math import ceil, exp
 from typing import Final
 
+from rigd.devices import DeviceError, wired_stop_dropped
 from rigd.devices.cia402.node import Node
 from rigd.devices.cia402.protocol import (
     CONTROLWORD,
@@ -21,7 +22,6 @@ from rigd.devices.cia402.protocol import (
     read_mode,
     state_of,
 )
-from rigd.devices.contracts import DeviceError, wired_stop_dropped
 
 _FOREIGN_COMMAND: Final = (
     "a command came over the bus that this computer did not give (a corrupt frame, a second master)"

@@ -21,7 +21,7 @@ from struct import Struct
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
-from rigd.sim.devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire.ati_gauges import (
     COUNTS_PER_UNIT,
     SERIAL_NUMBER,

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rigd.devices.contracts import DeviceError, Wrench
 from rigd.devices.parameters import AtiSerial, RigParameters
-from rigd.sim.devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire.ati_gauges import (
     PART_NUMBER,
     SERIAL_NUMBER,

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from rigd.devices.canbus import BUS_OFF_FRAME, pack_frame, unpack_frame
 from rigd.devices.parameters import RigParameters
-from rigd.sim.devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire.faults import LINE_KINDS, SERIAL, EventLog, Fault, FaultError, Line
 
 _MEMORY_SYNCS = 256

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
-from rigd.sim.devices import SimulatedRig
+from rigd.sim import SimulatedRig
 from rigd.sim.wire.canopen_services import (
     DISABLED,
     MAX_ENTRIES,

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.devices.simulator import SimulatorAddress, announce, described, find_simulator, forget
-from rigd.runtime.folder import runtime_folder
-from rigd.sim.devices import SimulatedRig
+from rigd.runtime import runtime_folder
+from rigd.sim import SimulatedRig
 from rigd.sim.wire.bus_simulation import World
 from rigd.sim.wire.faults import EventLog, Fault, FaultError, WrongUseError, parse_fault
 from rigd.sim.wire.links import (

@@ -1,0 +1,13 @@
+from .loops import LoopError as LoopError
+from .measure import HELD as HELD
+from .measure import Figures as Figures
+from .measure import Measurement as Measurement
+from .measure import figures as figures
+from .measure import measurement as measurement
+from .program import HIGHEST_HZ as HIGHEST_HZ
+from .program import Bench as Bench
+from .program import Results as Results
+from .program import core_of as core_of
+from .program import cores_beside as cores_beside
+from .report import as_json as as_json
+from .report import report_lines as report_lines

@@ -1,0 +1,9 @@
+from .machine import settings_granted as settings_granted
+from .on_paper import eds_rows as eds_rows
+from .rig import check_rig as check_rig
+from .rows import OF_A_RIG as OF_A_RIG
+from .rows import OF_AN_EDS as OF_AN_EDS
+from .rows import Row as Row
+from .rows import Verdict as Verdict
+from .rows import overall as overall
+from .rows import print_table as print_table

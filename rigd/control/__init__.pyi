@@ -1,0 +1,12 @@
+from .closed_loop import ClosedLoop as ClosedLoop
+from .closed_loop import LoopModel as LoopModel
+from .closed_loop import LoopResponse as LoopResponse
+from .closed_loop import check_stability as check_stability
+from .closed_loop import close_loop as close_loop
+from .margins import Margins as Margins
+from .margins import loop_margins as loop_margins
+from .pid import ControlDesignError as ControlDesignError
+from .pid import ControlSettings as ControlSettings
+from .pid import PidController as PidController
+from .pid import PidGains as PidGains
+from .pid import design_pid as design_pid

@@ -1,0 +1,13 @@
+from .address import AddressError as AddressError
+from .address import UnknownGroupError as UnknownGroupError
+from .address import find as find
+from .address import running as running
+from .address import socket_path as socket_path
+from .client import Client as Client
+from .client import DaemonGoneError as DaemonGoneError
+from .client import RefusedByDaemonError as RefusedByDaemonError
+from .client import await_end as await_end
+from .client import daemons as daemons
+from .client import find_views as find_views
+from .client import stop_session as stop_session
+from .main import run_daemon as run_daemon

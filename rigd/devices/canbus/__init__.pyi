@@ -1,0 +1,14 @@
+from .budget import MAX_LOAD as MAX_LOAD
+from .budget import BusLoad as BusLoad
+from .budget import bus_load as bus_load
+from .budget import check_identifiers as check_identifiers
+from .exchange import CanExchange as CanExchange
+from .exchange import CanLink as CanLink
+from .exchange import ReplyPairing as ReplyPairing
+from .port import BUS_OFF_FRAME as BUS_OFF_FRAME
+from .port import FRAME_SIZE as FRAME_SIZE
+from .port import CanPort as CanPort
+from .port import SocketPort as SocketPort
+from .port import open_port as open_port
+from .port import pack_frame as pack_frame
+from .port import unpack_frame as unpack_frame

@@ -1,0 +1,11 @@
+from .assignments import parse_assignment as parse_assignment
+from .drive import Cia402Drive as Cia402Drive
+from .requirements import ACCEPTABLE as ACCEPTABLE
+from .requirements import TORQUE_FEEDBACK as TORQUE_FEEDBACK
+from .requirements import TORQUE_LIMIT as TORQUE_LIMIT
+from .requirements import WATCHDOG as WATCHDOG
+from .requirements import Watchdog as Watchdog
+from .setup import Outfit as Outfit
+from .suitability import Finding as Finding
+from .suitability import Grade as Grade
+from .suitability import judge as judge

@@ -1,0 +1,12 @@
+from .from_file import from_csv as from_csv
+from .named import FROM_THE_RIG as FROM_THE_RIG
+from .named import KINDS as KINDS
+from .named import Value as Value
+from .named import make_excitation as make_excitation
+from .narrow_sweeps import modes as modes
+from .signals import Excitation as Excitation
+from .signals import ExcitationError as ExcitationError
+from .signals import chirp as chirp
+from .signals import hold as hold
+from .signals import multisine as multisine
+from .signals import step as step

@@ -1,0 +1,10 @@
+from .from_eds import Draft as Draft
+from .from_eds import UnusableDriveError as UnusableDriveError
+from .load import ProfileError as ProfileError
+from .load import known_profiles as known_profiles
+from .load import load_profile as load_profile
+from .schema import Profile as Profile
+from .schema import RealtimeSettings as RealtimeSettings
+from .schema import SessionSettings as SessionSettings
+from .write import check_new as check_new
+from .write import write_new as write_new

@@ -1,0 +1,10 @@
+from .folder import runtime_folder as runtime_folder
+from .locks import HeldError as HeldError
+from .locks import HeldFile as HeldFile
+from .locks import RigBusyError as RigBusyError
+from .locks import RigLock as RigLock
+from .signals import StopRequest as StopRequest
+from .signals import held_back as held_back
+from .signals import ignore as ignore
+from .signals import let_pass as let_pass
+from .signals import raise_on as raise_on

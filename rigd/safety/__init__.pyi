@@ -1,0 +1,11 @@
+from .limits import BUFFERED_S as BUFFERED_S
+from .limits import BY_NAME as BY_NAME
+from .limits import INTERLOCKS as INTERLOCKS
+from .limits import OVERLOADED as OVERLOADED
+from .limits import Action as Action
+from .limits import Checked as Checked
+from .limits import Interlock as Interlock
+from .limits import Limits as Limits
+from .limits import Violation as Violation
+from .monitor import LOOK_EVERY as LOOK_EVERY
+from .monitor import LimitWatch as LimitWatch

@@ -1,0 +1,2 @@
+from .devices import SimulatedRig as SimulatedRig
+from .plant import SimulatedPlant as SimulatedPlant
