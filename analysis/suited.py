@@ -125,7 +125,7 @@ def welch_analysis(
         Whether the record is analysed without them, too. Even so, segments or an estimator that
         were chosen for it are not dropped in silence.
     on_step : callable, optional
-        As of `analysis.paper.route.analyse`.
+        As of `analysis.paper._route.analyse`.
 
     Returns
     -------

@@ -27,15 +27,15 @@ from pathlib import Path
 marks = [("", 0.0)]
 mark = lambda name: marks.append((name, time.process_time()))
 mark("interpreter")
-import analysis.cli, analysis.record, analysis.identify, analysis.paper.route, rich.progress
+import analysis.cli, analysis.record, analysis.identify, analysis.paper._route, rich.progress
 from analysis.models import WelchSettings
 from analysis.identify import BAND_HZ, Measurement
 mark("imports of the analysis")
 record = analysis.record.load_record(Path(sys.argv[1]))
 mark("reading")
-welch = analysis.paper.route.analyse(record, WelchSettings())
+welch = analysis.paper._route.analyse(record, WelchSettings())
 mark("the paper's route")
-selection = analysis.identify.select(Measurement.of_record(record))
+selection = analysis.identify._select(Measurement.of_record(record))
 mark("whole record")
 from analysis.report.html import Subject
 from analysis.report.html.figures import illustrations

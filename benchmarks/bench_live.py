@@ -15,7 +15,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench import Measurement, figures, loops, measurement
+from rigd.bench import Measurement, figures, measurement
+from rigd.bench import _loops as loops
 from rigd.engine import LIVE, SINGLE_THREADED, Phase
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile

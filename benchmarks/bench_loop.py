@@ -14,17 +14,9 @@ import statistics
 import sys
 from pathlib import Path
 
-from rigd.bench import (
-    HELD,
-    HIGHEST_HZ,
-    Figures,
-    Measurement,
-    core_of,
-    cores_beside,
-    cyclictest,
-    figures,
-    loops,
-)
+from rigd.bench import HELD, HIGHEST_HZ, Figures, Measurement, core_of, cores_beside, figures
+from rigd.bench import _cyclictest as cyclictest
+from rigd.bench import _loops as loops
 from rigd.checks import settings_granted
 from rigd.engine import SINGLE_THREADED
 from rigd.profile import load_profile

@@ -183,14 +183,14 @@ class Done:
 def rigd_here(tmp_path, monkeypatch):
     """Run `rigd` in this process, as far as it comes without any other."""
     from rigd.cli.app import app
-    from rigd.runtime.signals import StopRequest
+    from rigd.runtime._signals import StopRequest
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
     no_crew = StopRequest(), contextlib.nullcontext()
     for command in ("run", "identify"):
         monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
-    monkeypatch.setattr("rigd.runtime.signals.ignore", lambda **_: None)  # of the test runner
+    monkeypatch.setattr("rigd.runtime._signals.ignore", lambda **_: None)  # of the test runner
 
     return partial(run_here, app)
 
@@ -215,7 +215,7 @@ def run_here(app, *arguments) -> Done:
 @pytest.fixture
 def start_simulator(runtime_folder, tmp_path):
     """Start `rigd simulate` for a profile and wait until it can be found."""
-    from rigd.devices.simulator import find_simulator
+    from rigd.devices._simulator import find_simulator
     from rigd.profile import load_profile
 
     started = []

@@ -107,7 +107,7 @@ def campaign(
 ) -> Campaign:
     """Analyse a campaign of sessions of one specimen on one rig.
 
-    Every session goes by Welch's method (`analysis.paper.route`), where that suits all of them, and
+    Every session goes by Welch's method (`analysis.paper`), where that suits all of them, and
     by the whole record (`analysis.identify`); each is then predicted from the others.
 
     Parameters

@@ -32,7 +32,7 @@ class WelchFit:
     at_bounds : tuple of str
         Free parameters that rest on the edge of the range searched.
     std : dict or None
-        See `analysis.paper.fit.FrfFit`.
+        See `analysis.paper._fit.FrfFit`.
     indices : Indices or None
         Distance of this fit from the session's own response.
     """

@@ -121,7 +121,7 @@ def frf_table(
 
     Raises
     ------
-    rigd.session.SessionError, analysis.record.RecordError, analysis.paper.estimate.EstimateError
+    rigd.session.SessionError, analysis.record.RecordError, analysis.paper._estimate.EstimateError
         As the analysis raises them.
     """
     record = load_record(path)

@@ -113,11 +113,11 @@ def fit_welch_aware(
     fit to the response itself makes of it:
 
     >>> import numpy as np
-    >>> from analysis.paper.fit import fit_frf
+    >>> from analysis.paper._fit import fit_frf
     >>> from analysis.models import STRUCTURES
     >>> from analysis.welch_aware import fit_welch_aware
     >>> from analysis.identify import Plant
-    >>> from analysis.identify.predictor import Prediction
+    >>> from analysis.identify._predictor import Prediction
     >>> from rigd.beam import Beam, Damping
     >>> from rigd.spectral import Segmentation, welch_response
     >>> rate_hz, time_s = 125.0, np.arange(7500) / 125.0

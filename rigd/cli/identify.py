@@ -123,8 +123,13 @@ def _run_sessions(
     Returns the files of the two: the trial's controller is too slow for its passes to count.
     """
     stop, crew = start_crew(live=False)
-    from rigd.identification import experiments
-    from rigd.identification import proposal as tuning
+    from rigd.identification import (
+        cautious,
+        multisine_session,
+        speeds_session,
+        trial_session,
+        tuned,
+    )
     from rigd.runner import Crew, ForegroundError, run_in_foreground
     from rigd.runtime import ignore
 
@@ -156,17 +161,15 @@ def _run_sessions(
         return path
 
     try:
-        trial = run(experiments.trial_session, tuning.cautious, 0, crew)
+        trial = run(trial_session, cautious, 0, crew)
         estimate = _estimate([trial], profile_name)[0]
 
         def tune(profile: "Profile") -> "Profile":
-            return tuning.tuned(profile, estimate)
+            return tuned(profile, estimate)
 
         return [
             run(session, tune, number, Crew(live=False))
-            for number, session in enumerate(
-                (experiments.multisine_session, experiments.speeds_session), start=1
-            )
+            for number, session in enumerate((multisine_session, speeds_session), start=1)
         ]
     except ForegroundError as error:
         fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)

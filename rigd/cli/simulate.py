@@ -42,9 +42,9 @@ def simulate(
 
     Example: rigd simulate --profile antenna_can --fault drop,from=drive,frames=3@10
     """
-    from rigd.devices import registry
+    from rigd.devices import simulator as simulator_of
 
-    simulator = registry.simulator()
+    simulator = simulator_of()
     try:
         options = simulator.SimulatorOptions(
             lock_step=lock_step,
@@ -96,9 +96,9 @@ def inject(
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
     """  # noqa: D301 - the mark that keeps lines apart is no raw text
-    from rigd.devices import registry
+    from rigd.devices import simulator as simulator_of
 
-    simulator = registry.simulator()
+    simulator = simulator_of()
     try:
         rig = profile_named(profile).rig
         simulator.check_on_wire(rig)

@@ -100,7 +100,7 @@ class Simulation:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which driver serves each device: names in :mod:`rigd.devices.registry`."""
+    """Which driver serves each device: names in :mod:`rigd.devices._registry`."""
 
     drive: Annotated[str, MinLen(1)]
     sensor: Annotated[str, MinLen(1)]
@@ -173,9 +173,9 @@ class ServoDrive:
     none."""
     set_objects: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
     """Objects of the maker's own to be written at the start, each ``"index:sub type value"``; see
-    :mod:`rigd.devices.cia402.assignments`."""
+    `rigd.devices.cia402`."""
     accept_without: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
-    """What this drive may lack, by names of :data:`rigd.devices.cia402.requirements.ACCEPTABLE`."""
+    """What this drive may lack, by names of `rigd.devices.cia402.ACCEPTABLE`."""
     own_watchdog_s: Annotated[float, Ge(0), Le(5)] = field(default=0.0, metadata=OPTIONAL)
     """After how long a watchdog of the maker's own takes the torque off when SYNC and RPDO stay
     away, for a drive that has neither 1016 nor 1400:5; 0: it has none."""

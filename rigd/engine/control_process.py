@@ -12,7 +12,7 @@ from dataclasses import asdict
 
 from rigd.control import PidController, design_pid
 from rigd.devices import DeviceError, Devices, StatedDrive, open_devices
-from rigd.engine.cycle import (
+from rigd.engine._cycle import (
     AXES,
     Cycle,
     Rest,
@@ -22,14 +22,14 @@ from rigd.engine.cycle import (
     recalled_heat_nm2,
     remember_heat,
 )
-from rigd.engine.ipc import Message, Parent
-from rigd.engine.jobs import ControlJob, SessionJob
-from rigd.engine.publish import Display
-from rigd.engine.realtime import REFUSED, collect_no_garbage, obtain
-from rigd.engine.ring import map_reference
-from rigd.engine.session_sequence import Procedure, SessionEnd
-from rigd.engine.shared_state import Channels, Event, Phase, Word, attach_channels, write_event
-from rigd.engine.timing import Clock, Metronome, RealClock, VirtualClock
+from rigd.engine._ipc import Message, Parent
+from rigd.engine._jobs import ControlJob, SessionJob
+from rigd.engine._publish import Display
+from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
+from rigd.engine._ring import map_reference
+from rigd.engine._session_sequence import Procedure, SessionEnd
+from rigd.engine._shared_state import Channels, Event, Phase, Word, attach_channels, write_event
+from rigd.engine._timing import Clock, Metronome, RealClock, VirtualClock
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
@@ -82,7 +82,7 @@ def attend(
     devices
         Not yet connected.
     clock, channels, parent, stop
-        As for :class:`rigd.engine.session_sequence.Procedure`.
+        As for :class:`rigd.engine._session_sequence.Procedure`.
     obtained
         The real-time settings that were granted, for the file.
     """

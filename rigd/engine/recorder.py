@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping
 from math import ceil
 from pathlib import Path
 
-from rigd.engine.ipc import Message, Parent
-from rigd.engine.jobs import RecorderJob
-from rigd.engine.realtime import Precedence
-from rigd.engine.shared_state import (
+from rigd.engine._ipc import Message, Parent
+from rigd.engine._jobs import RecorderJob
+from rigd.engine._realtime import Precedence
+from rigd.engine._shared_state import (
     CONTROL,
     EVENT,
     SAMPLE,
@@ -30,7 +30,7 @@ from rigd.engine.shared_state import (
     attach_channels,
     read_events,
 )
-from rigd.runtime import signals
+from rigd.runtime import ignore as ignore_signals
 from rigd.session import SAMPLE_SIZE, SessionError, SessionExistsError, SessionWriter
 
 _BLOCK = 250
@@ -41,7 +41,7 @@ _DISK_LOOK_S = 1.0
 
 def main() -> None:
     """Run as ``python -m rigd.engine.recorder``."""
-    signals.ignore()
+    ignore_signals()
     parent = Parent()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)

@@ -1,6 +1,11 @@
-from .estimate import EstimateError as EstimateError
-from .estimate import MotorEstimate as MotorEstimate
-from .estimate import estimate_motor as estimate_motor
-from .proposal import Proposal as Proposal
-from .proposal import propose as propose
-from .records import read_recording as read_recording
+from ._estimate import EstimateError as EstimateError
+from ._estimate import MotorEstimate as MotorEstimate
+from ._estimate import estimate_motor as estimate_motor
+from ._experiments import multisine_session as multisine_session
+from ._experiments import speeds_session as speeds_session
+from ._experiments import trial_session as trial_session
+from ._proposal import Proposal as Proposal
+from ._proposal import cautious as cautious
+from ._proposal import propose as propose
+from ._proposal import tuned as tuned
+from ._records import read_recording as read_recording

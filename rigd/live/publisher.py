@@ -16,14 +16,14 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
 from rigd.engine import SAMPLE, TOPICS, Channels, Message, Parent, Word, attach_channels
-from rigd.live.feed import Feed
-from rigd.live.ring_reader import Intake, LiveEnd
-from rigd.live.server import Outlet, RerunError
-from rigd.runtime import signals
+from rigd.live._feed import Feed
+from rigd.live._ring_reader import Intake, LiveEnd
+from rigd.live._server import Outlet, RerunError
+from rigd.runtime import ignore as ignore_signals
 from rigd.view import Health, outcome_note, settle_sdk
 
 if TYPE_CHECKING:
-    from rigd.live.ring_reader import LiveJob, LiveSession
+    from rigd.live._ring_reader import LiveJob, LiveSession
     from rigd.view import Drawing
 
 _MOST_OWED: Final = 1000
@@ -164,7 +164,7 @@ _PARTING_S: Final = 0.3
 
 def main() -> None:
     """Run as ``python -m rigd.live.publisher``."""
-    signals.ignore()
+    ignore_signals()
     # The watchdog's signal works whatever this process was started with.
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))

@@ -1,7 +1,7 @@
 """Session files: format, writer, reader, recovery.
 
 The names below are imported on first use, so that the control process, which needs the message
-layout only (:mod:`rigd.session.format`), does not pay for the container.
+layout only (:mod:`rigd.session._format`), does not pay for the container.
 """
 
 import lazy_loader as lazy

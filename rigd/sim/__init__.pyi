@@ -1,2 +1,2 @@
-from .devices import SimulatedRig as SimulatedRig
-from .plant import SimulatedPlant as SimulatedPlant
+from ._devices import SimulatedRig as SimulatedRig
+from ._plant import SimulatedPlant as SimulatedPlant

@@ -1,7 +1,7 @@
 """Frequency response estimates from sampled records: Welch (H1, H2, Hv, Hiv), whole-record FFT.
 
-Welch's also while the record grows (`rigd.spectral.running`), and a spectrogram that does
-(`rigd.spectral.spectrogram`).
+Welch's also while the record grows (`rigd.spectral._running`), and a spectrogram that does
+(`rigd.spectral._spectrogram`).
 """
 
 import lazy_loader as lazy

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
-from analysis.paper.fit import FitError, fit_frf, fit_many
+from analysis.paper._fit import FitError, fit_frf, fit_many
 from rigd.beam import TransferGrid
 
 WEIGHTINGS = ("const", "omega")

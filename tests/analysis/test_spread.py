@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.paper.fit import sandwich_covariance
+from analysis.paper._fit import sandwich_covariance
 
 N = 2000
 SLOPES = np.array([np.ones(N), np.linspace(-1, 1, N) ** 2, np.exp(1j * np.linspace(0, 9, N))])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from analysis.models import STRUCTURES
-from analysis.paper.fit import starts
+from analysis.paper._fit import starts
 
 
 def test_one_valley_one_start():

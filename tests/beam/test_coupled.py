@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm as scipy_expm
 
 from rigd.beam import Beam, Damping, couple, propagator, realise
-from rigd.beam.realisation import expm
+from rigd.beam._realisation import expm
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 REALISATION = realise(BEAM, Damping(7.1e-5, 0.996, 0.055, 0.594))

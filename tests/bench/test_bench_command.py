@@ -5,10 +5,10 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from rigd.bench.loops import LoopError
-from rigd.bench.program import Results
+from rigd.bench._loops import LoopError
+from rigd.bench._program import Results
 from rigd.cli.app import app
-from rigd.runtime.locks import RigLock
+from rigd.runtime._locks import RigLock
 
 
 @pytest.fixture

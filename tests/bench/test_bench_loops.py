@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rigd.bench import loops
+from rigd.bench import _loops as loops
 from rigd.profile import load_profile
 
 SECONDS = 0.3
@@ -40,7 +40,7 @@ def test_a_loop_that_fails_is_told(profile, monkeypatch):
     def no_memory(**_):
         raise OSError("no shared memory")
 
-    monkeypatch.setattr("rigd.bench.loops.Crew", no_memory)
+    monkeypatch.setattr("rigd.bench._loops.Crew", no_memory)
     with pytest.raises(loops.LoopError, match="no shared memory"):
         loops.run_alone("alone", profile, SECONDS, lambda: None)
 

@@ -6,9 +6,11 @@ from itertools import pairwise
 
 import pytest
 
-from rigd.bench import Bench, as_json, cyclictest, loops, report_lines
-from rigd.bench.program import cores_beside
-from rigd.engine.realtime import REFUSED
+from rigd.bench import Bench, as_json, report_lines
+from rigd.bench import _cyclictest as cyclictest
+from rigd.bench import _loops as loops
+from rigd.bench._program import cores_beside
+from rigd.engine._realtime import REFUSED
 from rigd.profile import load_profile
 
 GRANTED = {"memory": "locked", "cpu": "0", "scheduling": "SCHED_FIFO 80"}
@@ -45,11 +47,11 @@ def computer(monkeypatch, measured):
             return measured("cyclictest", late_us=(self.peer_late_us,), works=False)
 
     made = Computer()
-    monkeypatch.setattr("rigd.bench.program.loops.run_alone", made.loop)
-    monkeypatch.setattr("rigd.bench.program.loops.run_session", made.loop)
-    monkeypatch.setattr("rigd.bench.program.cyclictest.run", made.peer)
-    monkeypatch.setattr("rigd.bench.program.cyclictest.installed", lambda: True)
-    monkeypatch.setattr("rigd.bench.program.settings_granted", lambda _: made.granted)
+    monkeypatch.setattr("rigd.bench._program.loops.run_alone", made.loop)
+    monkeypatch.setattr("rigd.bench._program.loops.run_session", made.loop)
+    monkeypatch.setattr("rigd.bench._program.cyclictest.run", made.peer)
+    monkeypatch.setattr("rigd.bench._program.cyclictest.installed", lambda: True)
+    monkeypatch.setattr("rigd.bench._program.settings_granted", lambda _: made.granted)
     return made
 
 
@@ -115,7 +117,7 @@ def test_stalls_do_not_stop_the_search_and_are_told(bench, computer, measured, m
         passed = int(0.03 * rate_hz)
         return replace(found, missed=found.missed + passed, scheduled=found.scheduled + passed)
 
-    monkeypatch.setattr("rigd.bench.program.loops.run_session", stalling)
+    monkeypatch.setattr("rigd.bench._program.loops.run_session", stalling)
     results = bench()
     assert results.highest_rate_hz is None
     assert results.highest_rate_between_stalls_hz == 2000.0
@@ -136,7 +138,7 @@ def test_the_search_ends_where_everything_holds(bench, computer):
 
 
 def test_the_time_left_only_shrinks(bench, monkeypatch):
-    monkeypatch.setattr("rigd.bench.program.time.monotonic", lambda: 5.0)
+    monkeypatch.setattr("rigd.bench._program.time.monotonic", lambda: 5.0)
     bench()
     left = [left_s for _, left_s in bench.told]
     assert all(later <= earlier for earlier, later in pairwise(left))
@@ -146,7 +148,7 @@ def test_the_time_left_only_shrinks(bench, monkeypatch):
 @pytest.mark.parametrize("installed", [True, False])
 def test_without_cyclictest_the_rest_is_measured(bench, computer, monkeypatch, installed):
     computer.peer_missing = True
-    monkeypatch.setattr("rigd.bench.program.cyclictest.installed", lambda: installed)
+    monkeypatch.setattr("rigd.bench._program.cyclictest.installed", lambda: installed)
     results = bench()
     assert results.peer is None
     assert results.ratios() is None
@@ -189,10 +191,10 @@ def test_the_table_has_a_row_for_each(bench):
 
 
 def test_the_neighbour_works_beside_the_loop(monkeypatch):
-    monkeypatch.setattr("rigd.bench.program.os.sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.setattr("rigd.bench._program.os.sched_getaffinity", lambda _: {0, 1, 2})
     assert cores_beside({"cpu": "2"}) == {0, 1}
     assert cores_beside({"cpu": "2, isolated"}) == {0, 1}
-    monkeypatch.setattr("rigd.bench.program.os.sched_getaffinity", lambda _: {0})
+    monkeypatch.setattr("rigd.bench._program.os.sched_getaffinity", lambda _: {0})
     assert cores_beside({"cpu": f"{REFUSED}no"}) == {0}
 
 

@@ -5,7 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from rigd.bench import cyclictest
+from rigd.bench import _cyclictest as cyclictest
 
 OUTPUT = """\
 # /dev/cpu_dma_latency set to 2us
@@ -90,7 +90,7 @@ def test_what_it_complains_of_is_told(stand_in):
 
 def test_one_that_hangs_is_given_up(stand_in, monkeypatch):
     stand_in("exec sleep 60")
-    monkeypatch.setattr("rigd.bench.cyclictest._MARGIN_S", -0.9)
+    monkeypatch.setattr("rigd.bench._cyclictest._MARGIN_S", -0.9)
     with pytest.raises(cyclictest.CyclictestError) as told:
         cyclictest.run(1000.0, 1.0, cpu=0, priority=80)
     assert isinstance(told.value.__cause__, subprocess.TimeoutExpired)

@@ -11,10 +11,10 @@ from analysis.campaigns.experiment import Experiment
 from analysis.campaigns.session import SessionResult
 from analysis.identify import ModeEstimate, Plant
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper.route import Indices, Peak
+from analysis.paper._route import Indices, Peak
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionWriter
-from rigd.session.format import SAMPLE_SIZE, pack_sample_into
+from rigd.session._format import SAMPLE_SIZE, pack_sample_into
 
 RATE_HZ = 250.0
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

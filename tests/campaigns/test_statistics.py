@@ -11,7 +11,7 @@ from analysis.campaigns import paper
 from analysis.campaigns.nominal import best_models, mean_deviations, nominal_models
 from analysis.campaigns.parameter_statistics import parameter_statistics
 from analysis.models import STRUCTURES, FrequencyResponseModel
-from analysis.paper.route import Peak, resonant_peaks
+from analysis.paper._route import Peak, resonant_peaks
 from rigd.beam import transfer
 
 DATA = Path(__file__).parents[1] / "data"

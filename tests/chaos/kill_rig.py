@@ -30,10 +30,10 @@ from typing import Any
 
 import numpy as np
 
-from rigd.devices.simulator import find_simulator
-from rigd.safety.limits import OVERLOADED
+from rigd.devices._simulator import find_simulator
+from rigd.safety._limits import OVERLOADED
 from rigd.session import Status, read_session
-from rigd.sim.wire.simulator import ask
+from rigd.sim.wire._simulator import ask
 
 BIN = Path(sys.executable).parent
 PROFILES = Path(__file__).parents[2] / "hw_profiles"

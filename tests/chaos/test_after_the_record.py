@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.engine._ring import shared_memory_fd
+from rigd.engine._shared_state import DESCRIPTORS, Phase, Word, create_channels
 from rigd.engine.recorder import Recorder
-from rigd.engine.ring import shared_memory_fd
-from rigd.engine.shared_state import DESCRIPTORS, Phase, Word, create_channels
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig
-from rigd.runtime.signals import StopRequest
+from rigd.runner._request import Order
+from rigd.runner._rig import Rig
+from rigd.runtime._signals import StopRequest
 from rigd.session import SessionWriter, read_session
-from rigd.session.format import pack_sample_into
+from rigd.session._format import pack_sample_into
 
 
 @pytest.fixture

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks.devices import inspect_devices
-from rigd.checks.rows import Verdict, overall
+from rigd.checks._devices import inspect_devices
+from rigd.checks._rows import Verdict, overall
+from rigd.devices._simulator import find_simulator
+from rigd.devices._wired_rig import reset_drive
 from rigd.devices.contracts import DeviceError
-from rigd.devices.simulator import find_simulator
-from rigd.devices.wired_rig import reset_drive
 
 RUN = """
 import sys
 from rigd.profile import load_profile
-from rigd.sim.wire.simulator import SimulatorOptions, run_simulator
+from rigd.sim.wire._simulator import SimulatorOptions, run_simulator
 sys.exit(run_simulator(load_profile(sys.argv[1]).rig, SimulatorOptions(lock_step=True, quiet=True)))
 """
 
@@ -37,7 +37,7 @@ def profile(request, can_profile, serial_profile):
 
 
 def test_a_fault_is_found_and_only_the_operator_resets_it(profile):
-    from rigd.sim.wire.simulator import inject
+    from rigd.sim.wire._simulator import inject
 
     rows = inspect_devices(profile)
     assert overall(rows) == "ok", rows

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.checks.on_paper import profile_rows, wiring_rows
-from rigd.checks.rows import Row, Verdict, overall
-from rigd.devices.canbus.budget import bus_load
+from rigd.checks._on_paper import profile_rows, wiring_rows
+from rigd.checks._rows import Row, Verdict, overall
+from rigd.devices.canbus._budget import bus_load
 from rigd.profile import load_profile
 
 

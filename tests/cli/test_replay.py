@@ -21,18 +21,18 @@ import pytest
 from processes import children, eventually, has_ended, listeners
 
 from analysis.models import WelchSettings
-from analysis.paper.estimate import estimate
+from analysis.paper._estimate import estimate
 from analysis.record import load_record
 from rigd.session import SessionError, SessionWriter, Status, read_session
-from rigd.session.format import (
+from rigd.session._format import (
     SAMPLE_SIZE,
     TIMING_SIZE,
     pack_sample_into,
     pack_timing_into,
 )
-from rigd.view.frequency_charts import MAGNITUDE, ResponseCharts
-from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
-from rigd.view.recorded import nominal_damping, subject_of_session
+from rigd.view._frequency_charts import MAGNITUDE, ResponseCharts
+from rigd.view._plots import GREEN, GREY, ORANGE, SKY_BLUE, VERMILION
+from rigd.view._recorded import nominal_damping, subject_of_session
 
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 RIGD = Path(sys.executable).parent / "rigd"
@@ -556,11 +556,11 @@ def unseen(viewer, colors: dict) -> list:
 def test_a_port_that_somebody_takes_first_is_not_insisted_on(
     rerun_program, recording, tmp_path, monkeypatch
 ):
-    from rigd.live.viewer import PageOfFile
+    from rigd.live._viewer import PageOfFile
 
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
-        monkeypatch.setattr("rigd.live.viewer.free_port", lambda wanted: taken)
+        monkeypatch.setattr("rigd.live._viewer.free_port", lambda wanted: taken)
         with PageOfFile(recording, tmp_path) as page:
             assert page.program.grpc_port not in (0, taken)
             assert page.address.grpc_port == page.program.grpc_port
@@ -571,8 +571,8 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
-    from rigd.live.server import RerunProgram
-    from rigd.live.viewer import PageOfFile, Window
+    from rigd.live._server import RerunProgram
+    from rigd.live._viewer import PageOfFile, Window
 
     headless = ("--headless", "--window-size", "960x600")
     if way == "window":

@@ -11,7 +11,7 @@ import pytest
 from rigd.beam import Beam, Damping
 from rigd.control import check_stability, close_loop
 from rigd.profile import ProfileError, load_profile
-from rigd.profile.load import profile_of
+from rigd.profile._load import profile_of
 
 
 @pytest.fixture

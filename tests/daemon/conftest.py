@@ -9,19 +9,19 @@ from types import SimpleNamespace
 
 import pytest
 
-from rigd.daemon import protocol
-from rigd.daemon.service import CommandError, Service
-from rigd.daemon.states import Peer, State
+from rigd.daemon import _protocol as protocol
+from rigd.daemon._service import CommandError, Service
+from rigd.daemon._states import Peer, State
+from rigd.devices._registry import Reality, open_devices
 from rigd.devices.contracts import DeviceError, Devices
-from rigd.devices.registry import Reality, open_devices
 from rigd.engine import control_process as control
 from rigd.engine import recorder
-from rigd.engine.ipc import CONTROL, ChildError
+from rigd.engine._ipc import CONTROL, ChildError
 from rigd.profile import load_profile
-from rigd.runner import rig as rig_module
-from rigd.runner.process_group import Crew
-from rigd.runner.rig import Rig
-from rigd.runtime.signals import StopRequest
+from rigd.runner import _rig as rig_module
+from rigd.runner._process_group import Crew
+from rigd.runner._rig import Rig
+from rigd.runtime._signals import StopRequest
 from rigd.session import SessionError, SessionWriter
 
 _ENDED = object()

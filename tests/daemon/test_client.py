@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from rigd.daemon import client as client_module
-from rigd.daemon.client import (
+from rigd.daemon import _client as client_module
+from rigd.daemon._client import (
     STOP_SIGNAL,
     Client,
     DaemonGoneError,

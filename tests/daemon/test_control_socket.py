@@ -12,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from rigd.daemon import address, server
-from rigd.daemon.address import AddressError, answers, bind, find, running, socket_path
-from rigd.daemon.server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
-from rigd.daemon.states import Peer, State
+from rigd.daemon import _address as address
+from rigd.daemon import _server as server
+from rigd.daemon._address import AddressError, answers, bind, find, running, socket_path
+from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
+from rigd.daemon._states import Peer, State
 
 LONG = {
     "command": "start",

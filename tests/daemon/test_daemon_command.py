@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.daemon.address import answers, socket_path
-from rigd.daemon.client import STOP_SIGNAL
+from rigd.daemon._address import answers, socket_path
+from rigd.daemon._client import STOP_SIGNAL
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

@@ -5,8 +5,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
-from rigd.daemon.service import CommandError
-from rigd.daemon.states import Document, IllegalTransitionError, Peer, State, StateMachine
+from rigd.daemon._service import CommandError
+from rigd.daemon._states import Document, IllegalTransitionError, Peer, State, StateMachine
 from rigd.devices.contracts import DeviceError
 
 MOST_CALLS = 3000

@@ -5,7 +5,7 @@ import sys
 
 FLOOD = """
 import logging
-from rigd.daemon.log import NAME, Log
+from rigd.daemon._log import NAME, Log
 
 with Log():
     for number in range(20_000):
@@ -15,7 +15,7 @@ print("through")
 A_FEW = """
 import logging
 from rigd.daemon import log
-from rigd.daemon.log import NAME, Log
+from rigd.daemon._log import NAME, Log
 
 log._FLUSH_S = 60.0  # the machine may stand still for longer than a daemon would wait
 with Log():

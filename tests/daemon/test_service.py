@@ -4,13 +4,13 @@ import asyncio
 
 import pytest
 
-from rigd.daemon import protocol
-from rigd.daemon.service import CommandError
-from rigd.daemon.states import Peer, State
+from rigd.daemon import _protocol as protocol
+from rigd.daemon._service import CommandError
+from rigd.daemon._states import Peer, State
+from rigd.devices._registry import Reality
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.devices.registry import Reality
-from rigd.engine.ipc import ChildError
-from rigd.engine.shared_state import Word
+from rigd.engine._ipc import ChildError
+from rigd.engine._shared_state import Word
 
 SHORT = {
     "excitation": "hold",

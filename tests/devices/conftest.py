@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices.registry import open_devices
+from rigd.devices._registry import open_devices
 from rigd.profile import load_profile
 
 HARDWARE = "RIGD_HARDWARE"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from rigd.devices._registry import UnknownDeviceError, check_selection
 from rigd.devices.parameters import Selection
-from rigd.devices.registry import UnknownDeviceError, check_selection
 
 
 def test_unknown_drivers_are_refused_with_what_there_is():
@@ -17,7 +17,7 @@ def test_unknown_drivers_are_refused_with_what_there_is():
 
 def test_the_simulation_is_not_imported_unless_a_profile_names_it():
     code = (
-        "import sys, rigd.devices.registry, rigd.engine.control_process\n"
+        "import sys, rigd.devices._registry, rigd.engine.control_process\n"
         "assert not [name for name in sys.modules if name.startswith('rigd.sim')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

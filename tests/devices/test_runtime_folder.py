@@ -6,8 +6,8 @@ import tempfile
 
 import pytest
 
-from rigd.runtime.folder import runtime_folder
-from rigd.runtime.locks import HeldFile
+from rigd.runtime._folder import runtime_folder
+from rigd.runtime._locks import HeldFile
 
 
 @pytest.fixture

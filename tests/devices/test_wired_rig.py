@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices import wired_rig
+from rigd.devices import _wired_rig as wired_rig
+from rigd.devices._registry import Reality, open_devices, reality, simulated_differently
+from rigd.devices._simulator import SimulatorAddress, announce, described
 from rigd.devices.contracts import DeviceError
-from rigd.devices.registry import Reality, open_devices, reality, simulated_differently
-from rigd.devices.simulator import SimulatorAddress, announce, described
 from rigd.profile import load_profile
 
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from rigd.daemon.states import plan_document
+from rigd.daemon._states import plan_document
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.runner.planning import plan_session
+from rigd.runner._planning import plan_session
 
 PAGE = (Path(__file__).parents[2] / "docs" / "control_socket.md").read_text("utf-8")
 

@@ -14,8 +14,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from rigd.session.schema import EVENT_TOPIC, SAMPLE_TOPIC, message_class
-from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
+from rigd.session._schema import EVENT_TOPIC, SAMPLE_TOPIC, message_class
+from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE
 
 DOCS = Path(__file__).parents[2] / "docs"
 LAYOUTS = DOCS / "layouts"
@@ -164,7 +164,7 @@ def look(session):
     """
     from rerun.experimental import ViewerClient
 
-    from rigd.live.server import RerunProgram
+    from rigd.live._server import RerunProgram
 
     def shown(*files: str, is_right) -> tuple[dict[str, np.ndarray], list]:
         program = RerunProgram(

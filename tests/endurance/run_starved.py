@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 from run_viewers import Reading
 
-from rigd.live.server import find
-from rigd.safety.limits import OVERLOADED
+from rigd.live._server import find
+from rigd.safety._limits import OVERLOADED
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

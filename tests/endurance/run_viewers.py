@@ -19,9 +19,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench.measure import measurement
-from rigd.live.server import LiveAddress, RerunProgram, find
-from rigd.live.viewer import Viewer
+from rigd.bench._measure import measurement
+from rigd.live._server import LiveAddress, RerunProgram, find
+from rigd.live._viewer import Viewer
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine.ipc import CONTROL
+from rigd.engine._ipc import CONTROL
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner.process_group import Crew
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig
-from rigd.runtime.signals import StopRequest
+from rigd.runner._process_group import Crew
+from rigd.runner._request import Order
+from rigd.runner._rig import Rig
+from rigd.runtime._signals import StopRequest
 
 COARSE_KB = 4096
 

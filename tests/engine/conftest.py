@@ -5,17 +5,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
-from rigd.devices.registry import open_devices
+from rigd.engine._jobs import SessionJob
+from rigd.engine._ring import put_reference, shared_memory_fd
+from rigd.engine._shared_state import DESCRIPTORS, Phase, Word, create_channels, read_events
+from rigd.engine._timing import VirtualClock
 from rigd.engine.control_process import attend
-from rigd.engine.jobs import SessionJob
-from rigd.engine.ring import put_reference, shared_memory_fd
-from rigd.engine.shared_state import DESCRIPTORS, Phase, Word, create_channels, read_events
-from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.runtime.signals import StopRequest
-from rigd.session.format import decode_controls, decode_samples
+from rigd.runtime._signals import StopRequest
+from rigd.session._format import decode_controls, decode_samples
 
 
 @dataclass

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
-from rigd.engine.shared_state import Phase, Word
-from rigd.engine.timing import SuspendWatch, VirtualClock
+from rigd.engine._shared_state import Phase, Word
+from rigd.engine._timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
-from rigd.session.format import Status
+from rigd.session._format import Status
 
 
 class FakeRealClock(VirtualClock):
@@ -200,7 +200,7 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
 def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     boot_ns = [0]
     watch = SuspendWatch(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
-    monkeypatch.setattr("rigd.engine.session_sequence.SuspendWatch", lambda: watch)
+    monkeypatch.setattr("rigd.engine._session_sequence.SuspendWatch", lambda: watch)
     session = make_session(clock=FakeRealClock())
 
     read_angle = session.drive.read_angle

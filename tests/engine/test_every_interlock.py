@@ -9,13 +9,13 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
-from rigd.engine.cycle import make_watch
-from rigd.engine.shared_state import Word
-from rigd.engine.timing import VirtualClock
+from rigd.engine._cycle import make_watch
+from rigd.engine._shared_state import Word
+from rigd.engine._timing import VirtualClock
 from rigd.excitation import chirp, hold
 from rigd.profile import load_profile
 from rigd.safety import INTERLOCKS, Action
-from rigd.session.format import Status
+from rigd.session._format import Status
 
 MIDDLE_NS = 3_000_000_000
 MIDDLE = 3000

@@ -6,8 +6,8 @@ from math import exp
 
 import pytest
 
-from rigd.engine import cycle as watch
-from rigd.engine.cycle import make_watch, recalled_heat_nm2, remember_heat
+from rigd.engine import _cycle as watch
+from rigd.engine._cycle import make_watch, recalled_heat_nm2, remember_heat
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 

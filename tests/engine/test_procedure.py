@@ -10,10 +10,10 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
-from rigd.engine.shared_state import Phase, Stop, Word
-from rigd.engine.timing import VirtualClock
+from rigd.engine._shared_state import Phase, Stop, Word
+from rigd.engine._timing import VirtualClock
 from rigd.excitation import hold
-from rigd.session.format import Status, decode_samples
+from rigd.session._format import Status, decode_samples
 
 
 def books(**counts):
@@ -442,7 +442,7 @@ def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, mon
             taken.append(b"" if not taken else session.channels.samples.take(8000))
 
     clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=stand_still)
-    monkeypatch.setattr("rigd.engine.publish.time", clock)
+    monkeypatch.setattr("rigd.engine._publish.time", clock)
     session.run()
     assert session.finished["finished"] == "complete", session.finished["reason"]
     samples = np.concatenate([decode_samples(taken[1]), session.samples])
@@ -454,7 +454,7 @@ def test_a_recorder_that_does_not_read_is_not_waited_for_for_ever(make_session, 
     session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
     seconds = itertools.count(step=0.1)
     clock = SimpleNamespace(monotonic=lambda: next(seconds), sleep=lambda _: None)
-    monkeypatch.setattr("rigd.engine.publish.time", clock)
+    monkeypatch.setattr("rigd.engine._publish.time", clock)
     session.run()
     session.assert_safe()
     assert session.finished["finished"] == "fault"
@@ -526,7 +526,7 @@ def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session)
 
 
 def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session, monkeypatch):
-    monkeypatch.setattr("rigd.engine.session_sequence._GO_PATIENCE_S", 0.2)
+    monkeypatch.setattr("rigd.engine._session_sequence._GO_PATIENCE_S", 0.2)
     session = make_session()
     session.board[Word.GO] = 0
     session.run()

@@ -7,10 +7,10 @@ import subprocess
 import numpy as np
 import pytest
 
-from rigd.engine.ipc import Child, ChildError, packed_object
-from rigd.engine.jobs import SessionJob
-from rigd.engine.ring import map_reference, put_reference, shared_memory_fd
-from rigd.excitation.signals import MAX_TICKS
+from rigd.engine._ipc import Child, ChildError, packed_object
+from rigd.engine._jobs import SessionJob
+from rigd.engine._ring import map_reference, put_reference, shared_memory_fd
+from rigd.excitation._signals import MAX_TICKS
 from rigd.profile import load_profile
 
 PIPE_BYTES = 65_536

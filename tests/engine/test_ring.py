@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine.ring import Observer, Ring, shared_memory_fd
+from rigd.engine._ring import Observer, Ring, shared_memory_fd
 
 RECORD = struct.Struct("<Q")
 
@@ -91,7 +91,7 @@ def test_another_process_reads_what_this_one_wrote(ring):
         put(ring, number)
     spec = ring.spec
     child = (
-        "from rigd.engine.ring import Ring, RingSpec; import sys\n"
+        "from rigd.engine._ring import Ring, RingSpec; import sys\n"
         f"ring = Ring(RingSpec({spec.fd}, {spec.record_size}, {spec.capacity}))\n"
         "sys.stdout.buffer.write(ring.take(100))\n"
     )

@@ -14,8 +14,8 @@ from analysis.exchange.mapping import QUANTITIES, parse_choice
 from analysis.exchange.source import read_source
 from analysis.exchange.specimen import Specimen
 from analysis.models import WelchSettings
-from analysis.paper.estimate import estimate
-from analysis.paper.route import analyse
+from analysis.paper._estimate import estimate
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from rigd.beam import Beam
 from rigd.session import read_session

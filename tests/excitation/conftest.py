@@ -3,7 +3,7 @@ import json
 import pytest
 
 from rigd.profile import load_profile
-from rigd.runner.planning import Foresight
+from rigd.runner._planning import Foresight
 
 MODES = [
     {"frequency_hz": 2.57, "damping_ratio": 0.0091},

@@ -11,9 +11,9 @@ from rigd import excitation
 from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
 from rigd.cli import run
 from rigd.excitation import ExcitationError
-from rigd.excitation.named import FROM_THE_RIG, KINDS, make_excitation
-from rigd.excitation.narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
-from rigd.runner.planning import Foresight, excitation_for, plan_session
+from rigd.excitation._named import FROM_THE_RIG, KINDS, make_excitation
+from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
+from rigd.runner._planning import Foresight, excitation_for, plan_session
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from rigd.daemon.protocol import RequestError, parse_request
+from rigd.daemon._protocol import RequestError, parse_request
 from rigd.excitation import ExcitationError
-from rigd.excitation.narrow_sweeps import FoundMode, read_modes
+from rigd.excitation._narrow_sweeps import FoundMode, read_modes
 from rigd.session import read_session
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.excitation import ExcitationError
-from rigd.identification.experiments import (
+from rigd.identification._experiments import (
     Pass,
     lay_out_passes,
     multisine_session,
@@ -15,7 +15,7 @@ from rigd.identification.experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.runner.planning import plan_session
+from rigd.runner._planning import plan_session
 
 SESSIONS = (trial_session, multisine_session, speeds_session)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rigd.control import PidController, design_pid
+from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
-from rigd.devices.registry import open_devices
-from rigd.engine.cycle import Cycle, make_watch
-from rigd.identification.estimate import Timing, Window, estimate_motor
-from rigd.identification.experiments import (
+from rigd.engine._cycle import Cycle, make_watch
+from rigd.identification._estimate import Timing, Window, estimate_motor
+from rigd.identification._experiments import (
     TOP_HZ,
     lay_out_passes,
     multisine_session,
@@ -21,7 +21,7 @@ from rigd.identification.experiments import (
     speeds_session,
     trial_session,
 )
-from rigd.identification.proposal import cautious, tuned
+from rigd.identification._proposal import cautious, tuned
 from rigd.profile import load_profile
 
 OPTIONS = {"torque_percent": 40.0, "stroke_rad": 0.8}

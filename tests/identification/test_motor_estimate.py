@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rigd.identification.estimate import (
+from rigd.identification._estimate import (
     EstimateError,
     Timing,
     Window,

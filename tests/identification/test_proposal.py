@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.identification.estimate import MotorEstimate, Quantity
-from rigd.identification.proposal import _rounded, propose
+from rigd.identification._estimate import MotorEstimate, Quantity
+from rigd.identification._proposal import _rounded, propose
 from rigd.profile import load_profile
 
 ESTIMATE = MotorEstimate(

@@ -16,13 +16,13 @@ import pytest
 from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
-from rigd.engine.ipc import packed_object
-from rigd.engine.ring import Ring, shared_memory_fd
-from rigd.engine.shared_state import DESCRIPTORS, TOPICS, Board, Channels, Event, Word, write_event
-from rigd.live.ring_reader import LiveEnd, LiveJob, LiveSession
-from rigd.live.server import LiveAddress
-from rigd.session.format import pack_sample_into, pack_timing_into
-from rigd.view.session_info import Subject
+from rigd.engine._ipc import packed_object
+from rigd.engine._ring import Ring, shared_memory_fd
+from rigd.engine._shared_state import DESCRIPTORS, TOPICS, Board, Channels, Event, Word, write_event
+from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession
+from rigd.live._server import LiveAddress
+from rigd.session._format import pack_sample_into, pack_timing_into
+from rigd.view._session_info import Subject
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.5, density_kg_per_m=0.047, bending_stiffness_n_m2=0.2)

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.live.server import LiveAddress, announce, find, free_port, running, withdraw
-from rigd.runtime.folder import runtime_folder
+from rigd.live._server import LiveAddress, announce, find, free_port, running, withdraw
+from rigd.runtime._folder import runtime_folder
 
 
 @pytest.fixture

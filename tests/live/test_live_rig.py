@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from processes import eventually
 
-from rigd.engine.shared_state import Word
-from rigd.excitation.named import make_excitation
-from rigd.live.server import find
+from rigd.engine._shared_state import Word
+from rigd.excitation._named import make_excitation
+from rigd.live._server import find
 from rigd.profile import load_profile
-from rigd.runner import live_view
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig
-from rigd.runtime.signals import StopRequest
+from rigd.runner import _live_view as live_view
+from rigd.runner._request import Order
+from rigd.runner._rig import Rig
+from rigd.runtime._signals import StopRequest
 from rigd.session import read_session
 
 

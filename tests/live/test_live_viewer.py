@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from processes import eventually, sockets
 
-from rigd.live.viewer import Viewer
+from rigd.live._viewer import Viewer
 
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 
@@ -78,10 +78,10 @@ def test_a_window_that_does_not_answer_is_waited_for_by_nobody(
     publisher, viewer, shown_s, monkeypatch
 ):
     assert eventually(lambda: shown_s() > 0.5)
-    monkeypatch.setattr("rigd.live.viewer._ANSWER_S", 0.5)
+    monkeypatch.setattr("rigd.live._viewer._ANSWER_S", 0.5)
     os.kill(viewer.pid, signal.SIGSTOP)
     assert not viewer.connect(publisher.address)
     assert not viewer.connect(publisher.address), "one at a time"
     os.kill(viewer.pid, signal.SIGCONT)
-    monkeypatch.setattr("rigd.live.viewer._ANSWER_S", 60.0)
+    monkeypatch.setattr("rigd.live._viewer._ANSWER_S", 60.0)
     assert eventually(lambda: viewer.connect(publisher.address))

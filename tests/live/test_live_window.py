@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 from processes import eventually
 
-from rigd.view import plots
-from rigd.view.antenna import TITLE as ANTENNA
-from rigd.view.layout import TABS
-from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
+from rigd.view import _plots as plots
+from rigd.view._antenna import TITLE as ANTENNA
+from rigd.view._layout import TABS
+from rigd.view._plots import GREEN, GREY, ORANGE, SKY_BLUE
 
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 

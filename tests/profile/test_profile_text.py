@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from rigd.profile import ProfileError, load_profile
-from rigd.profile.load import profile_of
-from rigd.profile.write import Setting, check_new, with_head, with_settings, write_new
+from rigd.profile._load import profile_of
+from rigd.profile._write import Setting, check_new, with_head, with_settings, write_new
 
 
 @pytest.fixture(scope="module")

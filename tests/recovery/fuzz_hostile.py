@@ -92,7 +92,7 @@ SESSION = {
 
 def session_file(*parts, session=SESSION, end=True):
     """Make a file of parts, with the schemas and channels of a session in front (1 and 2)."""
-    from rigd.session.schema import EVENT_SCHEMA, SAMPLE_SCHEMA, schema_data
+    from rigd.session._schema import EVENT_SCHEMA, SAMPLE_SCHEMA, schema_data
 
     declared = (
         schema(1, SAMPLE_SCHEMA, schema_data(SAMPLE_SCHEMA))
@@ -107,7 +107,7 @@ def session_file(*parts, session=SESSION, end=True):
 
 def sample_records(first, count, *, permuted=False):
     """Make message records of samples, as bytes; `permuted` puts the tick before the time."""
-    from rigd.session.format import SAMPLE_DTYPE, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
+    from rigd.session._format import SAMPLE_DTYPE, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
 
     wire = np.zeros(count, SAMPLE_WIRE_DTYPE)
     for number, (name, kind) in enumerate(SAMPLE_TYPES.items(), start=1):
@@ -139,7 +139,7 @@ def samples(count, *, permuted=False, piece=20_000):
 
 def event(message_text):
     """Make a message of the log."""
-    from rigd.session.schema import event_class
+    from rigd.session._schema import event_class
 
     return message(2, event_class()(level=2, message=message_text, name="x").SerializeToString())
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rigd.session import describe, read_session, read_timings, recover
-from rigd.session.recovery import _increasing
+from rigd.session._recovery import _increasing
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,9 @@ from mcap.writer import Writer
 
 from analysis.record import load_record
 from rigd.session import SessionError, SessionExistsError, describe, read_session, recover
-from rigd.session.format import decode_samples
-from rigd.session.schema import SAMPLE_SCHEMA, schema_data
-from rigd.session.writer import mark_as_written
+from rigd.session._format import decode_samples
+from rigd.session._schema import SAMPLE_SCHEMA, schema_data
+from rigd.session._writer import mark_as_written
 
 
 def test_damage_of_every_kind_gives_what_was_before_it_or_a_refusal(fuzz_recovery, original):
@@ -128,7 +128,7 @@ def test_a_name_that_is_taken_meanwhile_is_refused(torn, monkeypatch):
         target.write_bytes(b"precious")
         return read(path, **options)
 
-    monkeypatch.setattr("rigd.session.recovery.read_session", reading_takes_a_while)
+    monkeypatch.setattr("rigd.session._recovery.read_session", reading_takes_a_while)
     with pytest.raises(SessionExistsError, match=r"a\.mcap exists and is not overwritten"):
         recover(torn)
     assert target.read_bytes() == b"precious"
@@ -249,7 +249,7 @@ def test_a_torn_file_of_another_writer_is_recovered_with_a_warning(
 
 
 def packed(row):
-    from rigd.session.format import SAMPLE_SIZE, pack_sample_into
+    from rigd.session._format import SAMPLE_SIZE, pack_sample_into
 
     block = bytearray(SAMPLE_SIZE)
     pack_sample_into(block, 0, *row.item())

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rigd.session import SessionError, SessionWriter, read_session, recover
-from rigd.session.format import SAMPLE_SIZE, decode_samples, pack_sample_into
+from rigd.session._format import SAMPLE_SIZE, decode_samples, pack_sample_into
 
 METADATA = {"rate_hz": "1000.0", "beam_length_m": "1"}
 
@@ -113,7 +113,7 @@ def test_a_limit_of_the_file_size_keeps_what_was_recorded(tmp_path):
 def advance(monkeypatch):
     """Let the writer's next sync be due."""
     now = [0.0]
-    monkeypatch.setattr("rigd.session.writer.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("rigd.session._writer.time.monotonic", lambda: now[0])
 
     def advance():
         now[0] += 2.0
@@ -165,7 +165,7 @@ def test_what_nobody_takes_is_said_to_be_lost(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("rigd.session.writer.copy_new", full)
+    monkeypatch.setattr("rigd.session._writer.copy_new", full)
     assert writer.abandon() is None
 
 
@@ -174,7 +174,7 @@ CHILD = """
     from pathlib import Path
     sys.path.insert(0, sys.argv[2])
     from test_recovery_disk import begun, packed
-    from rigd.session.format import SAMPLE_SIZE
+    from rigd.session._format import SAMPLE_SIZE
 
     rate_hz = float(sys.argv[3])
     block = packed(0, 3000, rate_hz)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper.route import analyse
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionWriter
-from rigd.session.format import SAMPLE_SIZE, pack_sample_into
+from rigd.session._format import SAMPLE_SIZE, pack_sample_into
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=1.15e11 * 7.85e-13)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from analysis.models import WelchSettings
-from analysis.paper.route import analyse
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from analysis.report import style
 from analysis.report.frf_figure import frf_figure

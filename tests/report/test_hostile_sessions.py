@@ -11,7 +11,7 @@ import zstandard
 
 from analysis.record import RecordError, load_record
 from rigd.session import SessionError
-from rigd.session.schema import SAMPLE_SCHEMA, schema_data
+from rigd.session._schema import SAMPLE_SCHEMA, schema_data
 
 MAGIC = b"\x89MCAP0\r\n"
 MEGABYTES = 1000

@@ -8,14 +8,14 @@ from typer.testing import CliRunner
 
 from analysis.cli import app
 from analysis.models import WelchSettings
-from analysis.paper.route import analyse
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from analysis.report import fit_charts
 from analysis.report.folder import OutputError
 from analysis.report.rerun_file import write_rerun_file
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
-from rigd.view.recorded import new_rrd_file
+from rigd.view._recorded import new_rrd_file
 
 BAND = (0.5875, 50.0)
 

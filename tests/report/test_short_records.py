@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper.estimate import estimate_warnings
-from analysis.paper.route import analyse
+from analysis.paper._estimate import estimate_warnings
+from analysis.paper._route import analyse
 from analysis.record import RecordError, load_record
 from analysis.report import style
 from analysis.report.document import document_text

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement
-from analysis.identify.problem import Comparison
+from analysis.identify._problem import Comparison
 from analysis.models import WelchSettings
-from analysis.paper.estimate import EstimateError, SettingsError
+from analysis.paper._estimate import EstimateError, SettingsError
 from analysis.record import load_record
 from analysis.suited import (
     against_welch,

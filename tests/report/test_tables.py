@@ -5,7 +5,7 @@ import pytest
 from rich.console import Console
 
 from analysis.models import WelchSettings
-from analysis.paper.route import analyse
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from analysis.report.tables import summary_table, with_spread
 from analysis.report.write import tables_text

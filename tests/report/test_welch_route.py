@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper.estimate import EstimateError, SettingsError
-from analysis.paper.route import analyse
+from analysis.paper._estimate import EstimateError, SettingsError
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from rigd.beam import transfer
 from rigd.spectral import Segmentation

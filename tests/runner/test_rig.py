@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from processes import children
 
-from rigd.engine.shared_state import Phase
+from rigd.engine._shared_state import Phase
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig, RigError
-from rigd.runtime.signals import StopRequest
+from rigd.runner._request import Order
+from rigd.runner._rig import Rig, RigError
+from rigd.runtime._signals import StopRequest
 from rigd.session import read_session
 
 
@@ -140,7 +140,7 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
             if recorder.state != "ended":
                 os.kill(recorder.pid, signal.SIGKILL)
 
-    from rigd.runner.session import SessionFailedError
+    from rigd.runner._session import SessionFailedError
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
         run(rig, watcher=watcher, duration_s=100.0)

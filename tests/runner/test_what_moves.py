@@ -6,10 +6,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from rigd.devices.registry import Reality, what_moves
-from rigd.devices.simulator import unreachable_simulators
-from rigd.runner.planning import RefusedError
-from rigd.runner.request import load_rig
+from rigd.devices._registry import Reality, what_moves
+from rigd.devices._simulator import unreachable_simulators
+from rigd.runner._planning import RefusedError
+from rigd.runner._request import load_rig
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from rigd.checks.on_paper import travel_rows, worst_travel
+from rigd.checks._on_paper import travel_rows, worst_travel
 from rigd.profile import load_profile
-from rigd.profile.schema import keys
+from rigd.profile._schema import keys
 from rigd.safety import INTERLOCKS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "safety.md").read_text("utf-8")

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine.cycle import make_watch
+from rigd.engine._cycle import make_watch
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner.planning import RefusedError
-from rigd.runner.request import make_room
+from rigd.runner._planning import RefusedError
+from rigd.runner._request import make_room
 from rigd.safety import LOOK_EVERY
 
 PROFILE = load_profile("antenna_can")

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.devices._registry import open_devices
 from rigd.devices.contracts import DeviceError
-from rigd.devices.registry import open_devices
 from rigd.profile import load_profile
-from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.drive_node import DriveNode
+from rigd.sim._devices import SimulatedRig
+from rigd.sim.wire._drive_node import DriveNode
 
 HOST, NODE = 127, 1
 

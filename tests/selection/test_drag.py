@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from analysis.identify import select
-from analysis.identify.candidates import Field
-from analysis.identify.drag import with_air_drag
+from analysis.identify._candidates import Field
+from analysis.identify._drag import with_air_drag
 
 NOISE_NM = 5e-3
 DRAG_M = 2.3e-3

@@ -2,7 +2,7 @@
 
 import pytest
 
-from analysis.identify.finding import SEEN, Finding, doubted
+from analysis.identify._finding import SEEN, Finding, doubted
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify.candidates import Field
-from analysis.identify.headline import structures
-from analysis.identify.profile_likelihood import Profile
-from analysis.identify.rivals import of_rig
-from analysis.identify.verdict import order_verdict
+from analysis.identify._candidates import Field
+from analysis.identify._headline import structures
+from analysis.identify._profile_likelihood import Profile
+from analysis.identify._rivals import of_rig
+from analysis.identify._verdict import order_verdict
 from analysis.models import STRUCTURES
 
 CLAMP = ("root_compliance_rad_per_nm",)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper.estimate import EstimateError
-from analysis.paper.route import analyse
+from analysis.paper._estimate import EstimateError
+from analysis.paper._route import analyse
 
 
 @pytest.mark.parametrize(

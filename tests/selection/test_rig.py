@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement, select
-from analysis.identify.candidates import Field
-from analysis.identify.channel_checks import clipping, stops, wrong_scale
-from analysis.identify.headline import MISREAD
-from analysis.identify.leakage import repeats_after_s
-from analysis.identify.problem import Comparison
+from analysis.identify._candidates import Field
+from analysis.identify._channel_checks import clipping, stops, wrong_scale
+from analysis.identify._headline import MISREAD
+from analysis.identify._leakage import repeats_after_s
+from analysis.identify._problem import Comparison
 from analysis.report.html.damping_sentences import damping_sentences
 from rigd.beam import Beam
 

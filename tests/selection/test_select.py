@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, headline_json, select
-from analysis.identify.candidates import Field
-from analysis.identify.free_decay import mode_poles
-from analysis.identify.noise import Noise
-from analysis.identify.problem import Comparison
-from analysis.identify.profile_likelihood import CHI_SQUARE_95
-from analysis.identify.refit import resonances_kept, vector
-from analysis.identify.verdict import EVEN
+from analysis.identify._candidates import Field
+from analysis.identify._free_decay import mode_poles
+from analysis.identify._noise import Noise
+from analysis.identify._problem import Comparison
+from analysis.identify._profile_likelihood import CHI_SQUARE_95
+from analysis.identify._refit import resonances_kept, vector
+from analysis.identify._verdict import EVEN
 from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam
 

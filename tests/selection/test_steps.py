@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.identify.candidates import Field
-from analysis.identify.diagnostics import of_settings
-from analysis.identify.profile_likelihood import Profile
-from analysis.identify.select import order as order_sentence
-from analysis.identify.verdict import order_verdict
+from analysis.identify._candidates import Field
+from analysis.identify._diagnostics import of_settings
+from analysis.identify._profile_likelihood import Profile
+from analysis.identify._select import order as order_sentence
+from analysis.identify._verdict import order_verdict
 
 BAND_HZ = (0.0, 50.0)
 
@@ -44,7 +44,7 @@ def test_what_all_else_makes_up_for_is_not_doubted(without_delay):
 
 
 def test_a_profile_looks_for_no_valley_where_there_is_none(without_delay):
-    from analysis.identify.profile_likelihood import profiled
+    from analysis.identify._profile_likelihood import profiled
 
     field, alpha, _ = profiled(without_delay)
     assert len(alpha.valleys) == 1

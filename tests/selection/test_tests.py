@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from analysis.identify import cumulative_periodogram
-from analysis.identify.residual_tests import (
+from analysis.identify._residual_tests import (
     harmonics,
     in_time,
     input_relation,

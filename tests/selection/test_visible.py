@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from analysis.identify import fit_record
-from analysis.identify.noise import Noise
-from analysis.identify.problem import Comparison
-from analysis.identify.select import experiments
-from analysis.identify.visible_modes import driven, visible_modes
+from analysis.identify._noise import Noise
+from analysis.identify._problem import Comparison
+from analysis.identify._select import experiments
+from analysis.identify._visible_modes import driven, visible_modes
 from analysis.models import STRUCTURES
 
 STRONG_NM = 0.05

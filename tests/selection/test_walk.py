@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.profile_likelihood import Walk, admitted, valleys
+from analysis.identify._profile_likelihood import Walk, admitted, valleys
 
 COUNT = 1000
 BOTTOMS = {0.6: 0.0, 1.4: 1.0}

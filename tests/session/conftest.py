@@ -14,7 +14,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from rigd.session import SessionWriter
-from rigd.session.format import (
+from rigd.session._format import (
     CONTROL_FIELDS,
     CONTROL_SIZE,
     SAMPLE_DTYPE,
@@ -25,7 +25,7 @@ from rigd.session.format import (
     pack_sample_into,
     pack_timing_into,
 )
-from rigd.session.schema import SAMPLE_SCHEMA, schema_data
+from rigd.session._schema import SAMPLE_SCHEMA, schema_data
 
 START_UTC_NS = 1_700_000_000_123_456_789
 METADATA = {

@@ -6,9 +6,10 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rigd.session import SessionError, message_decoder, read_session
-from rigd.session.format import SAMPLE_FIELDS
-from rigd.session.schema import SAMPLE_SCHEMA, message_class, schema_data
+from rigd.session import SessionError, read_session
+from rigd.session import _message_decoder as message_decoder
+from rigd.session._format import SAMPLE_FIELDS
+from rigd.session._schema import SAMPLE_SCHEMA, message_class, schema_data
 
 TYPES = {"INT64": 3, "UINT32": 13, "SINT32": 17, "FLOAT": 2, "SFIXED64": 16, "FIXED32": 7}
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigd.session import Status, message_decoder, read_session
-from rigd.session.format import CONTROL_TYPES, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
-from rigd.session.mcap_limits import (
+from rigd.session import Status, read_session
+from rigd.session import _message_decoder as message_decoder
+from rigd.session._format import CONTROL_TYPES, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE, field_tag
+from rigd.session._mcap_limits import (
     MAX_CHUNK_BYTES,
     MAX_DECLARED_BYTES,
     MAX_ENTRIES,
@@ -20,9 +21,9 @@ from rigd.session.mcap_limits import (
     MAX_TEXT_BYTES,
     MAX_TOTAL_BYTES,
 )
-from rigd.session.message_decoder import MAX_CHANNELS, MAX_SINGLE_MESSAGES
-from rigd.session.reader import MAX_SAMPLES, MAX_SURVEYED
-from rigd.session.schema import MAX_SCHEMA_BYTES
+from rigd.session._message_decoder import MAX_CHANNELS, MAX_SINGLE_MESSAGES
+from rigd.session._reader import MAX_SAMPLES, MAX_SURVEYED
+from rigd.session._schema import MAX_SCHEMA_BYTES
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "session_format.md").read_text("utf-8")
 

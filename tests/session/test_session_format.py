@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.session.format import (
+from rigd.session._format import (
     CONTROL_FIELDS,
     CONTROL_SIZE,
     SAMPLE_DTYPE,
@@ -27,7 +27,7 @@ from rigd.session.format import (
     pack_sample_into,
     pack_timing_into,
 )
-from rigd.session.schema import (
+from rigd.session._schema import (
     CONTROL_SCHEMA,
     SAMPLE_SCHEMA,
     TIMING_SCHEMA,
@@ -132,7 +132,7 @@ def test_a_block_that_is_no_whole_number_of_samples_is_refused():
 def test_the_control_process_imports_neither_container_nor_protobuf():
     heavy = ("mcap", "google.protobuf", "zstandard", "lz4", "scipy")
     code = (
-        "import sys, rigd.session, rigd.session.format\n"
+        "import sys, rigd.session, rigd.session._format\n"
         f"print([name for name in {heavy!r} if name in sys.modules])"
     )
     result = subprocess.run(

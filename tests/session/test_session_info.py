@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.session import SessionError, SessionWriter, describe
-from rigd.session.format import Status
+from rigd.session._format import Status
 
 
 @pytest.fixture

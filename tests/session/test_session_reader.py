@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
 
 from rigd.session import Event, SessionError, read_controls, read_session
-from rigd.session.format import SAMPLE_FIELDS, SAMPLE_TYPES, decode_controls
-from rigd.session.schema import SAMPLE_SCHEMA, message_class, schema_data
+from rigd.session._format import SAMPLE_FIELDS, SAMPLE_TYPES, decode_controls
+from rigd.session._schema import SAMPLE_SCHEMA, message_class, schema_data
 
 
 def encoded(samples, cls=None):

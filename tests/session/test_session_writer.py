@@ -15,8 +15,8 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from rigd.session import SessionError, SessionExistsError, SessionWriter, read_session, read_timings
-from rigd.session.format import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
-from rigd.session.schema import message_class
+from rigd.session._format import SAMPLE_FIELDS, TIMING_SIZE, decode_controls, decode_samples
+from rigd.session._schema import message_class
 
 
 def test_the_plain_reader_finds_and_decodes_everything(kit, recorded):
@@ -128,7 +128,7 @@ CHILD = """
     from pathlib import Path
     sys.path.insert(0, sys.argv[2])
     from conftest import begin, make_samples, packed
-    from rigd.session.format import SAMPLE_SIZE
+    from rigd.session._format import SAMPLE_SIZE
 
     block = packed(make_samples(5000))
     writer = begin(Path(sys.argv[1]))
@@ -163,7 +163,7 @@ def test_a_killed_recorder_loses_at_most_250_samples(kit, tmp_path, after):
 def test_the_file_is_synced_about_once_a_second(kit, tmp_path, monkeypatch):
     now = 0.0
     synced = []
-    monkeypatch.setattr("rigd.session.writer.time.monotonic", lambda: now)
+    monkeypatch.setattr("rigd.session._writer.time.monotonic", lambda: now)
     writer = kit.begin(tmp_path / "a.mcap")
     sync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda fd: (synced.append(now), sync(fd)))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement, Plant
-from analysis.identify.drag_torque import DragLaw, DragResponse
-from analysis.identify.problem import Comparison
+from analysis.identify._drag_torque import DragLaw, DragResponse
+from analysis.identify._problem import Comparison
 from rigd.beam import Damping
 from rigd.profile import load_profile
-from rigd.sim.plant import SimulatedPlant
+from rigd.sim._plant import SimulatedPlant
 
 DRAG_M = 2.3e-3
 RATE_HZ = 1000.0

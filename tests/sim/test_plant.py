@@ -14,7 +14,7 @@ from rigd.devices.parameters import (
     Selection,
     WrenchSensor,
 )
-from rigd.sim.plant import SimulatedPlant
+from rigd.sim._plant import SimulatedPlant
 
 MOTOR = Motor(
     inertia_kg_m2=2e-3,

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rigd.devices._registry import open_devices
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import Selection
-from rigd.devices.registry import open_devices
 from rigd.profile import load_profile
 
 PERIOD_NS = 1_000_000

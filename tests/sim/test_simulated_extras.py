@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import LoadedBeam
 from rigd.profile import load_profile
-from rigd.sim.plant import OtherClock, SimulatedPlant
+from rigd.sim._plant import OtherClock, SimulatedPlant
 
 TICKS = 12_000
 RATE_HZ = 1000.0

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.spectral.running import LowBins, bins_up_to
+from rigd.spectral._running import LowBins, bins_up_to
 
 
 @given(data=st.data())

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.spectral.running import Segments
+from rigd.spectral._running import Segments
 
 LENGTH, HOP, LONGEST_GAP = 40, 30, 5
 

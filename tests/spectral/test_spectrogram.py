@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rigd.spectral import RunningSpectrogram
-from rigd.spectral.spectrogram import LEAST_DB
+from rigd.spectral._spectrogram import LEAST_DB
 
 RATE_HZ = 1000.0
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping
-from rigd.session.format import SAMPLE_DTYPE
-from rigd.view.plots import TIMELINE
-from rigd.view.session_info import Subject
+from rigd.session._format import SAMPLE_DTYPE
+from rigd.view._plots import TIMELINE
+from rigd.view._session_info import Subject
 
 
 @pytest.fixture(autouse=True)

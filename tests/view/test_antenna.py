@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 
 from rigd.beam import DeflectionFilter
-from rigd.view import antenna
-from rigd.view.antenna import ANTENNA, BEAM, DRAWN_HZ, FACTOR, LABEL, TITLE, TRAIL, TRAIL_S, Antenna
+from rigd.view import _antenna as antenna
+from rigd.view._antenna import (
+    ANTENNA,
+    BEAM,
+    DRAWN_HZ,
+    FACTOR,
+    LABEL,
+    TITLE,
+    TRAIL,
+    TRAIL_S,
+    Antenna,
+)
 
 STRIPS = "LineStrips3D:strips"
 

@@ -2,10 +2,10 @@
 
 import pytest
 
-from rigd.view import plots
-from rigd.view.frequency_charts import SIZES
-from rigd.view.layout import CLOSE_UP_S, HISTORY_S, TABS, TIME_VIEWS, WINDOW_S, blueprint
-from rigd.view.plots import TIMELINE
+from rigd.view import _plots as plots
+from rigd.view._frequency_charts import SIZES
+from rigd.view._layout import CLOSE_UP_S, HISTORY_S, TABS, TIME_VIEWS, WINDOW_S, blueprint
+from rigd.view._plots import TIMELINE
 
 
 def leaves(part):

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from analysis.models import PAPER_BAND_HZ, WelchSettings
-from analysis.paper.estimate import estimate
+from analysis.paper._estimate import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import Status, read_session
-from rigd.session.format import TIMING_DTYPE
-from rigd.view.frequency_charts import MAGNITUDE, SweepResponse
-from rigd.view.scene import Picture
-from rigd.view.session_info import Health, Note, Subject
+from rigd.session._format import TIMING_DTYPE
+from rigd.view._frequency_charts import MAGNITUDE, SweepResponse
+from rigd.view._scene import Picture
+from rigd.view._session_info import Health, Note, Subject
 
 RIGD = Path(sys.executable).parent / "rigd"
 

@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from rigd.session.format import TIMING_DTYPE
-from rigd.view.plots import HEALTH, READINGS, SIGNALS, send_columns
-from rigd.view.session_info import Health, health_record
+from rigd.session._format import TIMING_DTYPE
+from rigd.view._plots import HEALTH, READINGS, SIGNALS, send_columns
+from rigd.view._session_info import Health, health_record
 
 SOURCES = (SIGNALS, READINGS, HEALTH)
 PLOTS = [plot for source in SOURCES for plot in source.plots]
@@ -106,5 +106,5 @@ def test_rerun_gets_the_columns_at_the_time_of_the_session(shown, make_samples):
 
 
 def test_views_are_imported_without_the_viewer():
-    code = "import sys, rigd.view.scene; sys.exit('rerun' in sys.modules)"
+    code = "import sys, rigd.view._scene; sys.exit('rerun' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

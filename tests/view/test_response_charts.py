@@ -7,7 +7,7 @@ import pytest
 
 from rigd.beam import transfer
 from rigd.spectral import FrequencyResponse, RunningEstimate
-from rigd.view.frequency_charts import (
+from rigd.view._frequency_charts import (
     COHERENCE,
     FIRST_HZ,
     LAST_HZ,

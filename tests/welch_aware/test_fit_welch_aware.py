@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import analysis.welch_aware.fit
 from analysis.identify import SETTINGS
 from analysis.models import STRUCTURES, WeightingError
-from analysis.paper.fit import fit_frf
+from analysis.paper._fit import fit_frf
 from rigd.beam import Beam, Damping
 
 OFF = Beam(0.98, 4.7e-3 * 1.01 * 1.02, 0.090275 * 1.02)

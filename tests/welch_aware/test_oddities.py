@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.models import STRUCTURES
-from analysis.paper.fit import fit_many
+from analysis.paper._fit import fit_many
 from rigd.beam import Damping, modes, transfer
 from rigd.spectral import segment_count
 

@@ -3,7 +3,7 @@
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper.estimate import SettingsError
+from analysis.paper._estimate import SettingsError
 from analysis.record import load_record
 from analysis.welch_aware import fit_record_welch_aware
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, Plant
-from analysis.identify.parametrization import Unknowns
+from analysis.identify._parametrization import Unknowns
 from analysis.models import STRUCTURES
 from analysis.welch_aware.comparison import Measured
 from analysis.welch_aware.objective import Objective

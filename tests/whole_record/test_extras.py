@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from analysis.identify import EXTRAS, SETTINGS, Plant
-from analysis.identify.free_decay import mode_poles
-from analysis.identify.parametrization import Unknowns
-from analysis.identify.predictor import LOGARITHMIC, Prediction
-from analysis.identify.refit import vector
+from analysis.identify._free_decay import mode_poles
+from analysis.identify._parametrization import Unknowns
+from analysis.identify._predictor import LOGARITHMIC, Prediction
+from analysis.identify._refit import vector
 from analysis.models import STRUCTURES
 from rigd.beam import PARAMETERS, Beam, Damping
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import fit_record
-from analysis.identify.problem import Comparison, following
+from analysis.identify._problem import Comparison, following
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, transfer
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
-from analysis.identify.optimizer import descend
-from analysis.identify.parametrization import Steps, Unknowns
-from analysis.identify.problem import Comparison, Objective
+from analysis.identify._optimizer import descend
+from analysis.identify._parametrization import Steps, Unknowns
+from analysis.identify._problem import Comparison, Objective
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, modes
 

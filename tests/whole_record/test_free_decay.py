@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import Plant
-from analysis.identify.free_decay import DecaySpectra, Pole, mode_poles
+from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
 from rigd.beam import Beam, Damping, poles
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, Plant
-from analysis.identify.parametrization import Unknowns
-from analysis.identify.problem import Comparison, Objective
+from analysis.identify._parametrization import Unknowns
+from analysis.identify._problem import Comparison, Objective
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 

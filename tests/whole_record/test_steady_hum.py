@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from analysis.identify import Plant, fit_record
-from analysis.identify.free_decay import Pole
-from analysis.identify.hum import hum_beside_modes
-from analysis.identify.noise import noise_of
-from analysis.identify.problem import Comparison
+from analysis.identify._free_decay import Pole
+from analysis.identify._hum import hum_beside_modes
+from analysis.identify._noise import noise_of
+from analysis.identify._problem import Comparison
 from analysis.models import STRUCTURES
 from rigd.beam import Damping
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, Plant
-from analysis.identify.parametrization import Unknowns
-from analysis.identify.predictor import LOGARITHMIC
+from analysis.identify._parametrization import Unknowns
+from analysis.identify._predictor import LOGARITHMIC
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
 

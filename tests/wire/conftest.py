@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from rigd.engine.shared_state import Event, Phase
+from rigd.engine._shared_state import Event, Phase
 from rigd.excitation import chirp
 from rigd.profile import load_profile
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig
-from rigd.runner.session import SessionProgress, SessionResult
-from rigd.runtime.signals import StopRequest
-from rigd.sim.wire.simulator import inject
+from rigd.runner._request import Order
+from rigd.runner._rig import Rig
+from rigd.runner._session import SessionProgress, SessionResult
+from rigd.runtime._signals import StopRequest
+from rigd.sim.wire._simulator import inject
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import pytest
 
 from rigd.devices.parameters import Selection
 from rigd.excitation import hold
-from rigd.runner.request import Order
-from rigd.runner.rig import Rig
-from rigd.runtime.signals import StopRequest
+from rigd.runner._request import Order
+from rigd.runner._rig import Rig
+from rigd.runtime._signals import StopRequest
 from rigd.session import read_session
-from rigd.sim.wire.simulator import inject
+from rigd.sim.wire._simulator import inject
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,3 @@
-from .can_sensor import AtiCanSensor as AtiCanSensor
-from .serial_protocol import RECORD_BITS as RECORD_BITS
-from .serial_sensor import AtiSerialSensor as AtiSerialSensor
+from ._can_sensor import AtiCanSensor as AtiCanSensor
+from ._serial_protocol import RECORD_BITS as RECORD_BITS
+from ._serial_sensor import AtiSerialSensor as AtiSerialSensor

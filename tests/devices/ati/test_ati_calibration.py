@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.ati.calibration import (
+from rigd.devices.ati._calibration import (
     CAN_CRITICAL,
     SERIAL_CRITICAL,
     WIRE_ORDER,

@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices.ati import netcanoem
-from rigd.devices.ati.can_sensor import AtiCanSensor
+from rigd.devices._simulator import SimulatorAddress
+from rigd.devices.ati import _netcanoem as netcanoem
+from rigd.devices.ati._can_sensor import AtiCanSensor
 from rigd.devices.canbus import CanLink
 from rigd.devices.contracts import DeviceError
-from rigd.devices.simulator import SimulatorAddress
 
 
 class Bench:
@@ -44,8 +44,8 @@ def bench(fakes, can_rig):
 @pytest.fixture
 def quick(monkeypatch):
     """No long waits for replies that never come."""
-    monkeypatch.setattr("rigd.devices.ati.can_sensor._REPLY_TIMEOUT_S", 0.01)
-    monkeypatch.setattr("rigd.devices.ati.can_sensor._LATE_REPLY_S", 0.01)
+    monkeypatch.setattr("rigd.devices.ati._can_sensor._REPLY_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("rigd.devices.ati._can_sensor._LATE_REPLY_S", 0.01)
 
 
 def with_ati(rig, **changes):
@@ -162,7 +162,7 @@ def test_a_reply_that_comes_twice_is_not_taken_for_that_to_the_next_request(
     fakes, can_rig, monkeypatch
 ):
     """One that is late is asked for again, and then two are on their way."""
-    monkeypatch.setattr("rigd.devices.ati.can_sensor._REPLY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("rigd.devices.ati._can_sensor._REPLY_TIMEOUT_S", 0.05)
     bench = Bench(fakes, can_rig, fakes.LateBus)
     bench.bus.late_s = {(2, b"\0"): [0.07, 0.07]}
     bench.sensor.connect()

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.ati import serial_protocol as modbus
+from rigd.devices.ati import _serial_protocol as modbus
 
 
 def hexed(text):

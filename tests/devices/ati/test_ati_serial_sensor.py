@@ -11,10 +11,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rigd.devices.ati.serial_sensor import AtiSerialSensor
-from rigd.devices.ati.serial_setup import SerialLine
+from rigd.devices._simulator import SimulatorAddress
+from rigd.devices.ati._serial_sensor import AtiSerialSensor
+from rigd.devices.ati._serial_setup import SerialLine
 from rigd.devices.contracts import DeviceError
-from rigd.devices.simulator import SimulatorAddress
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def open_sensor(serial_rig, digital_ft):
 @pytest.fixture
 def unhurried(monkeypatch):
     """However slowly a test runs, no tick comes after a pause that the driver distrusts."""
-    monkeypatch.setattr("rigd.devices.ati.serial_sensor._IDLE_NS", 10**12)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._IDLE_NS", 10**12)
 
 
 def refusal(sensor):
@@ -284,7 +284,7 @@ def test_another_clock_is_no_lag(follow, extra):
 
 
 def test_after_a_pause_only_new_records_count(open_sensor, digital_ft, fakes, monkeypatch, settled):
-    monkeypatch.setattr("rigd.devices.ati.serial_sensor._IDLE_NS", 1_000_000)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._IDLE_NS", 1_000_000)
     sensor = open_sensor()
     sensor.connect()
     settled(sensor)
@@ -376,7 +376,7 @@ def test_measuring(open_sensor, digital_ft, fakes):
 
 
 def test_a_silent_sensor(open_sensor, digital_ft, monkeypatch):
-    monkeypatch.setattr("rigd.devices.ati.serial_setup._REPLY_TIMEOUT_S", 0.02)
+    monkeypatch.setattr("rigd.devices.ati._serial_setup._REPLY_TIMEOUT_S", 0.02)
     digital_ft.silent = True
     message = refusal(open_sensor())
     assert "no usable reply in 3 tries: no reply came" in message
@@ -450,7 +450,7 @@ def test_a_declined_start(open_sensor, digital_ft):
 
 @pytest.mark.parametrize("first", [[], [b"\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a\x0b\x0c\x00"]])
 def test_a_start_without_sound_records(open_sensor, digital_ft, monkeypatch, first):
-    monkeypatch.setattr("rigd.devices.ati.serial_sensor._FIRST_RECORDS_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("rigd.devices.ati._serial_sensor._FIRST_RECORDS_TIMEOUT_S", 0.2)
     digital_ft.first_records = first * 30
     message = refusal(open_sensor())
     assert f"of the {390 if first else 0} bytes" in message
@@ -458,7 +458,7 @@ def test_a_start_without_sound_records(open_sensor, digital_ft, monkeypatch, fir
 
 
 def test_a_sensor_that_does_not_stop_streaming(open_sensor, digital_ft, monkeypatch, fakes):
-    monkeypatch.setattr("rigd.devices.ati.serial_setup._DRAIN_LIMIT_S", 0.1)
+    monkeypatch.setattr("rigd.devices.ati._serial_setup._DRAIN_LIMIT_S", 0.1)
     digital_ft.streaming = digital_ft.deaf_to_jam = True
     wait = SerialLine.wait
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from rigd.devices.ati.serial_protocol import RECORD_SIZE, SYNC_RECORDS, RecordStream
+from rigd.devices.ati._serial_protocol import RECORD_SIZE, SYNC_RECORDS, RecordStream
 
 
 def split(data):

@@ -5,11 +5,11 @@ import socket
 
 import pytest
 
+from rigd.devices._simulator import SimulatorAddress
 from rigd.devices.canbus import CanLink
-from rigd.devices.canbus.exchange import BusLock
+from rigd.devices.canbus._exchange import BusLock
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
-from rigd.devices.simulator import SimulatorAddress
 
 SETTINGS = CanBus("socketcan", "rigd-none0", 1_000_000)
 

@@ -10,12 +10,12 @@ from dataclasses import replace
 import can
 import pytest
 
+from rigd.devices._simulator import SimulatorAddress
 from rigd.devices.canbus import open_port, pack_frame, unpack_frame
-from rigd.devices.canbus.exchange import CanExchange
-from rigd.devices.canbus.port import PythonCanPort, SocketPort
+from rigd.devices.canbus._exchange import CanExchange
+from rigd.devices.canbus._port import PythonCanPort, SocketPort
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
-from rigd.devices.simulator import SimulatorAddress
 
 SETTINGS = CanBus("socketcan", "rigd-none0", 1_000_000)
 

@@ -11,13 +11,13 @@ import canopen
 import pytest
 
 import rigd.devices.cia402 as package
+from rigd.devices._simulator import SimulatorAddress
 from rigd.devices.canbus import CanExchange, open_port
-from rigd.devices.canbus.port import SocketPort
-from rigd.devices.cia402.setup import set_up
-from rigd.devices.cia402.standing import reset_fault
+from rigd.devices.canbus._port import SocketPort
+from rigd.devices.cia402._setup import set_up
+from rigd.devices.cia402._standing import reset_fault
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
-from rigd.devices.simulator import SimulatorAddress
 
 NODE = 5
 EDS = str(Path(package.__file__).with_name("drive.eds"))

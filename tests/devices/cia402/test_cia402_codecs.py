@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import rigd.devices.cia402 as package
 from rigd.devices.canbus import unpack_frame
-from rigd.devices.cia402 import protocol
-from rigd.devices.cia402 import protocol as states
-from rigd.devices.cia402.node import Inbox
-from rigd.devices.cia402.protocol import (
+from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _protocol as states
+from rigd.devices.cia402._node import Inbox
+from rigd.devices.cia402._protocol import (
     DriveState,
     NodeFrames,
     describe_error,

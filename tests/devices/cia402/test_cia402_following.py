@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigd.control import close_loop
-from rigd.devices.cia402.transitions import TorqueFollowing
+from rigd.devices.cia402._transitions import TorqueFollowing
 from rigd.devices.contracts import DeviceError
 from rigd.excitation import chirp
 from rigd.profile import load_profile

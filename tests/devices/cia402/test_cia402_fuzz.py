@@ -32,7 +32,7 @@ def test_only_device_errors_leave_the_driver(rig, settings, mode):
 
 def test_the_fuzzer_finds_a_handler_that_raises(rig, settings, monkeypatch):
     fuzzer = load()
-    from rigd.devices.cia402 import node as inbox
+    from rigd.devices.cia402 import _node as inbox
 
     monkeypatch.setattr(inbox, "LengthError", ZeroDivisionError)
     with pytest.raises(Exception, match="unpack requires a buffer of 8 bytes"):

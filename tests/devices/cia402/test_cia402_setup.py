@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.devices.cia402.drive import Cia402Drive
-from rigd.devices.cia402.requirements import (
+from rigd.devices.cia402._drive import Cia402Drive
+from rigd.devices.cia402._requirements import (
     interpolation_time,
     sync_period_us,
     torque_limit_per_mille,
 )
-from rigd.devices.cia402.sdo import SdoAccess
+from rigd.devices.cia402._sdo import SdoAccess
 from rigd.devices.contracts import DeviceError
 
 TPDO1, RPDO1 = 0x40000185, 0x205

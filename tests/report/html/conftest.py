@@ -6,7 +6,7 @@ import pytest
 
 from analysis.identify import Measurement, fit_record, of_fit
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper.route import analyse
+from analysis.paper._route import analyse
 from analysis.record import load_record
 from analysis.report.html import Subject, Verdict
 from analysis.report.html.write import write_html_report

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import of_fit
-from analysis.identify.headline import Simpler
+from analysis.identify._headline import Simpler
 from analysis.report import style
 from analysis.report.document import _finite
 from analysis.report.folder import OutputError

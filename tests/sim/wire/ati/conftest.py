@@ -10,8 +10,8 @@ import pytest
 
 from rigd.devices.parameters import AtiCan, AtiSerial
 from rigd.profile import load_profile
-from rigd.sim.wire.ati_can_node import AtiCanNode
-from rigd.sim.wire.ati_serial_device import AtiSerialDevice
+from rigd.sim.wire._ati_can_node import AtiCanNode
+from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
 RECORDS_PER_PERIOD = 7
 

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 
 from rigd.devices.parameters import AtiCan, AtiSerial
 from rigd.profile import load_profile
-from rigd.sim.wire.ati_can_node import AtiCanNode
-from rigd.sim.wire.ati_serial_device import AtiSerialDevice
+from rigd.sim.wire._ati_can_node import AtiCanNode
+from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
 BASE = 0x11
 START = bytes.fromhex("0A4655A39D")

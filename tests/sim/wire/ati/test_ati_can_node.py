@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.ati_can_node import AtiCanNode
+from rigd.sim._devices import SimulatedRig
+from rigd.sim.wire._ati_can_node import AtiCanNode
 
 UNLOADED = [612, -1043, 385, 871, -724, 198]
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigd.profile import load_profile
-from rigd.sim.wire.ati_gauges import AtiGauges
+from rigd.sim.wire._ati_gauges import AtiGauges
 
 SENSOR = load_profile("sim").rig.sensor
 GAUGES = AtiGauges(SENSOR)

@@ -8,8 +8,8 @@ import pytest
 
 from rigd.devices.parameters import ServoDrive
 from rigd.profile import load_profile
-from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.drive_node import DriveNode
+from rigd.sim._devices import SimulatedRig
+from rigd.sim.wire._drive_node import DriveNode
 
 NODE = 5
 HOST = 100

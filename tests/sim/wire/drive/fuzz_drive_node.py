@@ -12,8 +12,8 @@ from dataclasses import replace
 
 from rigd.devices.parameters import RigParameters, ServoDrive
 from rigd.profile import load_profile
-from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.drive_node import DriveNode
+from rigd.sim._devices import SimulatedRig
+from rigd.sim.wire._drive_node import DriveNode
 
 NODE = 5
 INTERESTING = (0x000, 0x080, 0x085, 0x185, 0x205, 0x305, 0x405, 0x505, 0x585, 0x605, 0x705, 0x764)

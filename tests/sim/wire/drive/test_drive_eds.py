@@ -7,7 +7,7 @@ import pytest
 from eds_files import FILES, WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim.wire.object_dictionary import read_device
+from rigd.sim.wire._object_dictionary import read_device
 
 ABSENT, NO_SUB = 0x06020000, 0x06090011
 READ_ONLY, WRITE_ONLY, VALUE = 0x06010002, 0x06010001, 0x06090030

@@ -5,7 +5,7 @@ import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.sim.wire.object_dictionary import Abort, AbortCode, Entry, ObjectDictionary, SdoServer
+from rigd.sim.wire._object_dictionary import Abort, AbortCode, Entry, ObjectDictionary, SdoServer
 
 MODEST = settings(max_examples=150)
 LETTERS = "bBhHiI"

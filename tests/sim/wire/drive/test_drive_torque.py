@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.sim.devices import SimulatedDrive, SimulatedRig
+from rigd.sim._devices import SimulatedDrive, SimulatedRig
 
 RATED_NM = 0.5
 
@@ -234,7 +234,7 @@ def test_a_log_entry_for_each_change_of_torque_or_enabling_and_no_other(running)
 
 def test_a_profile_a_drive_cannot_serve_is_refused(rig, make_bench):
     from rigd.devices.contracts import DeviceError
-    from rigd.sim.wire.drive_node import DriveNode
+    from rigd.sim.wire._drive_node import DriveNode
 
     def build(changed):
         return DriveNode(changed, SimulatedRig(rig), None, None, None)

@@ -5,9 +5,9 @@ import struct
 import pytest
 
 from rigd.profile import load_profile
-from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.bus_simulation import World
-from rigd.sim.wire.faults import EventLog
+from rigd.sim._devices import SimulatedRig
+from rigd.sim.wire._bus_simulation import World
+from rigd.sim.wire._faults import EventLog
 
 PERIOD_NS = 1_000_000
 

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.sim.wire.bus_simulation import LockStep, WallClock
+from rigd.sim.wire._bus_simulation import LockStep, WallClock
 
 T = 1_000_000
 quiet = settings(max_examples=60)

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim.wire.links import Hub, VirtualCan, interface_kind, is_virtual, kind_in_reply, listen
+from rigd.sim.wire._links import Hub, VirtualCan, interface_kind, is_virtual, kind_in_reply, listen
 
 
 def frame(n):

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from rigd.devices._simulator import SimulatorAddress
 from rigd.devices.contracts import DeviceError
-from rigd.devices.simulator import SimulatorAddress
 from rigd.profile import load_profile
-from rigd.sim.wire.faults import EventLog
-from rigd.sim.wire.links import PtyLine, without_transport
-from rigd.sim.wire.simulator import ControlSocket, ask
+from rigd.sim.wire._faults import EventLog
+from rigd.sim.wire._links import PtyLine, without_transport
+from rigd.sim.wire._simulator import ControlSocket, ask
 
 # The serial line
 

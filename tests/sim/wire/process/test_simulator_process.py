@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from rigd.devices.simulator import find_simulator
+from rigd.devices._simulator import find_simulator
 
 RUN = (
     "import typer\n"
@@ -422,7 +422,7 @@ def test_a_rig_that_is_not_started_leaves_no_log(runtime, rigd_here, tmp_path):
 
 
 def test_the_help_names_every_fault(rigd_here):
-    from rigd.sim.wire.faults import KINDS
+    from rigd.sim.wire._faults import KINDS
 
     shown = rigd_here("inject", "--help").stdout
     assert all(f"{kind}," in shown or f"{kind}[" in shown for kind in KINDS)

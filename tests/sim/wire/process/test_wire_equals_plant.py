@@ -13,19 +13,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigd.devices.canbus.budget import bus_load
-from rigd.devices.registry import open_devices
-from rigd.devices.simulator import find_simulator
+from rigd.devices._registry import open_devices
+from rigd.devices._simulator import find_simulator
+from rigd.devices.canbus._budget import bus_load
 from rigd.profile import load_profile
-from rigd.sim.devices import SimulatedRig
-from rigd.sim.wire.simulator import ask
+from rigd.sim._devices import SimulatedRig
+from rigd.sim.wire._simulator import ask
 
 PERIOD_NS = 1_000_000
 PROFILES = Path(__file__).parents[4] / "hw_profiles"
 RUN = (
     "import sys\n"
     "from rigd.profile import load_profile\n"
-    "from rigd.sim.wire.simulator import SimulatorOptions, run_simulator\n"
+    "from rigd.sim.wire._simulator import SimulatorOptions, run_simulator\n"
     "options = SimulatorOptions(lock_step=True, quiet=True)\n"
     "sys.exit(run_simulator(load_profile(sys.argv[1]).rig, options))\n"
 )

@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from rigd.sim.wire.faults import LASTING, LINE_KINDS, FaultError, parse_fault
+from rigd.sim.wire._faults import LASTING, LINE_KINDS, FaultError, parse_fault
 
 PERIOD_NS = 1_000_000
 RPDO, POLL = 0x201, 0x680

@@ -1,0 +1,477 @@
+"""All structures fitted to one record under one noise, the lowest BIC first."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._channel_checks import wrong_scale
+from analysis.identify._fit import fit_record
+from analysis.identify._leakage import without_leakage
+from analysis.identify._noise import Noise
+from analysis.identify._parametrization import Unknowns
+from analysis.identify._predictor import SETTINGS
+from analysis.identify._problem import Comparison
+from analysis.identify._refit import Refit, adapted, resonances_kept, vector
+from analysis.identify._residual_tests import whiteness
+from analysis.identify._rivals import with_extras
+from analysis.identify._visible_modes import visible_modes
+from analysis.models import STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._data import Measurement
+    from analysis.identify._drag import DragEstimate
+    from analysis.identify._finding import Finding
+    from analysis.identify._predictor import Plant, Setting
+    from analysis.identify._result import RecordAnalysis, RecordFit
+    from analysis.models import Structure
+
+Kind = tuple[bool, tuple[str, ...]]
+"""Kind of rig: whether the beam is uniform, and what else is free."""
+
+EXTRA_WORDS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "root_compliance_rad_per_nm": "elastic clamp",
+        "tip_mass_kg": "tip mass",
+        "filter_time_constant_s": "first-order filter",
+        "second_order_filter_time_constant_s": "second-order filter",
+        "clock_rate_difference": "clock rate difference",
+    }
+)
+"""What tables call the extras of a candidate."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One structure on one kind of beam, fitted.
+
+    Attributes
+    ----------
+    structure : Structure
+    uniform : bool
+        Whether all modes follow from one stiffness.
+    fit : RecordFit
+    columns : int
+        Parameters of what is not linear, beside those of the fit.
+    extras : tuple of str
+        What else of `analysis.identify.EXTRAS` was free.
+    """
+
+    structure: Structure
+    uniform: bool
+    fit: RecordFit
+    columns: int = 0
+    extras: tuple[str, ...] = ()
+
+    @property
+    def parameters(self) -> int:
+        """Number of free parameters; the free decay's amplitudes, common to all, do not count."""
+        return len(self.fit.interval) + self.columns
+
+    @property
+    def values(self) -> int:
+        """Number of real values compared."""
+        fit = self.fit
+        decays = fit.ringing.degrees_of_freedom
+        return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns
+
+    @property
+    def deviance(self) -> float:
+        """``-2 ln`` likelihood but for a constant: noise of known shape and free level."""
+        return self.values * math.log(self.fit.cost / self.values)
+
+    @property
+    def bic(self) -> float:
+        """Schwarz, Annals of Statistics 6 (1978) 461-464."""
+        return self.deviance + self.parameters * math.log(self.values)
+
+    @property
+    def aic(self) -> float:
+        """Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723."""
+        return self.deviance + 2 * self.parameters
+
+    @property
+    def kind(self) -> Kind:
+        """Of rig: whether the beam is uniform, and what else was free."""
+        return self.uniform, self.extras
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        beside = [] if self.uniform else ["modes free"]
+        beside += [EXTRA_WORDS[name] for name in self.extras]
+        return ", ".join([self.structure.name, *beside])
+
+
+FREE_STIFFNESS: Final = (STRUCTURES["III"], STRUCTURES["VII"])
+"""Structures always tried on a beam that is not uniform: those of a material of integer order."""
+
+_FREE_ORDERS: Final = (STRUCTURES["IV"], STRUCTURES["VI"])
+"""Fitted there as well if such a beam is the best, as on any other kind. Where the modes are free
+their frequencies say nothing of the orders, only their damping does."""
+
+_DISMISSED: Final = 10.0
+"""Difference of BIC by which these must be better for the noise to be taken anew."""
+
+_SHOWS: Final = 4.0
+"""Deviance that a damping must save to stay in the freest structure: one that saves less moves no
+other parameter by more than two standard deviations, and only makes them uncertain."""
+
+_PLAIN: Final[Kind] = (True, ())
+"""Kind of rig: a uniform beam, and nothing beside it."""
+
+_FREEST: Final = STRUCTURES["VI"]
+_ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
+
+_CROSS_CHECKS: Final = 3
+_FEW: Final = 8
+"""Evaluations that settle a fit under slightly other noise, or show that a start leads nowhere."""
+
+_MANY: Final = 40
+_NEARLY: Final = 1e-3
+_MISSED: Final = 1e-5
+"""Share of a sum of squares, which is some 1e4; BIC counts a parameter as 9."""
+
+_DOUBTFUL: Final = 0.01
+"""Probability of a residual's shape by chance, below which all modes are searched for anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """All candidates on one record, and what it takes to fit again.
+
+    Attributes
+    ----------
+    comparison : Comparison
+    noise : Noise
+        The one under which all were fitted.
+    free : tuple of str
+        Settings that are free.
+    candidates : tuple of Candidate
+        The lowest BIC first.
+    columns : ndarray of complex, shape (c, K)
+        What all were allowed beside the linear beam.
+    drag : DragEstimate, optional
+        Of the air, if the record calls for it; it is then in all candidates.
+    misread : tuple of Finding
+        A wrong sign or unit, which makes every number wrong; empty where there is none.
+    """
+
+    comparison: Comparison
+    noise: Noise
+    free: tuple[Setting, ...]
+    candidates: tuple[Candidate, ...]
+    columns: NDArray[np.complex128]
+    drag: DragEstimate | None = None
+    misread: tuple[Finding, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        measurement: Measurement,
+        fixed: tuple[Setting, ...],
+        band_hz: tuple[float, float],
+    ) -> Field:
+        """Fit every structure; the freest alone where a sign or a unit is wrong.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used.
+        """
+        if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
+            # No beam explains such a record: one structure shows what remains as well as all.
+            found = fit_record(measurement, (_FREEST,), fixed=fixed, band_hz=band_hz)
+            return replace(cls._uniform(found, fixed), misread=misread)
+        field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
+        field = field._without_leakage()
+        likeliest = field.likeliest
+        if len(visible_modes(field.comparison, field.noise, likeliest)) > 1:
+            field = (
+                field._with_modes_free(likeliest)
+                if _all_but_white(field, likeliest)
+                else field._with_modes_searched(measurement, fixed, band_hz)
+            )
+        return with_extras(field.cross_checked())
+
+    @classmethod
+    def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> Field:
+        """Take over what was fitted with a uniform beam."""
+        comparison = uniform.comparison
+        return cls(
+            comparison=comparison,
+            noise=_noise(uniform, comparison),
+            free=tuple(name for name in SETTINGS if name not in fixed),
+            candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
+            columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
+        )
+
+    @property
+    def best(self) -> Candidate:
+        """The first: the lowest BIC, unless the field is led by another (`led_by`)."""
+        return self.candidates[0]
+
+    @property
+    def freest(self) -> Candidate:
+        """The freest structure that the record supports, on the kind of rig that it calls for.
+
+        All orders are free, so its intervals hold whichever simpler structure is the true one;
+        those of the lowest BIC hold only if that is. For the same reason kinds of rig are compared
+        by their freest structures: with an order fixed, a tip mass or free modes stand for what
+        the order would be. The uniform beam without anything beside it gives way to a BIC that is
+        lower by 10 only.
+        """
+        plain = self._freest_of(_PLAIN)
+        other = self._freest_of(self.best.kind)
+        if plain is None or (other is not None and other.bic < plain.bic - _DISMISSED):
+            return other or self.best
+        return plain
+
+    def _freest_of(self, kind: Kind) -> Candidate | None:
+        """Find the freest on one kind of rig; a damping that does not show is left out.
+
+        None if no structure was fitted with its orders free there.
+        """
+        alike = {c.structure.name: c for c in self.candidates if c.kind == kind}
+        freest = alike.get(_FREEST.name)
+        if freest is None:
+            return None
+        lesser = [alike[s.name] for s in _ONE_DAMPING if s.name in alike]
+        least = min(lesser, key=lambda c: c.deviance, default=freest)
+        return least if least.deviance - freest.deviance < _SHOWS else freest
+
+    def led_by(self, candidate: Candidate) -> Field:
+        """Put one candidate first: the one whose numbers are told."""
+        others = (c for c in self.candidates if c is not candidate)
+        return replace(self, candidates=(candidate, *others))
+
+    def other_kinds(self, within: float) -> tuple[Candidate, ...]:
+        """Return the best candidate of each other kind of rig that explains the record as well.
+
+        Parameters
+        ----------
+        within : float
+            By how much the BIC may be above the lowest.
+        """
+        best: dict[Kind, Candidate] = {}
+        for candidate in self.of_other_kinds(within):
+            best.setdefault(candidate.kind, candidate)
+        return tuple(best.values())
+
+    def of_other_kinds(self, within: float) -> tuple[Candidate, ...]:
+        """Return all candidates on other kinds of rig that explain the record as well.
+
+        A rig with nothing beside the beam is none of them where the freest structure has more: with
+        the same orders free that was far better. A simpler structure without it may yet have a low
+        BIC, for it saves on orders what it loses by the rig.
+
+        Parameters
+        ----------
+        within : float
+            By how much the BIC may be above the lowest.
+
+        Returns
+        -------
+        tuple of Candidate
+            The lowest BIC first.
+        """
+        beaten = {_PLAIN, self.freest.kind}
+        ranked = _ranked(self.candidates)
+        return tuple(
+            each for each in ranked if each.kind not in beaten and each.bic < ranked[0].bic + within
+        )
+
+    @property
+    def likeliest(self) -> RecordFit:
+        """The lowest sum of squares, however many parameters it took."""
+        return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
+
+    @property
+    def bic(self) -> float:
+        """The lowest, comparable between fields whose noise has been estimated anew."""
+        return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
+
+    def unknowns(
+        self, structure: Structure, uniform: bool, extras: tuple[str, ...] = ()
+    ) -> Unknowns:
+        """Search space of a structure on this record."""
+        modes = 1 if uniform else self.comparison.visible_modes
+        nominal = self.comparison.measurement.nominal
+        return Unknowns.of(structure, nominal, self.free, modes, extras)
+
+    def refit(
+        self,
+        structure: Structure,
+        uniform: bool,
+        start: Plant,
+        max_evaluations: int = _MANY,
+        extras: tuple[str, ...] = (),
+    ) -> Refit:
+        """Descend with one structure from a plant that has its damping."""
+        unknowns = self.unknowns(structure, uniform, extras)
+        return self.descent(unknowns, vector(unknowns, start), max_evaluations)
+
+    def descent(
+        self, unknowns: Unknowns, start: NDArray[np.float64], max_evaluations: int
+    ) -> Refit:
+        """Descend from a vector of unknowns."""
+        return Refit.descend(
+            self.comparison,
+            unknowns,
+            start,
+            self.noise,
+            self.columns,
+            max_evaluations=max_evaluations,
+        )
+
+    def candidate(
+        self,
+        structure: Structure,
+        uniform: bool,
+        start: Plant,
+        max_evaluations: int = _MANY,
+        extras: tuple[str, ...] = (),
+    ) -> Candidate:
+        """Fit one structure from a plant."""
+        refit = self.refit(structure, uniform, start, max_evaluations, extras)
+        return Candidate(structure, uniform, refit.fit(), len(self.columns), extras)
+
+    def _without_leakage(self) -> Field:
+        """Leave out what hum beyond the band spoils."""
+        noise = without_leakage(self.noise, self.comparison, self.likeliest)
+        return self.under(noise) if noise is not self.noise else self
+
+    def under(self, noise: Noise) -> Field:
+        """Fit again under a noise that differs a little."""
+        other = replace(self, noise=noise)
+        again = _ranked(
+            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW, c.extras)
+            for c in self.candidates
+        )
+        return replace(other, candidates=again)
+
+    def _with_modes_free(self, uniform: RecordFit) -> Field:
+        """Free the modes' stiffness from where a uniform beam explains the record."""
+        fits = {candidate.structure.name: candidate.fit for candidate in self.candidates}
+        found = []
+        for structure in FREE_STIFFNESS:
+            unknowns = self.unknowns(structure, uniform=False)
+            start = resonances_kept(unknowns, fits[structure.name], uniform.modes)
+            refit = self.descent(unknowns, start, _MANY)
+            found.append(Candidate(structure, False, refit.fit(), len(self.columns)))
+        return replace(self, candidates=_ranked((*self.candidates, *found)))
+
+    def _with_modes_searched(
+        self,
+        measurement: Measurement,
+        fixed: tuple[Setting, ...],
+        band_hz: tuple[float, float],
+    ) -> Field:
+        """Search for the modes wherever they are; the noise is that of the likelier beam."""
+        loose = fit_record(measurement, FREE_STIFFNESS, fixed=fixed, band_hz=band_hz, uniform=False)
+        found = tuple(Candidate(fit.structure, False, fit) for fit in loose.fits)
+        every = replace(self, candidates=(*self.candidates, *found))
+        noise, closest = _noise(loose, self.comparison), min(loose.fits, key=lambda f: f.cost)
+        common = noise.counts & self.noise.counts
+        if _deviance(noise, closest, common) > _deviance(self.noise, self.likeliest, common):
+            return every.under(self.noise)
+        return every.under(without_leakage(noise, self.comparison, closest))
+
+    def cross_checked(self) -> Field:
+        """Start each from where the best is: over a flat valley a search may miss what is there."""
+        field = self
+        for _ in range(_CROSS_CHECKS):
+            best = field.best
+            checked = _ranked(
+                c if c is best else field._from_plant(c, best.fit.plant, best.structure)
+                for c in field.candidates
+            )
+            field = replace(field, candidates=checked)
+            if field.best is best:
+                break
+        return field
+
+    def tried_from(self, plant: Plant, of: Structure) -> Field:
+        """Start each from a plant that a search in structure `of` has found."""
+        tried = _ranked(self._from_plant(c, plant, of) for c in self.candidates)
+        return replace(self, candidates=tried).cross_checked()
+
+    def _from_plant(self, candidate: Candidate, plant: Plant, of: Structure) -> Candidate:
+        """Fit a candidate from another's plant, where that has the same kinds of damping."""
+        structure = candidate.structure
+        if (of.internal and not structure.internal) or (of.external and not structure.external):
+            return candidate
+        unknowns = self.unknowns(structure, candidate.uniform, candidate.extras)
+        start = adapted(unknowns, plant, of)
+        outlook = self.descent(unknowns, start, 1)
+        least = candidate.fit.cost * (1 - _MISSED)
+        if outlook.promised_cost > least:
+            return candidate
+        first = self.descent(unknowns, start, _FEW)
+        if first.cost > candidate.fit.cost * (1 + _NEARLY):
+            return candidate
+        found = self.descent(unknowns, first.x, _MANY)
+        if found.cost > least:
+            return candidate
+        return replace(candidate, fit=found.fit(), columns=len(self.columns))
+
+    def with_orders_free(self) -> Field:
+        """Free the orders too, on a beam of the best's kind, if that was not done."""
+        best = self.best
+        known = {c.structure.name for c in self.candidates if c.kind == best.kind}
+        found = []
+        for structure in _FREE_ORDERS:
+            if structure.name not in known:
+                unknowns = self.unknowns(structure, best.uniform, best.extras)
+                start = adapted(unknowns, best.fit.plant, best.structure)
+                found.append((structure, self.descent(unknowns, start, _MANY)))
+        if not found:
+            return self
+        candidates = (
+            Candidate(structure, best.uniform, refit.fit(), len(self.columns), best.extras)
+            for structure, refit in found
+        )
+        freed = replace(self, candidates=_ranked((*self.candidates, *candidates)))
+        if freed.best.bic > best.bic - _DISMISSED:
+            return freed.cross_checked()
+        lowest = min((refit for _, refit in found), key=lambda refit: refit.cost)
+        return freed.under(lowest.noise_here())
+
+    def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
+        """Fit all again, with what is not linear beside the beam."""
+        other = replace(self, columns=columns, noise=noise)
+        again = _ranked(
+            other.candidate(c.structure, c.uniform, c.fit.plant, extras=c.extras)
+            for c in self.candidates
+        )
+        return replace(other, candidates=again).cross_checked()
+
+
+def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    return tuple(sorted(candidates, key=lambda candidate: candidate.bic))
+
+
+def _deviance(noise: Noise, fit: RecordFit, bins: NDArray[np.bool_]) -> float:
+    """``-2 ln`` likelihood of a fit under its noise, in some of the bins."""
+    squares = float(np.sum(np.abs(fit.residual[bins]) ** 2))
+    return squares + 2 * float(np.sum(np.log(noise.power[bins])))
+
+
+def _all_but_white(field: Field, fit: RecordFit) -> bool:
+    counts = field.noise.counts
+    found = whiteness(fit.residual[counts], field.comparison.frequency_hz[counts])
+    return found.probability > _DOUBTFUL and not found.loud
+
+
+def _noise(analysis: RecordAnalysis, comparison: Comparison) -> Noise:
+    """Noise as the estimator had it: the power of each bin."""
+    scale = comparison.samples * comparison.decimation.rate_hz / 2
+    return Noise(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)

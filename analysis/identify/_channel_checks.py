@@ -1,0 +1,196 @@
+"""What is wrong with a channel as recorded: clipping, a stop, a wrong sign or unit, drift.
+
+A sign reversed or a unit mistaken, from torque over angle against the beam that the file states.
+
+The median over the band sees neither where the modes are exactly, nor how they are damped.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._finding import Finding
+from rigd.beam import Damping, transfer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._candidates import Field
+    from analysis.identify._data import Measurement
+    from analysis.identify._problem import Comparison
+
+_FEWEST_FLAT: Final = 4
+"""Known values next to another at the very extreme: noise does not repeat its largest."""
+
+_STILL_S: Final = 0.5
+_STILL: Final = 0.02
+"""Least stand-still worth a word, and motion then, over what was asked for."""
+
+
+def clipping(measurement: Measurement) -> Iterator[Finding]:
+    """Find a torque that stays at its extreme values."""
+    torque, known = measurement.torque_nm, measurement.torque_known
+    flat = []
+    for limit in (torque[known].max(), torque[known].min()):
+        at = known & (torque == limit)
+        beside = at & (np.roll(at, 1) | np.roll(at, -1))
+        if limit != 0 and np.count_nonzero(beside) >= _FEWEST_FLAT:
+            flat.append((float(limit), int(np.count_nonzero(at))))
+    if not flat:
+        return
+    limits = " and ".join(f"{limit:+.3g} N·m" for limit, _ in flat)
+    count = sum(ticks for _, ticks in flat)
+    yield Finding(
+        kind="clipping",
+        sentence=(
+            f"The torque is clipped at {limits}: {count} values lie exactly there, none beyond, "
+            "and no flag says so. What it would have been is not known."
+        ),
+        value=max(abs(limit) for limit, _ in flat),
+        interval=None,
+        unit="N·m",
+        remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
+    )
+
+
+def stops(measurement: Measurement) -> Iterator[Finding]:
+    """Find a motor that stands still while it is asked to move."""
+    asked = measurement.reference_rad
+    if asked is None:
+        return
+    length = max(round(_STILL_S * measurement.rate_hz), 2)
+    blocks = asked.size // length
+    if blocks == 0:
+        return
+    moved, wanted = (
+        np.ptp(values[: blocks * length].reshape(blocks, length), axis=1)
+        for values in (measurement.angle_rad, asked)
+    )
+    still = (wanted > np.median(wanted)) & (moved < _STILL * wanted)
+    if not still.any():
+        return
+    first, last = _longest(still)
+    yield Finding(
+        kind="stop",
+        sentence=(
+            f"The motor stands still from {first * _STILL_S:.1f} to {last * _STILL_S:.1f} s of the "
+            "record, though it is asked to move."
+        ),
+        value=(last - first) * _STILL_S,
+        interval=None,
+        unit="s",
+        remedy="Look for what held the shaft or switched the drive off, and sweep again.",
+    )
+
+
+def _longest(true: NDArray[np.bool_]) -> tuple[int, int]:
+    """First block of the longest run, and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    return int(starts[longest]), int(ends[longest])
+
+
+_LOSS_S: Final = 1e-4
+"""Internal damping of order 1, in s: of some per cent, for want of a better."""
+
+_DRIVEN: Final = 1e-3
+"""Power of the angle over its largest from which a frequency counts."""
+
+_ALIGNED: Final = 0.7
+"""Median cosine of the phase against the beam's from which a sign is certain."""
+
+_FACTORS: Final = (
+    (180 / math.pi, "degrees for radians"),
+    (1000.0, "thousandths (m, mm or N·m, mN·m)"),
+    (9.80665, "kilograms or kilopond for newtons"),
+    (4.4482216, "pounds-force for newtons"),
+    (1 / 0.11298483, "pound-force inches for N·m"),
+    (1 / 1.3558179, "pound-force feet for N·m"),
+    (2 * math.pi, "turns for radians"),
+)
+_NEAR: Final = math.log(1.1)
+_OFF: Final = math.log(2.0)
+"""Below a factor of 2 it is the beam's data that are wrong."""
+
+_BEYOND: Final = math.log(5.0)
+"""Above a factor of 5 it is not: no fit searches for a stiffness so far from the file's."""
+
+
+def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
+    """Find a reversed sign, or a factor between units, in torque over angle."""
+    angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
+    torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
+    power = np.abs(angle) ** 2
+    driven = power > _DRIVEN * power.max()
+    beam = comparison.measurement.nominal.beam
+    expected = transfer(2j * np.pi * comparison.frequency_hz[driven], beam, Damping(zeta=_LOSS_S))
+    share = torque[driven] / (angle[driven] * expected)
+    size = np.abs(share)
+    cosine = float(np.median(share.real / np.maximum(size, np.finfo(float).tiny)))
+    if abs(cosine) < _ALIGNED:
+        return
+    if cosine < 0:
+        yield Finding(
+            kind="sign",
+            sentence=(
+                "Torque or angle has the wrong sign: the torque opposes what the beam asks for at "
+                "nearly all frequencies. No number here is the antenna's."
+            ),
+            value=None,
+            interval=None,
+            unit="1",
+            remedy=(
+                "Reverse the sign of one channel: the torque is positive where the motor pushes "
+                "the beam towards positive angles."
+            ),
+        )
+    factor = float(np.median(size))
+    if not factor > 0 or abs(math.log(factor)) < _OFF:
+        return
+    named = [
+        words
+        for ratio, words in _FACTORS
+        if abs(abs(math.log(factor)) - abs(math.log(ratio))) < _NEAR
+    ]
+    if not named and abs(math.log(factor)) < _BEYOND:
+        return
+    which = (
+        f"which is the factor of {named[0]}: a wrong unit"
+        if named
+        else "more than any beam is off its data: a wrong unit or gain, or the data of another beam"
+    )
+    yield Finding(
+        kind="unit",
+        sentence=(
+            f"Torque over angle is {factor:.3g} times what the beam in the file gives, {which}. "
+            "No number here is the antenna's."
+        ),
+        value=factor,
+        interval=None,
+        unit="1",
+        remedy="Check the units of angle and torque, and import the record again.",
+    )
+
+
+_PARTS: Final = 16
+_BEYOND_CHANCE: Final = 10.0
+"""Scatter of the means over what noise alone makes of them."""
+
+
+def drift_of_zero(field: Field) -> float:
+    """Range of the means over parts of the record in N·m; 0 if noise alone may make it."""
+    comparison = field.comparison
+    torque, _ = comparison.prediction.torque(field.best.fit.plant)
+    left = comparison.torque_nm[comparison.kept] - torque
+    length = left.size // _PARTS
+    means = left[: _PARTS * length].reshape(_PARTS, length).mean(axis=1)
+    # White noise as loud as that of the band's upper half.
+    upper = field.noise.power[field.noise.power.size // 2 :]
+    chance = math.sqrt(float(np.median(upper)) / comparison.samples / length)
+    return float(np.ptp(means)) if float(means.std()) > _BEYOND_CHANCE * chance else 0.0

@@ -1,0 +1,331 @@
+"""What the estimator is given: two channels on a uniform grid, gaps closed, decimated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._predictor import Plant
+from analysis.record_checks import too_much_unknown
+from rigd.beam import Damping
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.record import Record
+    from rigd.beam import Beam
+
+MAX_ANGLE_GAP_PERIODS: Final = 0.4
+"""Longest gap of the angle that is bridged, in periods of the band's upper end."""
+
+MAX_TORQUE_GAP_S: Final = 1.0
+"""Longest gap of the torque: a longer one may swallow a resonance."""
+
+
+class MeasurementError(ValueError):
+    """A record that the whole-record estimator cannot use; the message says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """Angle and torque of one session, with what the file states of rig and specimen.
+
+    Attributes
+    ----------
+    name : str
+        What messages call it: the file's path.
+    angle_rad, torque_nm : ndarray, shape (n,)
+        Motor angle and coupling torque, one value a tick.
+    rate_hz : float
+        Ticks per second.
+    beam : Beam
+        As the file states it: where the search for density and stiffness starts.
+    angle_known, torque_known : ndarray of bool, shape (n,)
+        False where a tick was missed or its value is flagged (held, saturated). Such a torque is
+        not compared; such an angle is bridged, since the convolution needs one.
+    rest_angle_rad : float or None
+        Angle at which the beam rested before the record, None if not known: then the first angle.
+    delay_s : float
+        By how much the torque is older than the angle at one time stamp, as the file states it.
+    tool_inertia_kg_m2 : float
+        Inertia between torque sensor and beam, as the file states it.
+    filter_time_constant_s, second_order_filter_time_constant_s : float
+        Low-pass filter of the torque's channel, as the file states it: see `Plant`.
+    reference_rad : ndarray, shape (n,), or None
+        Angle that a controller was asked for, if one held the motor: what of the angle does not
+        follow it is taken to be the noise's doing.
+    """
+
+    name: str
+    angle_rad: NDArray[np.float64]
+    torque_nm: NDArray[np.float64]
+    rate_hz: float
+    beam: Beam
+    angle_known: NDArray[np.bool_]
+    torque_known: NDArray[np.bool_]
+    rest_angle_rad: float | None = None
+    delay_s: float = 0.0
+    tool_inertia_kg_m2: float = 0.0
+    reference_rad: NDArray[np.float64] | None = None
+    filter_time_constant_s: float = 0.0
+    second_order_filter_time_constant_s: float = 0.0
+
+    @classmethod
+    def of_record(cls, record: Record) -> Measurement:
+        """Take over a record that was read from a session file.
+
+        Raises
+        ------
+        MeasurementError
+            The motor was held.
+        """
+        if record.metadata.get("excitation") == "hold":
+            raise MeasurementError(
+                f"{record.path}: the motor was held, and moved with no more than the noise of its "
+                "sensors; record an excitation, such as rigd run chirp."
+            )
+        return cls(
+            name=str(record.path),
+            angle_rad=record.angle_rad,
+            torque_nm=record.torque_nm,
+            rate_hz=record.rate_hz,
+            beam=record.beam,
+            angle_known=record.angle_known,
+            torque_known=record.torque_known,
+            rest_angle_rad=record.rest_angle_rad,
+            delay_s=record.torque_delay_s - record.angle_delay_s,
+            tool_inertia_kg_m2=record.tool_inertia_kg_m2,
+            reference_rad=record.reference_rad,
+            filter_time_constant_s=record.torque_filter_s[0],
+            second_order_filter_time_constant_s=record.torque_filter_s[1],
+        )
+
+    def check(self, highest_hz: float) -> None:
+        """Refuse what cannot be used in a band that ends at `highest_hz`.
+
+        Raises
+        ------
+        MeasurementError
+            Shapes differ, values are not finite, too much is unknown or in one piece, or the angle
+            never moves.
+        """
+        n = len(self.angle_rad)
+        for other in (self.torque_nm, self.angle_known, self.torque_known):
+            if len(other) != n:
+                raise MeasurementError(
+                    f"{self.name}: angle, torque and their masks hold {n} and {len(other)} values, "
+                    "but must be of one length."
+                )
+        for channel, unit, values, known in (
+            ("angle", "rad", self.angle_rad, self.angle_known),
+            ("torque", "N·m", self.torque_nm, self.torque_known),
+        ):
+            bad = np.flatnonzero(known & ~np.isfinite(values))
+            if bad.size:
+                raise MeasurementError(
+                    f"{self.name}: the {channel} is {values[bad[0]]} {unit} at tick {bad[0]} and "
+                    f"not finite at {bad.size} of {n} ticks; mask them as unknown or record the "
+                    "session again."
+                )
+            much = too_much_unknown(f"the {channel}", int(np.count_nonzero(~known)), n)
+            if much:
+                raise MeasurementError(f"{self.name}: {much}")
+        bridged_s = MAX_ANGLE_GAP_PERIODS / highest_hz
+        for channel, known, allowed_s in (
+            ("angle", self.angle_known, bridged_s),
+            ("torque", self.torque_known, MAX_TORQUE_GAP_S),
+        ):
+            run, start = longest_run(~known)
+            if run > allowed_s * self.rate_hz:
+                raise MeasurementError(
+                    f"{self.name}: the {channel} is missing or flagged for {run} ticks from tick "
+                    f"{start} on ({1e3 * run / self.rate_hz:.3g} ms), longer than the "
+                    f"{1e3 * allowed_s:.3g} ms that a band up to {highest_hz:g} Hz tolerates; "
+                    "record the session again."
+                )
+        angles = self.angle_rad[self.angle_known]
+        if angles.size == 0 or np.ptp(angles) == 0:
+            raise MeasurementError(
+                f"{self.name}: the angle never changes, so nothing was excited; check the encoder "
+                "and that the motor moved."
+            )
+
+    @property
+    def nominal(self) -> Plant:
+        """Rig and specimen as the file states them, without damping."""
+        return Plant(
+            beam=self.beam,
+            damping=Damping(),
+            delay_s=self.delay_s,
+            tool_inertia_kg_m2=self.tool_inertia_kg_m2,
+            filter_time_constant_s=self.filter_time_constant_s,
+            second_order_filter_time_constant_s=self.second_order_filter_time_constant_s,
+        )
+
+    @property
+    def torque_share(self) -> float:
+        """Share of the torque that is known."""
+        return float(np.mean(self.torque_known))
+
+    def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
+        """Angle relative to where the beam rested, shape (n,), unknown values bridged."""
+        angle = bridged(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
+        origin = angle[0] if self.rest_angle_rad is None else self.rest_angle_rad
+        return angle - origin
+
+
+_REACH_PERIODS: Final = 2.0
+_MARGIN: Final = 1.2
+_NOISE_POWER: Final = 1e-6
+
+
+def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
+    """Length and start of the longest run of True, (0, 0) without any."""
+    starts, ends = _runs(mask)
+    if starts.size == 0:
+        return 0, 0
+    longest = int(np.argmax(ends - starts))
+    return int(ends[longest] - starts[longest]), int(starts[longest])
+
+
+def bridged(
+    values: NDArray[np.float64], known: NDArray[np.bool_], highest: float
+) -> NDArray[np.float64]:
+    """Estimate the unknown values of a band-limited signal from their known neighbours.
+
+    The best linear estimate for a signal with a flat spectrum up to its highest frequency and a
+    little white noise (N. Wiener; here over two periods to either side). A gap of a quarter of a
+    period loses less than 1e-3 of the signal; a straight line would lose a third.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        What stands at unknown places is ignored.
+    known : ndarray of bool, shape (n,)
+    highest : float
+        Highest frequency, in cycles per sample.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        The values themselves where known.
+    """
+    filled = np.where(known, values, 0.0)
+    reach = int(np.ceil(_REACH_PERIODS / highest))
+    for start, end in zip(*_runs(~known), strict=True):
+        first = max(start - reach, 0)
+        neighbours = first + np.flatnonzero(known[first : end + reach])
+        if neighbours.size == 0:
+            continue
+        weights = _weights(tuple(neighbours - start), int(end - start), _MARGIN * highest)
+        level = float(values[neighbours].mean())
+        filled[start:end] = level + weights @ (values[neighbours] - level)
+    return filled
+
+
+def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First places of the runs of True, and those after their last."""
+    edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+
+
+@lru_cache(maxsize=64)
+def _weights(neighbours: tuple[int, ...], length: int, highest: float) -> NDArray[np.float64]:
+    """Weights of the neighbours in each of `length` values from place 0 on."""
+    places = np.array(neighbours)
+    among = np.sinc(2 * highest * np.subtract.outer(places, places))
+    among += _NOISE_POWER * np.eye(places.size)
+    across = np.sinc(2 * highest * np.subtract.outer(np.arange(length), places))
+    weights: NDArray[np.float64] = np.linalg.solve(among, across.T).T
+    return weights
+
+
+_ATTENUATION_DB: Final = 100.0
+_RATE_OVER_BAND: Final = 2.4
+"""Least decimated rate per highest frequency: below 2.4 the filter becomes long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decimation:
+    """A linear-phase low-pass filter, centred, and the samples that are kept after it.
+
+    Attributes
+    ----------
+    factor : int
+        One sample in so many is kept.
+    kernel : ndarray, shape (2 reach factor + 1,)
+        The filter: passes `highest_hz`, and 100 dB less from half the new rate on.
+    reach : int
+        Samples of the new rate to either side that the filter sees.
+    rate_hz : float
+        The new rate.
+    """
+
+    factor: int
+    kernel: NDArray[np.float64]
+    reach: int
+    rate_hz: float
+
+    @classmethod
+    def to_band(cls, rate_hz: float, highest_hz: float) -> Decimation:
+        """Choose the lowest rate that holds 0 to `highest_hz`, which is at most 0.4 `rate_hz`."""
+        factor = max(int(rate_hz / (_RATE_OVER_BAND * highest_hz)), 1)
+        new_rate_hz = rate_hz / factor
+        stop_hz = new_rate_hz / 2
+        # Kaiser's formulas for the length of the filter and the shape of its window.
+        width = 2 * np.pi * (stop_hz - highest_hz) / rate_hz
+        half = (_ATTENUATION_DB - 7.95) / (2 * 2.285 * width)
+        reach = int(np.ceil(half / factor))
+        ticks = np.arange(-reach * factor, reach * factor + 1)
+        cutoff = (stop_hz + highest_hz) / rate_hz  # twice the middle of the transition
+        kernel = cutoff * np.sinc(cutoff * ticks)
+        kernel *= np.kaiser(ticks.size, 0.1102 * (_ATTENUATION_DB - 8.7))
+        return cls(factor, kernel / kernel.sum(), reach, new_rate_hz)
+
+    def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Filter and thin out.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n,)
+            Taken as 0 before and after.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Sample `reach` is the one at the first value; so many precede it.
+        """
+        length = values.size + self.kernel.size - 1
+        padded = fast_length(length)
+        spectrum = np.fft.rfft(values, padded) * np.fft.rfft(self.kernel, padded)
+        return np.fft.irfft(spectrum, padded)[: length : self.factor].copy()
+
+    def inside(self, ticks: int) -> slice:
+        """Select samples of `apply` for which the filter saw nothing but the record's `ticks`."""
+        return slice(2 * self.reach, (ticks - 1) // self.factor + 1)
+
+
+def fast_length(at_least: int) -> int:
+    """Least number not below `at_least` whose prime factors are at most 11: a fast transform."""
+    length = max(at_least, 1)
+    while not _is_smooth(length):
+        length += 1
+    return length
+
+
+def fast_length_below(at_most: int) -> int:
+    """Largest number not above `at_most` (1 or more) whose prime factors are at most 11."""
+    length = at_most
+    while not _is_smooth(length):
+        length -= 1
+    return length
+
+
+def _is_smooth(number: int) -> bool:
+    for factor in (2, 3, 5, 7, 11):
+        while number % factor == 0:
+            number //= factor
+    return number == 1

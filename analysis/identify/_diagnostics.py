@@ -1,0 +1,458 @@
+"""What is in the record beside the beam of Eq. 25, each by its name and size."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from analysis.identify._channel_checks import clipping, drift_of_zero, stops
+from analysis.identify._finding import Finding
+from analysis.identify._leakage import repeats_after_s
+from analysis.identify._refit import vector
+from analysis.identify._residual_tests import SURE, of_chi_square
+from analysis.identify._rivals import of_rig
+from analysis.identify._verdict import EVEN, STRONG, rivals
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from analysis.identify._candidates import Field
+    from analysis.identify._nonlinear import NonlinearForce
+    from analysis.identify._predictor import Setting
+    from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
+    from analysis.identify._result import ModeEstimate
+
+_MANY: Final = 40
+"""Evaluations of a descent that is to end."""
+
+_BEAM_OFF: Final = 0.003
+"""Deviation of stiffness or density, relative to the file's, worth a word."""
+
+
+def at_edges(field: Field) -> Iterator[Finding]:
+    """Find settings that the search took as far as it goes; no rig is so far from its file."""
+    fit = field.best.fit
+    for name, words, factor, unit in (
+        ("delay_s", "The delay between the channels", 1e3, "ms"),
+        ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)", 1, "s²/m⁴"),
+        ("bending_stiffness_n_m2", "The bending stiffness (EI)", 1, "N·m²"),
+    ):
+        if name in fit.at_bounds:
+            value = fit.parameters[name]
+            yield Finding(
+                kind="implausible",
+                sentence=(
+                    f"{words} would have to be {factor * value:.4g} {unit} or go farther, which is "
+                    "the edge of what is searched: the record and its file do not fit each other. "
+                    "No number here is the antenna's."
+                ),
+                value=value,
+                interval=None,
+                unit=unit if factor == 1 else "s",
+                remedy=(
+                    "Check the signs and the units of angle and torque, and the beam's length, "
+                    "density and stiffness in the file."
+                ),
+            )
+
+
+def of_settings(field: Field) -> Iterator[Finding]:
+    """Find what of delay, inertia, beam and start is not as the file states it."""
+    differing = {name for name in field.free if _apart(field, name) and not _as_stated(field, name)}
+    yield from _of_instruments(field, differing)
+    yield from _of_beam(field, differing)
+    yield from of_rig(field)
+    if _rings(field):
+        yield from _of_start(field)
+
+
+def _of_instruments(field: Field, differing: set[Setting]) -> Iterator[Finding]:
+    """Find a delay and an inertia that the file does not state."""
+    fit = field.best.fit
+    if "delay_s" in differing:
+        value, low, high = _difference(field, "delay_s")
+        yield Finding(
+            kind="delay",
+            sentence=(
+                f"The torque comes {1e3 * abs(value):.3f} ms "
+                f"{'later' if value > 0 else 'earlier'} than the file says "
+                f"({1e3 * low:.3f} to {1e3 * high:.3f} ms; 95 %): a delay between the channels "
+                "that nobody declared. It was fitted, and is not damping."
+            ),
+            value=value,
+            interval=(low, high),
+            unit="s",
+            remedy=(
+                "Declare the delay between the channels as "
+                f"{1e3 * fit.parameters['delay_s']:.3f} ms."
+            ),
+        )
+    if "tool_inertia_kg_m2" in differing:
+        value, low, high = _difference(field, "tool_inertia_kg_m2")
+        yield Finding(
+            kind="tool inertia",
+            sentence=(
+                f"Between torque sensor and beam turns {value:.3g} kg·m² more than the file says "
+                f"({low:.3g} to {high:.3g}; 95 %): clamp or flange."
+            ),
+            value=value,
+            interval=(low, high),
+            unit="kg·m²",
+            remedy="A run without the beam measures it; declare it as tool inertia.",
+        )
+
+
+def _of_beam(field: Field, differing: set[Setting]) -> Iterator[Finding]:
+    """Find density and stiffness that are not the file's."""
+    beam: tuple[tuple[Setting, str], ...] = (
+        ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
+        ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
+    )
+    for name, words in beam:
+        stated = _stated(field, name)
+        off = _difference(field, name)
+        if name not in differing or abs(off[0]) < _BEAM_OFF * stated:
+            continue
+        share, low, high = (100 * part / stated for part in off)
+        yield Finding(
+            kind="beam data",
+            sentence=(
+                f"{words} is {abs(share):.2f} % {'higher' if share > 0 else 'lower'} than the "
+                f"file says ({low:+.2f} to {high:+.2f} %; 95 %){_or_else(field, name)}."
+            ),
+            value=share / 100,
+            interval=(low / 100, high / 100),
+            unit="1",
+            remedy="Weigh and measure the link again, or take the value found.",
+        )
+
+
+def _or_else(field: Field, name: Setting) -> str:
+    """Name what does to the torque just what such a deviation does; the sentence's end."""
+    if name == "bending_stiffness_n_m2":
+        return ", or the torque's gain is"
+    fit, beam = field.best.fit, field.comparison.measurement.beam
+    share = math.log(fit.plant.beam.density_over_stiffness / beam.density_over_stiffness) / 4
+    stiffness = fit.plant.beam.bending_stiffness_n_m2
+    std = fit.std["bending_stiffness_n_m2"] or 0.0
+    # A small mass at the tip moves all modes alike, and the torque by a quarter of that.
+    missing = math.log(stiffness / beam.bending_stiffness_n_m2) + share
+    if fit.plant.tip_mass_kg or share <= 0 or abs(missing) > SURE * std / stiffness:
+        return ""
+    mass_g = 1e3 * share * beam.density_kg_per_m * beam.length_m
+    return f", or the beam carries {mass_g:.2g} g at its tip"
+
+
+def _of_start(field: Field) -> Iterator[Finding]:
+    """Say that the beam rang when the record began."""
+    loudest = max(field.best.fit.ringing.amplitude_nm)
+    yield Finding(
+        kind="ringing start",
+        sentence=(
+            f"The beam already rang when the record began ({1e3 * loudest:.3g} mN·m); its free "
+            "decay was fitted beside the response and spoils nothing."
+        ),
+        value=loudest,
+        interval=None,
+        unit="N·m",
+        remedy="Wait longer at rest before the sweep.",
+    )
+
+
+def _rings(field: Field) -> bool:
+    """Whether the beam rang at the start, whatever structure it has."""
+    loudest = max(field.best.fit.ringing.amplitude_nm, default=0.0)
+    # A hum begins and ends with the record, which looks a little like a decay.
+    hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
+    return loudest > hum and all(
+        of_chi_square(ringing.chi_square, ringing.degrees_of_freedom) > SURE
+        for ringing in (c.fit.ringing for c in (field.best, *rivals(field, EVEN)))
+        if ringing.degrees_of_freedom
+    )
+
+
+def _stated(field: Field, name: Setting) -> float:
+    """Give the value of a setting in the file."""
+    measurement = field.comparison.measurement
+    return {
+        "density_over_stiffness": measurement.beam.density_over_stiffness,
+        "bending_stiffness_n_m2": measurement.beam.bending_stiffness_n_m2,
+        "delay_s": measurement.delay_s,
+        "tool_inertia_kg_m2": measurement.tool_inertia_kg_m2,
+    }[name]
+
+
+def _apart(field: Field, name: Setting) -> bool:
+    """Whether a setting differs from what the file states by more than chance allows.
+
+    So it must in every structure that the data cannot tell from the best.
+    """
+    stated = _stated(field, name)
+    for candidate in (field.best, *rivals(field, EVEN)):
+        fit = candidate.fit
+        std = fit.std.get(name)
+        if not std or fit.interval.get(name) is None:
+            return False
+        if abs(fit.parameters[name] - stated) < SURE * std:
+            return False
+    return True
+
+
+def _as_stated(field: Field, name: Setting) -> bool:
+    """Whether any structure explains the record about as well with a setting as the file has it.
+
+    A standard deviation tells what is close to the minimum. This tells whether all else, other
+    kinds of damping included, can make up for the setting farther away.
+    """
+    held = replace(field, free=tuple(other for other in field.free if other != name))
+    for candidate in field.candidates:
+        structure, uniform, values = candidate.structure, candidate.uniform, candidate.values
+        unknowns = held.unknowns(structure, uniform, candidate.extras)
+        start = vector(unknowns, candidate.fit.plant)
+        saved = field.best.bic + STRONG - (candidate.parameters - 1) * math.log(values)
+        enough = values * math.exp(saved / values)
+        if (
+            held.descent(unknowns, start, 1).promised_cost < enough
+            and held.descent(unknowns, start, _MANY).cost < enough
+        ):
+            return True
+    return False
+
+
+def _difference(field: Field, name: Setting) -> tuple[float, float, float]:
+    """By how much a setting differs from what the file states, with the ends of its interval."""
+    best, stated = field.best.fit, _stated(field, name)
+    low, high = best.interval[name] or (stated, stated)
+    return best.parameters[name] - stated, low - stated, high - stated
+
+
+_NORMAL_95: Final = 1.959963984540054
+_MAINS_WANDER: Final = 0.005
+_MODES_TO_JUDGE: Final = 2
+_SLOW_HZ: Final = 0.5
+_FEWEST_PERIODS: Final = 5.0
+"""In the record: what is slower is no hum but a sensor that drifts."""
+
+_SAME_TURN: Final = 0.5
+"""Of a turn over the whole record, within which a line's frequency is that of a harmonic."""
+
+
+def findings(
+    field: Field,
+    forces: tuple[NonlinearForce, ...],
+    multiples: tuple[Harmonic, ...],
+    visible: tuple[int, ...],
+) -> tuple[Finding, ...]:
+    """Name what is there: of a record with a wrong sign or unit, only what needs no model.
+
+    Parameters
+    ----------
+    field : Field
+    forces : tuple of NonlinearForce
+        Those the record calls for.
+    multiples : tuple of Harmonic
+        What the residual holds at multiples of the sweep's frequency.
+    visible : tuple of int
+        Modes that stand out of the noise. With fewer than two, what the file states is not
+        doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
+    """
+    measurement = field.comparison.measurement
+    seen = (*field.misread, *clipping(measurement), *stops(measurement))
+    if field.misread:
+        return seen
+    found = (
+        *seen,
+        *_hum(field),
+        *_air(field),
+        *map(_force, forces),
+        *_harmonics(multiples),
+    )
+    edges = tuple(at_edges(field))
+    if edges:
+        return (*found, *edges)
+    if len(visible) < _MODES_TO_JUDGE:
+        return found
+    return (*found, *of_settings(field))
+
+
+def mains(frequency_hz: float) -> str:
+    """Name the mains if that may be the source, else nothing."""
+    for base in (50, 60):
+        for n in range(1, 9):
+            if abs(frequency_hz - n * base) < _MAINS_WANDER * n * base:
+                return "the mains" if n == 1 else f"{n} times the mains frequency"
+    return ""
+
+
+def _hum(field: Field) -> Iterator[Finding]:
+    comparison = field.comparison
+    duration_s = comparison.samples / comparison.decimation.rate_hz
+    drift_nm = drift_of_zero(field)
+    if drift_nm > 0:
+        yield _drift(drift_nm)
+    period_s = repeats_after_s(comparison)
+    for line in field.noise.lines:
+        if line.frequency_hz * duration_s < _FEWEST_PERIODS:
+            continue
+        near = mains(line.frequency_hz)
+        source = f", {near}" if near else ""
+        turns = line.frequency_hz * period_s
+        with_drive = period_s > 0 and abs(turns - round(turns)) < _SAME_TURN * period_s / duration_s
+        yield Finding(
+            kind="hum",
+            sentence=(
+                f"The torque holds a line at {line.frequency_hz:.2f} Hz{source}, with "
+                f"{1e3 * line.amplitude_nm:.3g} mN·m all through the record. "
+                + (
+                    f"The drive repeats every {period_s:.4g} s, and so does this line: the motor "
+                    "may cause it, as a harmonic of what is not linear. It was left out."
+                    if with_drive
+                    else "The motor did not cause it; it was taken out."
+                )
+            ),
+            value=line.amplitude_nm,
+            interval=None,
+            unit="N·m",
+            remedy=(
+                "Repeat with half the amplitude: a line that shrinks is the motor's doing."
+                if with_drive
+                else "Check shield and earth of the torque sensor's cable."
+            ),
+        )
+
+
+def _drift(size_nm: float) -> Finding:
+    return Finding(
+        kind="sensor drift",
+        sentence=(
+            f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m in the "
+            "course of the record. That is slower than anything the beam does."
+        ),
+        value=size_nm,
+        interval=None,
+        unit="N·m",
+        remedy="",
+    )
+
+
+def _air(field: Field) -> Iterator[Finding]:
+    drag = field.drag
+    if drag is None:
+        return
+    low, high = (1e3 * end for end in drag.interval_95_m)
+    yield Finding(
+        kind="air drag",
+        sentence=(
+            f"The air brakes the beam: C_D d = {1e3 * drag.value_m:.4g} mm ({low:.4g} to "
+            f"{high:.4g} mm; 95 %) at {drag.speed_m_s:.2g} m/s. The damping therefore grows "
+            "with the amplitude; the drag was fitted beside the beam, whose parameters are those "
+            "without air."
+        ),
+        value=drag.value_m,
+        interval=drag.interval_95_m,
+        unit="m",
+        remedy="Sweep at a quarter of the amplitude, where drag all but vanishes, or in vacuum.",
+    )
+
+
+def _force(force: NonlinearForce) -> Finding:
+    size, std, mode = force.size, force.std, force.term.mode
+    percent = f"{100 * abs(size):.2g} % (± {100 * _NORMAL_95 * std:.1g} %)"
+    if force.term.kind == "quadratic drag":
+        sentence = (
+            f"The damping of mode {mode} depends on its speed, as drag in air does: its damping "
+            f"ratio is {abs(size):.2g} (± {_NORMAL_95 * std:.1g}) "
+            f"{'higher' if size > 0 else 'lower'} at the highest speed than at rest."
+        )
+    elif force.term.kind == "cubic stiffness":
+        sentence = (
+            f"The beam is not linear: the stiffness of mode {mode} "
+            f"{'rises' if size > 0 else 'falls'} by {percent} up to its largest deflection (a "
+            "cubic force). It is neither a mode nor an order of the damping, and was fitted beside "
+            "the beam."
+        )
+    else:
+        sentence = (
+            f"The beam is not linear: the stiffness of mode {mode} differs from one side to the "
+            f"other, by {percent} at its largest deflection (a quadratic force)."
+        )
+    return Finding(
+        kind="nonlinear damping" if force.term.kind == "quadratic drag" else "nonlinear stiffness",
+        sentence=sentence,
+        value=size,
+        interval=(size - _NORMAL_95 * std, size + _NORMAL_95 * std),
+        unit="1",
+        remedy="Repeat the sweep at half the amplitude: what is not linear all but vanishes.",
+    )
+
+
+def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
+    for harmonic in multiples:
+        if harmonic.present:
+            parity = "odd" if harmonic.multiple % 2 else "even"
+            yield Finding(
+                kind="harmonics",
+                sentence=(
+                    f"What remains follows the sweep at {harmonic.multiple} times its frequency, "
+                    f"most with the drive at {harmonic.drive_hz:.1f} Hz: an {parity} harmonic, "
+                    "which nothing linear makes."
+                ),
+                value=harmonic.deviate,
+                interval=None,
+                unit="standard deviations",
+                remedy="Repeat the sweep at half the amplitude; look for play in the clamp.",
+            )
+
+
+def unexplained(
+    white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
+) -> Finding:
+    """Describe what remains and has no name."""
+    low, high = white.loudest_hz
+    at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
+    if related.related:
+        where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
+        what = (
+            f"Part of the torque follows the motor, {where}, in a way that no uniform or nearly "
+            "uniform beam does: something else moves along."
+        )
+        remedy = (
+            "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "
+            "what stays belongs to the rig."
+        )
+    elif white.loud and at_mode:
+        what = (
+            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise at mode "
+            f"{at_mode[0]} ({low:.2f} to {high:.2f} Hz): steps of the encoder, which the resonance "
+            "magnifies, or something of that mode that the model lacks."
+        )
+        remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
+    elif white.loud and high < _SLOW_HZ:
+        what = (
+            f"What remains below {high:.2f} Hz is {white.loudest_ratio:.1f} times as loud as the "
+            "noise and does not follow the motor: drift of the torque sensor's zero."
+        )
+        remedy = ""
+    else:
+        near = mains((low + high) / 2)
+        what = (
+            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise from "
+            f"{low:.2f} to {high:.2f} Hz, and does not follow the motor: a disturbance"
+            f"{', as of the mains that come and go' if near else ''}."
+            if white.loud
+            else "What remains is not spread over the frequencies as the noise is (most from "
+            f"{low:.2f} to {high:.2f} Hz), and does not follow the motor."
+        )
+        remedy = (
+            "Record for as long with the motor held (rigd run hold): if it is there as well, look "
+            "for what else runs near by, and at the sensor's shield and earth."
+        )
+    return Finding(
+        kind="unexplained",
+        sentence=f"{what} Until it is known, take intervals and orders with care.",
+        value=white.loudest_ratio,
+        interval=None,
+        unit="1",
+        remedy=remedy,
+    )

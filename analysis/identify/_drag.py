@@ -1,0 +1,448 @@
+"""Whether the air brakes the beam, how large C_D d is, and the damping by amplitude that follows.
+
+Whether the air brakes the beam, and how large C_D d is.
+
+Drag along the whole beam is one number, or two where the coefficient falls with the speed. Left
+out, it passes for a fractional order, a delay, modes of their own stiffness and another density:
+it damps each mode by as much as the mode is fast at the time.
+
+Damping of a mode against its amplitude, where the air brakes the beam.
+
+In free vibration of one mode, the tip moving by ``A sin(omega t)``, a force per metre
+``rho_air/2 C v^p`` takes from each cycle as much as linear damping of the ratio::
+
+    rho_air/2 C (A omega)^(p - 1) m_p kappa_p / (2 rho omega)
+
+rho being the mass per length, ``m_p`` the mean of ``2 |sin|^(p + 1)`` and ``kappa_p`` that of
+``|psi|^(p + 1)`` over that of ``psi²`` along the beam, psi being the mode with 1 at the tip. This
+adds to the ratio of the beam without air.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._candidates import Candidate
+from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
+from analysis.identify._refit import Refit, adapted, unexplained_part, vector
+from analysis.models import STRUCTURES
+from rigd.beam import mode_shape
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.identify._candidates import Field
+    from analysis.identify._noise import Noise
+    from analysis.identify._predictor import Plant
+    from analysis.identify._problem import Comparison
+    from analysis.models import Structure
+
+_SCORED: Final = ("III", "VI", "VII")
+"""Structures beside which drag is looked for: those that have either damping."""
+
+_PROMISE: Final = 6.0
+"""Deviance by which the first order may fail to foresee what drag saves."""
+
+_ROUNDS: Final = 15
+_FEW: Final = 12
+"""Evaluations of a descent before the drag is computed anew."""
+
+_MANY: Final = 40
+_HOPELESS: Final = 50.0
+"""Deviance behind the structure with drag from which another is not followed to its minimum."""
+
+_SETTLED: Final = 0.5
+_ROUGHLY: Final = 20.0
+"""Squares that another step may save where the drag need not be computed anew."""
+
+_SHORT: Final = 0.3
+"""Step of the drag, in its standard deviations, that is none."""
+
+_LEAD: Final = "III"
+_FREEST: Final = "VI"
+
+_ONE_NUMBER: Final = 0.1
+"""Relative deviation of the drag above which one number has to do.
+
+A cylinder's coefficient falls with the speed. Taken for constant it is up to 7 % off on rods and
+wires between 0.2 and 2 mm, and makes up for the rest with external damping: what is known better
+has two numbers, whether or not the second differs from nought, or its interval would be too narrow.
+"""
+
+_SLOWEST: Final = 0.02
+"""Of the highest speed: slower air tells nothing."""
+
+_NORMAL_95: Final = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True)
+class DragEstimate:
+    """Drag of the air as found.
+
+    Attributes
+    ----------
+    value_m : float
+        C_D d at `speed_m_s`; 1.2 kg/m³ is taken for the density of the air.
+    std_m : float
+    interval_95_m : tuple of float
+        Not below 0.
+    speed_m_s : float
+        The speed at which it is known best; where the record tells no more than a mean, the one
+        that counts most in it.
+    law : DragLaw
+        For all speeds.
+    covariance : tuple of tuple of float
+        Of the law's numbers that were free: of the first, or of both.
+    """
+
+    value_m: float
+    std_m: float
+    interval_95_m: tuple[float, float]
+    speed_m_s: float
+    law: DragLaw
+    covariance: tuple[tuple[float, ...], ...]
+
+
+def with_air_drag(field: Field) -> Field:
+    """Fit all candidates anew with the air's drag, if that explains the record better.
+
+    To first order a column of known shape tells what drag could save beside each of a few
+    structures. Only if one of them could then be the best of all is anything fitted.
+
+    Parameters
+    ----------
+    field : Field
+        Without drag.
+
+    Returns
+    -------
+    Field
+        The one given, if there is no drag; else with `drag`, the lowest BIC first.
+    """
+    if not _promising(field):
+        return field
+    lead = next(
+        (c for c in _without_extras(field) if c.uniform and c.structure.name == _LEAD), None
+    )
+    start = None if lead is None else _start(field, lead)
+    if start is None:
+        return field
+    settled = _settled(field, start, STRUCTURES[_LEAD], uniform=True, tolerance=_ROUGHLY)
+    if settled is None:
+        return field
+    # Thence to the freest damping; without drag its fit may be that of no beam at all.
+    settled = _settled(field, _Point.of(settled), STRUCTURES[_FREEST], uniform=True) or settled
+    found = _all(field, settled)
+    if not found.best.uniform:
+        best = found.best
+        point = replace(_Point.of(settled), plant=best.fit.plant, structure=best.structure)
+        settled = _settled(field, point, best.structure, uniform=False) or settled
+        found = _all(field, settled)
+    assert found.drag is not None
+    return found if found.drag.value_m > 0 and found.bic < field.bic else field
+
+
+def _without_extras(field: Field) -> tuple[Candidate, ...]:
+    """Candidates beside which drag may stand.
+
+    What has extras is compared with those, and goes with the drag: drag is computed for a bare beam
+    on a rigid clamp, and it shifts modes as extras do.
+    """
+    return tuple(candidate for candidate in field.candidates if not candidate.extras)
+
+
+def _promising(field: Field) -> bool:
+    """Whether some structure with drag could be better than the best without."""
+    best = field.best
+    for candidate in _without_extras(field):
+        if candidate is not best and candidate.structure.name not in _SCORED:
+            continue
+        unknowns = field.unknowns(candidate.structure, candidate.uniform)
+        plant = candidate.fit.plant
+        beside = Refit.descend(
+            field.comparison,
+            unknowns,
+            vector(unknowns, plant),
+            field.noise,
+            np.concatenate([field.columns, _first_order(field.comparison, plant)]),
+            max_evaluations=1,
+        )
+        size, saved, before = _last_amplitude(beside)
+        cost = max(before - saved, 1e-3 * before)
+        gain = candidate.values * math.log(before / cost)
+        if size > 0 and candidate.bic - gain + math.log(candidate.values) < best.bic + _PROMISE:
+            return True
+    return False
+
+
+def _first_order(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+    """Spectrum of a small drag's torque, over C_D d, shape (1, K)."""
+    moved_rad = comparison.angle_rad + comparison.rest_rad
+    response = DragResponse(moved_rad, comparison.decimation.rate_hz, plant)
+    return comparison.spectrum(response.first_order()[None, comparison.kept])
+
+
+def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
+    """Amplitude of the last column, all else free, the squares that it saves, and those without."""
+    at = refit.objective.linearise(refit.x)
+    weight = refit.noise.weight
+    without = replace(at, columns=at.columns[:-1])
+    projected = refit.objective.project(without, weight)
+    known = np.concatenate([projected.jacobian, without.columns * weight])
+    # The residual has nothing left of the decays; of the unknowns it may have, at no minimum.
+    both = np.stack([at.columns[-1] * weight, projected.residual])
+    column, residual = unexplained_part(both, known)
+    square = float(np.vdot(column, column).real)
+    if square <= 0:
+        return 0.0, 0.0, projected.cost
+    along = float(np.vdot(column, residual).real)
+    return -along / square, along**2 / square, projected.cost
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """Where a search with drag stands."""
+
+    plant: Plant
+    structure: Structure
+    law: DragLaw
+    noise: Noise
+    two: bool = False
+
+    @classmethod
+    def of(cls, refit: Refit) -> _Point:
+        structure = refit.objective.unknowns.structure
+        two = len(refit.columns) > 1
+        return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
+
+
+def _start(field: Field, lead: Candidate) -> _Point | None:
+    """First order of the drag beside a fit without it; None if the air would have to push."""
+    plant, structure = lead.fit.plant, lead.structure
+    columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
+    unknowns = field.unknowns(structure, lead.uniform)
+    here = vector(unknowns, plant)
+    size, *_ = _last_amplitude(
+        Refit.descend(field.comparison, unknowns, here, field.noise, columns, max_evaluations=1)
+    )
+    return _Point(plant, structure, DragLaw(size), field.noise) if size > 0 else None
+
+
+def _settled(
+    field: Field,
+    point: _Point,
+    structure: Structure,
+    *,
+    uniform: bool,
+    tolerance: float = _SETTLED,
+) -> Refit | None:
+    """Fit one structure with drag.
+
+    Parameters
+    ----------
+    field : Field
+        Without drag.
+    point : _Point
+        Where to start.
+    structure : Structure
+    uniform : bool
+    tolerance : float
+        Squares that a further step may still save.
+
+    Returns
+    -------
+    Refit or None
+        None if the air would have to push, the drag cannot be followed, or nothing settles.
+    """
+    unknowns = field.unknowns(structure, uniform)
+    x = adapted(unknowns, point.plant, point.structure)
+    still = False
+    law, noise, two = point.law, point.noise, point.two
+    for _ in range(_ROUNDS):
+        plant = unknowns.plant(x)
+        # Without drag the beam seemed to be another, and so what the rest of the angle did.
+        try:
+            comparison = field.comparison.with_rest_of(plant).with_drag(plant, law)
+        except DragError:
+            return None
+        assert comparison.drag is not None
+        descent = partial(Refit.descend, comparison, unknowns, x)
+        columns = comparison.drag.by_law[: 1 + two]
+        here = descent(noise, columns, max_evaluations=1)
+        if here.cost - here.promised_cost < tolerance or (two and still):
+            # With damping that is not the beam's, a second number would be its stopgap.
+            roughly = tolerance > _SETTLED
+            if two or roughly or _known_to(here) > _ONE_NUMBER:
+                return here
+            two, columns = True, comparison.drag.by_law
+        here = descent(noise, columns, max_evaluations=_FEW)
+        # Two numbers and external damping can make up for each other along a flat valley, where the
+        # steps are short long before the last of them.
+        step, std = here.amplitudes()
+        still = two and bool(np.all(np.abs(step) < _SHORT * std))
+        x, law, noise = here.x, _law_at(here), here.noise_here()
+        if law.at(comparison.drag.speed_m_s) <= 0:
+            return None
+    return None
+
+
+def _known_to(refit: Refit) -> float:
+    """Relative deviation of the drag, of one number."""
+    law, (_, std) = _law_at(refit), refit.amplitudes()
+    return float(std[0]) / max(law.constant_m, np.finfo(float).tiny)
+
+
+def _law_at(refit: Refit) -> DragLaw:
+    """Drag at a minimum: where it was computed, and the step from there."""
+    expansion = refit.objective.comparison.drag
+    assert expansion is not None
+    step = refit.amplitudes()[0].tolist()
+    slowing = expansion.law.slowing + (step[1] if len(step) > 1 else 0.0)
+    return DragLaw(expansion.law.constant_m + step[0], slowing)
+
+
+def _all(field: Field, settled: Refit) -> Field:
+    """Fit all candidates without extras with the drag settled in one, and say how large it is."""
+    other = replace(
+        field,
+        comparison=settled.objective.comparison,
+        columns=settled.columns,
+        noise=settled.noise_here(),
+    )
+    of, plant = settled.objective.unknowns.structure, settled.plant
+    least = other.descent(settled.objective.unknowns, settled.x, 1).cost
+    candidates = []
+    for before in _without_extras(field):
+        unknowns = other.unknowns(before.structure, before.uniform)
+        refit = other.descent(unknowns, adapted(unknowns, plant, of), _FEW)
+        if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
+            refit = other.descent(unknowns, refit.x, _MANY)
+        candidates.append(
+            Candidate(before.structure, before.uniform, refit.fit(), len(other.columns))
+        )
+    ranked = tuple(sorted(candidates, key=lambda candidate: candidate.bic))
+    found = replace(other, candidates=ranked).cross_checked()
+    return replace(found, drag=_estimate(found))
+
+
+def _estimate(field: Field) -> DragEstimate:
+    """Drag with its deviation, beside all the damping that the best beam may have."""
+    best = field.best
+    freest = max(
+        (c for c in field.candidates if c.kind == best.kind),
+        key=lambda c: (len(c.structure.free), -c.bic),
+    )
+    refit = field.refit(freest.structure, freest.uniform, freest.fit.plant)
+    law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
+    covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
+    expansion = refit.objective.comparison.drag
+    assert expansion is not None
+    speed = expansion.speed_m_s
+    slope = np.ones(1)
+    if len(covariance) > 1:
+        pivot = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
+        top = expansion.top_speed_m_s
+        speed = min(max(float(pivot**-1.5), _SLOWEST * top), top)
+        slope = np.array([1.0, speed ** (-2 / 3)])
+    value, std = law.at(speed), math.sqrt(float(slope @ covariance @ slope))
+    return DragEstimate(
+        value_m=value,
+        std_m=std,
+        interval_95_m=(max(value - _NORMAL_95 * std, 0.0), value + _NORMAL_95 * std),
+        speed_m_s=speed,
+        law=law,
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
+    )
+
+
+_MODES: Final = (1, 2)
+_DEFLECTIONS: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
+"""Of the tip, relative to the length, as far as slopes are small."""
+
+_POWERS: Final = (2.0, 4 / 3)
+"""Of the speed, for the two numbers of a `DragLaw`."""
+
+_POINTS: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class DampingAt:
+    """Damping ratio of a mode that vibrates freely.
+
+    Attributes
+    ----------
+    mode : int
+    tip_amplitude_m : float
+    damping_ratio, std : float
+        That of the beam and that of the air, whose uncertainties are added as if they were
+        independent: one makes up for the other, so that the sum is known better than that.
+    """
+
+    mode: int
+    tip_amplitude_m: float
+    damping_ratio: float
+    std: float
+
+
+def damping_with_amplitude(field: Field) -> tuple[DampingAt, ...]:
+    """Damping of the first modes that show at several amplitudes; nothing without drag.
+
+    Parameters
+    ----------
+    field : Field
+    """
+    drag = field.drag
+    if drag is None:
+        return ()
+    fit = field.best.fit
+    numbers = np.array([drag.law.constant_m, drag.law.slowing])[: len(drag.covariance)]
+    covariance = np.array(drag.covariance)
+    found = []
+    for mode in fit.modes:
+        if mode.number not in _MODES or mode.frequency_hz <= 0:
+            continue
+        for share in _DEFLECTIONS:
+            amplitude = share * fit.plant.beam.length_m
+            slopes = by_law(
+                mode.number,
+                2 * math.pi * mode.frequency_hz,
+                amplitude,
+                fit.plant.beam.density_kg_per_m,
+            )[: numbers.size]
+            variance = mode.damping_ratio_std**2 + float(slopes @ covariance @ slopes)
+            found.append(
+                DampingAt(
+                    mode=mode.number,
+                    tip_amplitude_m=amplitude,
+                    damping_ratio=mode.damping_ratio + float(slopes @ numbers),
+                    std=math.sqrt(variance),
+                )
+            )
+    return tuple(found)
+
+
+def by_law(
+    mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
+) -> NDArray[np.float64]:
+    """Damping ratio by the air over the two numbers of a `DragLaw`, shape (2,).
+
+    Parameters
+    ----------
+    mode : int
+    omega_rad_s, tip_amplitude_m, density_kg_per_m : float
+    """
+    node, weight = np.polynomial.legendre.leggauss(_POINTS)
+    shape = np.abs(mode_shape(mode, 0.5 * (node + 1)) / mode_shape(mode, 1.0))
+    speed = tip_amplitude_m * omega_rad_s
+    slopes = []
+    for power in _POWERS:
+        mean = 2 / math.sqrt(math.pi) * math.gamma(power / 2 + 1) / math.gamma(power / 2 + 1.5)
+        along = float(weight @ shape ** (power + 1)) / float(weight @ shape**2)
+        viscous = HALF_DENSITY * speed ** (power - 1) * mean * along
+        slopes.append(viscous / (2 * density_kg_per_m * omega_rad_s))
+    return np.array(slopes)

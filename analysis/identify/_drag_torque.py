@@ -1,0 +1,599 @@
+"""Torque by the drag of the air along the beam, and how it changes with beam and drag.
+
+Torque by the drag of the air along the beam, and how it changes with beam and drag.
+
+Mode i, relative to its root, feels of a force f per metre ``F_i = ∫ phi_i f dx / L``; with p, c and
+k of `analysis.identify._predictor`, ``Z_i = p + c k_i⁴`` and ``b_i = ∫ x phi_i dx / L``::
+
+    q_i = (F_i / EI - p b_i angle) / Z_i
+    v(x) = x angle' + sum_i phi_i(x) q_i'
+    f = -rho_air/2 (C |v| v + S |v|^(1/3) v)
+    torque added = sum_i L b_i F_i p / Z_i - ∫ x f dx
+
+The moment of the force is exact, the sum over the modes all that inertia makes of it. C is C_D d of
+a constant coefficient. S is the part of it that falls with the speed as in White's law for a
+cylinder, ``C_D = 1 + 10 Re^(-2/3)``.
+
+What the motor's motion makes of the speeds is exact (by transforms over the whole record, as in
+`Prediction`). What the drag makes of them is followed step by step, for drag halves a peak and no
+repeated substitution converges there. Of each mode the two poles, with their residues, are stepped;
+the force between the steps is the cubic through the last four of them. From the forces so found
+the torque again follows by transforms, exactly.
+
+Drag in a whole-record fit: its torque at one beam, and what it changes by beside it.
+
+The torque by drag is not linear in the motion, so no response function gives it. At a beam and a
+drag it is computed (`analysis.identify._drag_torque`) and taken out of the measured torque; what it
+changes by when beam or drag change is linear in
+
+* the poles of the modes, on which the motion near a resonance depends,
+* the external damping, which also drives the modes,
+* the logarithm of the mass per length, which the force has to move,
+* the delay between the channels,
+* the drag itself.
+
+The first four follow from a fit's unknowns, the last is free: its columns are projected out as
+those of a free decay are. A fit with drag repeats both steps until they agree.
+
+Without drag a peak grows as the damping falls, beyond all bounds; with it, it hardly grows. Where
+the linear torque curves with a pole, the torque by drag curves against it. So of the linear torque
+too only the first order in the poles counts: its remainder is taken away again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._data import fast_length
+from analysis.identify._free_decay import mode_poles
+from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, torque_channel
+from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._predictor import Plant
+
+    Real = NDArray[np.float64]
+    Complex = NDArray[np.complex128]
+    from collections.abc import Callable
+
+    from analysis.identify._free_decay import Pole
+
+MODES: Final = 5
+POINTS: Final = 16
+_OVERSAMPLING: Final = 3
+"""The band ends at 0.4 of the rate: up to three times its end nothing folds back into it."""
+
+_PADDED: Final = 1.1
+_DECAY: Final = 6.6
+"""As in `Prediction`."""
+
+_PAST: Final = 3
+"""Forces before the present one that the polynomial passes."""
+
+HALF_DENSITY: Final = 0.5 * AIR_DENSITY_KG_PER_M3
+_LOWEST: Final = [0, 1]
+"""Modes that external damping drives: it falls off against the inertia."""
+
+_BEYOND_ALL: Final = 10.0
+"""Speed over the highest without drag that no braked beam reaches."""
+
+_CHUNK: Final = 4096
+_QUADRATURE: Final = 12
+_SLOWING: Final = 1 / 3
+"""Power of the speed that is left where C_D falls as its power of -2/3."""
+
+
+class DragError(ArithmeticError):
+    """So much drag on so light a beam cannot be followed from sample to sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class DragLaw:
+    """Drag per metre and speed squared.
+
+    Attributes
+    ----------
+    constant_m : float
+        C_D d that does not depend on the speed.
+    slowing : float
+        S, in m (m/s)^(2/3): by how much C_D d is more at 1 m/s.
+    """
+
+    constant_m: float
+    slowing: float = 0.0
+
+    def at(self, speed_m_s: float) -> float:
+        """C_D d in m at a speed."""
+        return float(self.constant_m + self.slowing * speed_m_s ** (_SLOWING - 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DragTorque:
+    """Torque by drag at one point, and its derivatives, at the samples of the angle.
+
+    Attributes
+    ----------
+    law : DragLaw
+    torque_nm : ndarray, shape (m,)
+    by_pole : dict of int to ndarray, shape (2, m)
+        Of each mode: derivatives by the real and the imaginary part of its upper pole.
+    by_external : ndarray, shape (2, m)
+        By gamma and by lambda, the poles held: external damping also drives the modes.
+    by_law : ndarray, shape (2, m)
+        By the two numbers of the law.
+    by_delay : ndarray, shape (m,)
+    speed_m_s : float
+        Mean of the speed along beam and record, weighted with the power that the air takes.
+    top_speed_m_s : float
+        The highest.
+    """
+
+    law: DragLaw
+    torque_nm: Real
+    by_pole: dict[int, Real]
+    by_external: Real
+    by_law: Real
+    by_delay: Real
+    speed_m_s: float
+    top_speed_m_s: float
+
+    @property
+    def by_ln_density(self) -> Real:
+        """By the logarithm of the mass per length, the poles and the drag held."""
+        numbers = np.array([self.law.constant_m, self.law.slowing])
+        own: Real = self.torque_nm - numbers @ self.by_law
+        return own
+
+
+class DragResponse:
+    """What drag does to one beam that follows one angle.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (m,)
+        From rest, band-limited: nothing left at half the rate.
+    rate_hz : float
+    plant : Plant
+        The linear beam.
+
+    Attributes
+    ----------
+    s : ndarray of complex, shape (bins,)
+        Where its transforms are told: a line beside the imaginary axis, in rad/s.
+    """
+
+    def __init__(self, angle_rad: Real, rate_hz: float, plant: Plant) -> None:
+        n = angle_rad.size
+        self.plant, self._samples, self._rate_hz = plant, n, rate_hz
+        self._length = fast_length(int(np.ceil(_PADDED * n)))
+        self._sigma = sigma = _DECAY * rate_hz / self._length
+        bins = np.arange(self._length // 2 + 1)
+        self.s = s = sigma + 2j * np.pi * rate_hz / self._length * bins
+        fine = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
+        self._growth = np.exp(sigma * fine)
+        beam, damping = plant.beam, plant.damping
+        self._grid = DragGrid.of(beam, MODES, POINTS)
+        k = (eigenvalues(MODES) / beam.length_m) ** 4
+        offsets = plant.stiffness_offsets[: MODES - 1]
+        k[FIRST_OFFSET - 1 : FIRST_OFFSET - 1 + len(offsets)] *= 1 + np.array(offsets)
+        log_s = np.log(s)
+        p = beam.density_over_stiffness * s * s + damping.gamma * np.exp(damping.lambda_ * log_s)
+        z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
+        self._follow = p / z  # (MODES, bins): what inertia makes of a force
+        self._yield = s / z / beam.bending_stiffness_n_m2
+        self._inertial = p
+        self._late = torque_channel(plant, s)
+        turned = np.fft.rfft(angle_rad / self._growth[::_OVERSAMPLING], self._length)
+        self._driven = -self._grid.leverage_m[:, None] * (self._follow * s * turned)
+        self._turning = s * turned
+        self._pairs = _pole_pairs(k * beam.length_m**4, plant)
+
+    def first_order(self) -> Real:
+        """Torque by a small drag, over C_D d, shape (m,)."""
+        return self._torque(self._modal(_force(self._linear_speed(), DragLaw(1.0))))
+
+    def torque(self, law: DragLaw, modes: Sequence[int] = ()) -> DragTorque:
+        """Torque by drag, with its derivatives.
+
+        Parameters
+        ----------
+        law : DragLaw
+        modes : sequence of int
+            By whose poles the torque is to be differentiated.
+
+        Raises
+        ------
+        DragError
+            The speeds grow without end.
+        """
+        speed = self._linear_speed()
+        highest = float(np.abs(speed).max())
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._brake(speed, law)
+            top = float(np.abs(speed).max())
+        if not top <= _BEYOND_ALL * highest:
+            raise DragError(f"drag of {law.constant_m:g} m cannot be followed.")
+        forces = self._modal(_force(speed, law))
+        modes = [mode for mode in modes if self._pairs[mode - 1][0].imag > 0]
+        spectra = self._spectra(forces)
+        moved = self._driven + self._yield * spectra[:-1]
+        sources: list[tuple[list[int], Real]] = []
+        direct = []
+        carried = self._leverage[:, None] * self._follow * spectra[:-1]
+        for mode in modes:
+            pole = self._pairs[mode - 1][0]
+            share, mirror = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
+            for change in (share + mirror, 1j * (share - mirror)):
+                sources.append(([mode - 1], self._fine(moved[mode - 1 : mode] * change)))
+                direct.append(self.in_time(carried[mode - 1] * change))
+        for change in self._external():
+            sources.append((_LOWEST, self._fine(self._driven[_LOWEST] * change)))
+            direct.append(self.in_time(carried[_LOWEST].sum(axis=0) * change))
+        changed = self._perturbed(speed, law, sources)
+        by = [self._torque(change) for change in changed]
+        by[: len(direct)] = [row + more for row, more in zip(by, direct, strict=False)]
+        torque = self._response(spectra)
+        return DragTorque(
+            law=law,
+            torque_nm=self.in_time(torque),
+            by_pole={mode: np.array(by[2 * i : 2 * i + 2]) for i, mode in enumerate(modes)},
+            by_external=np.array(by[-4:-2]),
+            by_law=np.array(by[-2:]),
+            by_delay=self.in_time(-self.s * torque),
+            speed_m_s=self._mean_speed(speed),
+            top_speed_m_s=top,
+        )
+
+    def _external(self) -> tuple[Complex, Complex]:
+        """Differentiate ``ln p`` by gamma and by lambda, shape (bins,) each."""
+        damping = self.plant.damping
+        log_s = np.log(self.s)
+        by_gamma = np.exp(damping.lambda_ * log_s) / self._inertial
+        return by_gamma, damping.gamma * log_s * by_gamma
+
+    @property
+    def _leverage(self) -> Real:
+        """Of the modes, L b_i, shape (MODES,)."""
+        return self.plant.beam.length_m * self._grid.leverage_m
+
+    def _mean_speed(self, speed: Real) -> float:
+        cubes = np.abs(speed) ** 3
+        total = float(cubes.sum(axis=0) @ self._grid.weight_m)
+        power = float(np.einsum("tg,tg->g", cubes, np.abs(speed)) @ self._grid.weight_m)
+        return power / total if total > 0 else 0.0
+
+    def _linear_speed(self) -> Real:
+        """Speeds at the points without drag, shape (3 m, POINTS)."""
+        speed = np.outer(self._fine(self._turning), self._grid.x_m)
+        for shape, driven in zip(self._grid.shapes, self._driven, strict=True):
+            speed += np.outer(self._fine(driven), shape)
+        return speed
+
+    def _brake(self, speed: Real, law: DragLaw) -> None:
+        """Turn the speeds without drag into those with it, in place."""
+        step, of_force = self._stepping()
+        of_force = of_force @ self._grid.to_modes
+        state, force, magnitude = np.zeros(len(step) - POINTS), *np.zeros((2, POINTS))
+        out = np.zeros(len(step))
+        braked, later = out[:POINTS], out[POINTS:]
+        constant, slowing = -HALF_DENSITY * law.constant_m, -HALF_DENSITY * law.slowing
+        step_dot, of_force_dot = step.dot, of_force.dot
+        add, multiply, absolute, cbrt = np.add, np.multiply, np.absolute, np.cbrt
+        for at in speed:
+            step_dot(state, out)
+            add(at, braked, at)
+            absolute(at, magnitude)
+            if slowing:
+                cbrt(magnitude, force)
+                multiply(force, slowing, force)
+                multiply(magnitude, constant, magnitude)
+                add(force, magnitude, magnitude)
+            else:
+                multiply(magnitude, constant, magnitude)
+            multiply(magnitude, at, force)
+            of_force_dot(force, state)
+            add(state, later, state)
+
+    def _perturbed(
+        self, speed: Real, law: DragLaw, sources: list[tuple[list[int], Real]]
+    ) -> list[Real]:
+        """Change the forces, as `_modal` has them, by a mode's speed and by the law.
+
+        Parameters
+        ----------
+        speed : ndarray, shape (3 m, POINTS)
+            With drag.
+        sources : list of (list of int, ndarray of shape (modes, 3 m))
+            Which modes (from 0) move faster, and by how much.
+        """
+        step, of_force = self._stepping()
+        of_force = of_force @ self._grid.to_modes
+        runs = len(sources) + 2
+        weights = self._to_root
+        changed = np.empty((len(speed), len(weights), runs))
+        state, out = np.zeros((len(step) - POINTS, runs)), np.zeros((len(step), runs))
+        braked, later = out[:POINTS], out[POINTS:]
+        dot, multiply, add = np.dot, np.multiply, np.add
+        for first in range(0, len(speed), _CHUNK):
+            chunk = slice(first, first + _CHUNK)
+            magnitude = np.abs(speed[chunk])
+            slope = -2 * HALF_DENSITY * law.constant_m * magnitude
+            if law.slowing:
+                slope -= (1 + _SLOWING) * HALF_DENSITY * law.slowing * np.cbrt(magnitude)
+            steep = slope[:, :, None]
+            force = np.empty((len(slope), POINTS, runs))
+            for run, (modes, faster) in enumerate(sources):
+                force[:, :, run] = faster[:, chunk].T @ self._grid.shapes[modes]
+            force[:, :, : len(sources)] *= steep
+            force[:, :, len(sources)] = -HALF_DENSITY * magnitude * speed[chunk]
+            force[:, :, -1] = -HALF_DENSITY * np.cbrt(magnitude) * speed[chunk]
+            for at, now in zip(force, steep, strict=True):
+                dot(step, state, out)
+                multiply(braked, now, braked)
+                add(at, braked, at)
+                dot(of_force, at, state)
+                add(state, later, state)
+            np.matmul(weights, force, out=changed[chunk])
+        return list(np.ascontiguousarray(changed.transpose(2, 1, 0)))
+
+    def _stepping(self) -> tuple[Real, Real]:
+        """Matrices of a step: speed at the points and next state, by the state; by the new force.
+
+        The state holds two numbers a mode, then the modes' forces of the last three steps.
+        """
+        n, step_s = MODES, 1 / (_OVERSAMPLING * self._rate_hz)
+        states = 2 * n + _PAST * n
+        by_state, by_force = np.zeros((states, states)), np.zeros((states, n))
+        told = np.zeros((n, states))
+        z_prime = self._slopes()
+        for i, (pair, slope) in enumerate(zip(self._pairs, z_prime, strict=True)):
+            rows = slice(2 * i, 2 * i + 2)
+            decay = np.exp(pair * step_s)
+            inputs = _polynomial_inputs(pair, step_s)  # (2, 1 + _PAST), the newest first
+            gain = pair / slope / self.plant.beam.bending_stiffness_n_m2
+            if pair[0].imag > 0:
+                a, b = decay[0].real, decay[0].imag
+                by_state[rows, rows] = [[a, -b], [b, a]]
+                parts = np.array([inputs[0].real, inputs[0].imag])
+                told[i, rows] = 2 * gain[0].real, -2 * gain[0].imag
+            elif np.isnan(pair[0]):
+                continue
+            else:
+                by_state[rows, rows] = np.diag(decay.real)
+                parts = inputs.real
+                told[i, rows] = gain.real
+            by_force[rows, i] = parts[:, 0]
+            by_state[rows, 2 * n + i :: n] = parts[:, 1:]
+        # The forces move on by one place.
+        by_force[2 * n : 3 * n] = np.eye(n)
+        by_state[3 * n :, 2 * n : -n] = np.eye((_PAST - 1) * n)
+        # For the speed the new force is not known yet: it is foreseen from the last three.
+        foreseen = by_state[: 2 * n].copy()
+        for back, factor in enumerate((3.0, -3.0, 1.0)):
+            columns = slice((2 + back) * n, (3 + back) * n)
+            foreseen[:, columns] += factor * by_force[: 2 * n]
+        speed = self._grid.shapes.T @ (told[:, : 2 * n] @ foreseen)
+        return np.concatenate([speed, by_state]), by_force
+
+    def _slopes(self) -> Complex:
+        """Slope of Z at the poles, shape (MODES, 2)."""
+        s, damping = self._pairs, self.plant.damping
+        ratio = self.plant.beam.density_over_stiffness
+        log_s = np.log(s)
+        external = damping.gamma * np.exp(damping.lambda_ * log_s)
+        internal = damping.zeta * np.exp(damping.alpha * log_s)
+        k = -(ratio * s * s + external) / (1 + internal)  # Z is nought there
+        slopes: Complex = (
+            2 * ratio * s + (damping.lambda_ * external + damping.alpha * k * internal) / s
+        )
+        return slopes
+
+    @property
+    def _to_root(self) -> Real:
+        """From the points to the modes and, last, to the moment: (MODES + 1, POINTS)."""
+        return np.vstack([self._grid.to_modes, self._grid.to_moment])
+
+    def _modal(self, force: Real) -> Real:
+        """Force on each mode and, last, its moment: (MODES + 1, 3 m), of (3 m, POINTS)."""
+        modal: Real = self._to_root @ force.T
+        return modal
+
+    def _spectra(self, forces: Real) -> Complex:
+        """Transform what `_modal` gives, shape (MODES + 1, bins)."""
+        every = np.fft.rfft(forces / self._growth, _OVERSAMPLING * self._length)
+        spectra: Complex = every[:, : self.s.size] / _OVERSAMPLING
+        return spectra
+
+    def _response(self, spectra: Complex) -> Complex:
+        """Torque's transform, without the delay, by forces on modes and their moment."""
+        torque: Complex = self._leverage @ (self._follow * spectra[:-1]) - spectra[-1]
+        return torque
+
+    def _torque(self, forces: Real) -> Real:
+        return self.in_time(self._response(self._spectra(forces)))
+
+    def in_time(self, torque: Complex) -> Real:
+        """Values (..., m) of a torque, as its channel shows it, at the samples of the angle.
+
+        Parameters
+        ----------
+        torque : ndarray of complex, shape (..., bins)
+            On the grid `s`.
+        """
+        values = np.fft.irfft(torque * self._late, self._length)[..., : self._samples]
+        values *= self._growth[::_OVERSAMPLING]
+        return values
+
+    def modal_torque(self, mode: int) -> Complex:
+        """Part of one mode, from 1, in the linear torque, without the delay, shape (bins,).
+
+        The mode's poles are in all of it, and in nothing else of the torque.
+        """
+        share = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
+        torque: Complex = share * self._inertial * self._driven[mode - 1] / self.s
+        return torque
+
+    def _fine(self, spectrum: Complex) -> Real:
+        """Values (..., 3 m) over the record at the multiple of the rate."""
+        fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
+        values: Real = fine[..., : self._growth.size] * self._growth
+        return values
+
+
+def _force(speed: Real, law: DragLaw) -> Real:
+    """Force per metre in N/m."""
+    magnitude = np.abs(speed)
+    per_speed = law.constant_m * magnitude
+    if law.slowing:
+        per_speed += law.slowing * np.cbrt(magnitude)
+    force: Real = -HALF_DENSITY * per_speed * speed
+    return force
+
+
+def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
+    """Poles of the modes, shape (MODES, 2), of which ``(k L)^4`` is given."""
+    pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
+    return pairs.astype(np.complex128)
+
+
+def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
+    """Integrate ``z' = p z + F`` over forces at the end of a step and before: (poles, 1 + _PAST).
+
+    Between the instants the force is the polynomial through all of them.
+    """
+    node, weight = np.polynomial.legendre.leggauss(_QUADRATURE)
+    at = 0.5 * (node + 1)
+    places = 1.0 - np.arange(1 + _PAST)
+    lagrange = np.array(
+        [
+            np.prod([(at - other) / (own - other) for other in places if other != own], axis=0)
+            for own in places
+        ]
+    )
+    growth = np.exp(pole[:, None] * (step_s * (1 - at)))
+    inputs: Complex = growth * (0.5 * step_s * weight) @ lagrange.T
+    return inputs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DragExpansion:
+    """Changes of the torque by drag round one beam and drag, as spectra in the band.
+
+    Attributes
+    ----------
+    plant : Plant
+    law : DragLaw
+        At these the torque was taken out of the record.
+    response : DragResponse
+        Of that beam.
+    band : callable
+        Spectrum in the band of samples of the angle's times.
+    by_pole : dict of int to ndarray of complex, shape (2, K)
+        Of each mode: by the real and the imaginary part of its upper pole.
+    by_external : ndarray of complex, shape (2, K)
+        By gamma and lambda, the poles held.
+    by_ln_density, by_delay : ndarray of complex, shape (K,)
+    by_law : ndarray of complex, shape (2, K)
+        By the two numbers of the law.
+    speed_m_s, top_speed_m_s : float
+        Speed that counts most, and the highest: see `DragTorque`.
+    """
+
+    plant: Plant
+    law: DragLaw
+    response: DragResponse
+    band: Callable[[Real], Complex]
+    by_pole: dict[int, Complex]
+    by_external: Complex
+    by_ln_density: Complex
+    by_delay: Complex
+    by_law: Complex
+    speed_m_s: float
+    top_speed_m_s: float
+
+    def beside(
+        self, plant: Plant, poles: Sequence[Pole], names: Sequence[str], chain: Real
+    ) -> tuple[Complex, Complex]:
+        """Spectrum (K,) of what another beam changes, and its derivatives by the unknowns (k, K).
+
+        Parameters
+        ----------
+        plant : Plant
+            The other beam.
+        poles : sequence of Pole
+            Its poles, differentiated by the unknowns.
+        names : sequence of str
+            Names of the parameters, those of `Unknowns`.
+        chain : ndarray, shape (len(names), k)
+            Their derivatives by the unknowns, of density over stiffness and of stiffness as
+            logarithms.
+        """
+        rows, moved, slopes = [], [], []
+        own = {pole.mode: pole.at_rad_s for pole in mode_poles(self.plant, len(self.by_pole), ())}
+        for pole in poles:
+            if pole.mode in self.by_pole and pole.oscillates and pole.mode in own:
+                apart = pole.at_rad_s - own[pole.mode]
+                curved, steeper = self._remainder(pole.mode, own[pole.mode], pole.at_rad_s)
+                by_pole = self.by_pole[pole.mode]
+                # Slopes at the pole itself, the values of the remainder as a row of their own.
+                rows += [*by_pole, *steeper, curved]
+                moved += [apart.real, apart.imag, 0.0, 0.0, -1.0]
+                turn = [pole.derivative.real, pole.derivative.imag]
+                slopes += [*turn, *(-part for part in turn), np.zeros(chain.shape[1])]
+        of_density = sum(
+            (chain[names.index(name)] for name in _OF_DENSITY if name in names),
+            start=np.zeros(chain.shape[1]),
+        )
+        rows.append(self.by_ln_density)
+        here, there = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
+        moved.append(np.log(there / here))
+        slopes.append(of_density)
+        before, after = self.plant.damping, plant.damping
+        if after.gamma > 0:
+            rows += list(self.by_external)
+            moved += [after.gamma - before.gamma, after.lambda_ - before.lambda_]
+            slopes += [
+                chain[names.index(name)] if name in names else np.zeros(chain.shape[1])
+                for name in ("gamma", "lambda")
+            ]
+        else:
+            rows.append(self.by_external[0])
+            moved.append(-before.gamma)
+            slopes.append(np.zeros(chain.shape[1]))
+        rows.append(self.by_delay)
+        moved.append(plant.delay_s - self.plant.delay_s)
+        free = "delay_s" in names
+        slopes.append(chain[names.index("delay_s")] if free else np.zeros(chain.shape[1]))
+        # As real numbers: they are multiplied by real ones only.
+        every = np.array(rows).view(np.float64)
+        change: Complex = (np.array(moved) @ every).view(np.complex128)
+        jacobian: Complex = (np.array(slopes).T @ every).view(np.complex128)
+        return change, jacobian
+
+    def _remainder(self, mode: int, here: complex, there: complex) -> tuple[Complex, Complex]:
+        """Linear torque of a mode beyond the first order in its pole, (K,), and its slopes, (2, K).
+
+        The slopes are by the real and the imaginary part.
+        """
+        s, torque = self.response.s, self.response.modal_torque(mode)
+        apart = there - here
+        before, mirror = 1 / (s - here), 1 / (s - here.conjugate())
+        after, after_mirror = 1 / (s - there), 1 / (s - there.conjugate())
+        grown = after * after_mirror / (before * mirror)
+        first = apart * before + apart.conjugate() * mirror
+        real = grown * (after + after_mirror) - (before + mirror)
+        imaginary = 1j * (grown * (after - after_mirror) - (before - mirror))
+        spectra = torque * np.array([grown - 1 - first, real, imaginary])
+        curved, *steeper = self.band(self.response.in_time(spectra))
+        return curved, np.array(steeper)
+
+
+_OF_DENSITY = ("density_over_stiffness", "bending_stiffness_n_m2")
+"""Parameters whose logarithms add up to that of the mass per length."""

@@ -1,0 +1,209 @@
+"""Output-error estimation on the whole record: measured torque against predicted torque."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._parametrization import Unknowns
+from analysis.identify._predictor import SETTINGS
+from analysis.identify._problem import Comparison, Objective
+from analysis.identify._result import RecordAnalysis, RecordFit
+from analysis.identify._search import Descent, RoughResponse, Search
+from analysis.identify._uncertainty import (
+    covariance_of_unknowns,
+    interval_from_zero,
+    mode_table,
+    parameter_uncertainty,
+    ringing,
+)
+from analysis.models import RECORD_BAND_HZ, STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._data import Measurement
+    from analysis.identify._noise import Noise
+    from analysis.identify._predictor import Setting
+    from analysis.identify._problem import Objective, Projected
+    from analysis.models import Structure
+
+
+def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> RecordFit:
+    """Parameters, uncertainty, modes and residual at a minimum.
+
+    Parameters
+    ----------
+    objective : Objective
+    x : ndarray, shape (k,)
+        The minimum.
+    noise : Noise
+        What was taken for noise when it was found.
+    """
+    unknowns, comparison = objective.unknowns, objective.comparison
+    at = objective.linearise(x)
+    projected = objective.project(at, noise.weight)
+    # Where a torque is unknown the residual is nought and adds nothing to the sum.
+    compared = round(2 * np.sum(noise.counts) * comparison.measurement.torque_share)
+    freedom = compared - x.size - projected.amplitudes.size
+    scatter = projected.cost / freedom
+    lower, upper = unknowns.bounds
+    held = (x <= lower) | (x >= upper)
+    jacobian = _compared_jacobian(objective, x, projected, noise)
+    of_unknowns, known = covariance_of_unknowns(jacobian, scatter, held)
+    names, plant = unknowns.names, unknowns.plant(x)
+    values = unknowns.parameters(x)
+    of = parameter_uncertainty(unknowns, x, held, of_unknowns, known)
+    std, intervals = dict(of.std), dict(of.interval)
+    tool = "tool_inertia_kg_m2"
+    if tool in names and held[names.index(tool)]:
+        place = names.index(tool)
+        free = held & (np.arange(held.size) != place)
+        every, _ = covariance_of_unknowns(jacobian, scatter, free)
+        chain = unknowns.estimates_by_unknowns(x)
+        std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
+    spread = std.get(tool)
+    if tool in names and spread:
+        intervals[tool] = interval_from_zero(values[tool], spread)
+    hum = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
+    return RecordFit(
+        structure=unknowns.structure,
+        plant=plant,
+        parameters=values,
+        std=std,
+        interval=intervals,
+        determined=of.determined,
+        covariance=of.covariance,
+        at_bounds=of.at_bounds,
+        internal=of.internal,
+        external=of.external,
+        modes=mode_table(at.poles, of_unknowns),
+        ringing=ringing(at.poles, projected, scatter, at.columns * noise.weight, hum),
+        cost=projected.cost,
+        degrees_of_freedom=freedom,
+        residual=projected.residual,
+    )
+
+
+def _compared_jacobian(
+    objective: Objective,
+    x: NDArray[np.float64],
+    projected: Projected,
+    noise: Noise,
+) -> NDArray[np.complex128]:
+    """Jacobian of the torques that are known, shape (k, K)."""
+    comparison, unknowns = objective.comparison, objective.unknowns
+    if comparison.measurement.torque_known.all():
+        return projected.jacobian
+    lost = comparison.lost_gradient(unknowns.plant(x), unknowns.gradient_names)
+    weighted = noise.weight * (unknowns.gradient_by_unknowns(x).T @ lost)
+    return projected.jacobian - weighted
+
+
+BAND_HZ: Final[tuple[float, float]] = RECORD_BAND_HZ
+_TOLERANCE: Final = 1e-9
+"""Of the sum of squares: less than a hundredth of a standard deviation."""
+
+_BEFORE_LINES: Final = 1e-4
+"""The same while noise and lines are still to be found: a standard deviation."""
+
+_REPEATS: Final = 3
+"""Each leaves a fifth of what hum had made of the beam."""
+
+
+def fit_record(
+    measurement: Measurement,
+    structures: Iterable[Structure] = tuple(STRUCTURES.values()),
+    *,
+    fixed: Iterable[Setting] = (),
+    band_hz: tuple[float, float] = BAND_HZ,
+    uniform: bool = True,
+) -> RecordAnalysis:
+    """Fit structures to a whole record in the band.
+
+    The torque is predicted from the measured angle (`Prediction`); the squares of what the
+    measurement differs by, whitened with the spectrum of the noise found in it, are minimised over
+    the damping and over density over stiffness, stiffness, delay and tool inertia. For noise in
+    the torque alone that is the maximum-likelihood estimate, whatever the excitation. Where a
+    controller held the motor to a reference, only what follows that is taken for input
+    (`analysis.identify._problem`): the noise then moves the motor as well.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    structures : iterable of Structure
+        They share one noise spectrum, that of the one closest to the rough response, so that
+        their costs compare.
+    fixed : iterable of str
+        Settings (`SETTINGS`) that stay at the values the file states.
+    band_hz : tuple of float
+        First and last frequency compared.
+    uniform : bool
+        Whether the beam is taken to be uniform, as Eq. 25 has it; otherwise the stiffness of each
+        mode in the band but the first is free as well.
+
+    Raises
+    ------
+    MeasurementError
+        The record cannot be used.
+    ValueError
+        There is no such setting.
+    """
+    fixed = tuple(fixed)
+    unknown = sorted(set(fixed) - set(SETTINGS))
+    if unknown:
+        raise ValueError(f"{unknown} cannot be fixed: choose from {SETTINGS}.")
+    free = tuple(name for name in SETTINGS if name not in fixed)
+    comparison = Comparison.of(measurement, band_hz)
+    nominal = measurement.nominal
+    rough = RoughResponse(comparison)
+    searches = [
+        Search.of(Objective(comparison, unknowns), rough)
+        for unknowns in (
+            Unknowns.of(structure, nominal, free, 1 if uniform else comparison.visible_modes)
+            for structure in structures
+        )
+    ]
+    closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
+    reference = searches[closest].lowest()
+    reference = reference.settled(reference.noise(), _BEFORE_LINES)
+    whole = reference.objective.comparison
+    comparison = whole.following_reference(reference.plant)
+    searches = [search.on(comparison) for search in searches]
+    reference = Descent(searches[closest].objective, reference.x)
+    clean = reference.without_hum(_BEFORE_LINES)
+    if clean is not reference:
+        reference = _followed_again(clean, whole)
+        comparison = reference.objective.comparison
+        rough = RoughResponse(comparison)
+        searches = [Search.of(Objective(comparison, search.unknowns), rough) for search in searches]
+    # Lines are looked for once, in what a fit to every bin leaves.
+    noise = reference.noise(with_lines=True)
+    noise = replace(noise, lines=(*noise.lines, *(hum.line for hum in comparison.hum)))
+    descents = [
+        search.under(noise, reference if i == closest else None).settled(noise, _TOLERANCE)
+        for i, search in enumerate(searches)
+    ]
+    return RecordAnalysis(
+        fits=tuple(summary(descent.objective, descent.x, noise) for descent in descents),
+        frequency_hz=comparison.frequency_hz,
+        compared=noise.counts,
+        noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
+        lines=noise.lines,
+        comparison=comparison,
+    )
+
+
+def _followed_again(clean: Descent, whole: Comparison) -> Descent:
+    """Compute anew what follows no reference: it was, with a beam that the hum had spoilt."""
+    hum, unknowns = clean.objective.comparison.hum, clean.objective.unknowns
+    for _ in range(_REPEATS):
+        comparison = whole.following_reference(clean.plant).without_hum(hum)
+        clean = Descent(Objective(comparison, unknowns), clean.x)
+        clean = clean.settled(clean.noise(), _TOLERANCE)
+        hum = clean.hum() or hum
+    return Descent(Objective(clean.objective.comparison.without_hum(hum), unknowns), clean.x)

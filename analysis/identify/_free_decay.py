@@ -1,0 +1,235 @@
+"""Free decay of the beam's modes, as its spectrum over a record, and how the poles move.
+
+A beam that already rings when the record begins adds to the torque a sum of decays whose amplitudes
+nobody knows but whose poles are the model's own. Their spectra over the samples compared are
+geometric sums, in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, offset_name
+from rigd.beam import LoadedBeam, poles_for_eigenvalues
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._predictor import Plant
+
+
+_HARDLY: Final = 1e-6
+_ASIDE: Final = 1e-8
+"""Relative distance from a pole: the root of what rounding leaves of G's size there."""
+
+_OF_ENDS: Final = frozenset({"tip_mass_kg", "root_compliance_rad_per_nm"})
+"""Extras that move poles."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pole:
+    """One pole of one mode: of a conjugate pair the upper, or a real one.
+
+    Attributes
+    ----------
+    mode : int
+        From 1.
+    at_rad_s : complex
+    derivative : ndarray of complex, shape (k,)
+        By the parameters asked for.
+    """
+
+    mode: int
+    at_rad_s: complex
+    derivative: NDArray[np.complex128]
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether the decay is an oscillation: two columns, else one."""
+        return self.at_rad_s.imag != 0
+
+
+def mode_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]:
+    """Poles of the first `count` modes with their derivatives, without modes that have none.
+
+    Parameters
+    ----------
+    plant : Plant
+    count : int
+    wrt : sequence of str
+        Names that `ResponseGrid` knows; some do not move a pole.
+    """
+    if plant.tip_mass_kg or plant.root_compliance_rad_per_nm or not _OF_ENDS.isdisjoint(wrt):
+        return _loaded_poles(plant, count, wrt)
+    z = eigenvalues(count).copy()
+    for mode, offset in enumerate(plant.stiffness_offsets[: count - 1], start=FIRST_OFFSET):
+        z[mode - 1] *= (1 + offset) ** 0.25
+    found = []
+    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping)):
+        if np.isnan(pair[0]):
+            continue
+        stiffness = float((z[i] / plant.beam.length_m) ** 4)
+        for pole in pair[: 1 if pair[0].imag else 2]:
+            moved = _pole_derivative(complex(pole), stiffness, i + 1, plant, wrt)
+            found.append(Pole(i + 1, complex(pole), moved))
+    return tuple(found)
+
+
+def _loaded_poles(plant: Plant, count: int, wrt: Sequence[str]) -> tuple[Pole, ...]:
+    """Compute the same with a tip mass or an elastic clamp, on a uniform beam.
+
+    The derivatives are those of a root of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
+    is infinite, but next to it the ratios of its derivatives are already as they should be.
+    """
+    damping, ratio = plant.damping, plant.beam.density_over_stiffness
+    loaded = LoadedBeam(plant.beam, damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm)
+    found = []
+    for mode, pair in enumerate(loaded.poles(eigenvalues(count)), start=1):
+        if np.isnan(pair).any():
+            continue
+        for pole in pair[: 1 if pair[0].imag else 2]:
+            s = np.array([pole if plant.root_compliance_rad_per_nm else pole * (1 - _ASIDE)])
+            at, log_s = loaded.at(s), np.log(s)
+            s_alpha, s_lambda = np.exp(damping.alpha * log_s), np.exp(damping.lambda_ * log_s)
+            by: dict[str, NDArray[np.complex128]] = {
+                "zeta": at.by_elastic * s_alpha,
+                "alpha": at.by_elastic * damping.zeta * log_s * s_alpha,
+                "gamma": at.by_inertial * s_lambda,
+                "lambda": at.by_inertial * damping.gamma * log_s * s_lambda,
+                "ln_density_over_stiffness": at.by_inertial * ratio * s * s,
+                "ln_stiffness": at.response - plant.tip_mass_kg * at.by_mass,
+                "tip_mass_kg": at.by_mass,
+                "root_compliance_rad_per_nm": -at.response * at.response,
+            }
+            slope = loaded.slope(s, at)
+            moved = [-(by[name] / slope)[0] if name in by else 0.0 for name in wrt]
+            found.append(Pole(mode, complex(pole), np.array(moved, dtype=np.complex128)))
+    return tuple(found)
+
+
+def _pole_derivative(
+    s: complex, stiffness: float, mode: int, plant: Plant, wrt: Sequence[str]
+) -> NDArray[np.complex128]:
+    """Differentiate a root of ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha) = 0``.
+
+    By implicit differentiation, `stiffness` being k⁴. Shape (len(wrt),).
+    """
+    damping, ratio = plant.damping, plant.beam.density_over_stiffness
+    log_s = np.log(complex(s))
+    internal = stiffness * np.exp(damping.alpha * log_s)
+    external = np.exp(damping.lambda_ * log_s)
+    slope = (
+        2 * ratio * s
+        + damping.gamma * damping.lambda_ * external / s
+        + damping.zeta * damping.alpha * internal / s
+    )
+    by: dict[str, complex] = {
+        "zeta": internal,
+        "alpha": damping.zeta * log_s * internal,
+        "gamma": external,
+        "lambda": damping.gamma * log_s * external,
+        "ln_density_over_stiffness": ratio * s * s,
+    }
+    if FIRST_OFFSET <= mode < FIRST_OFFSET + len(plant.stiffness_offsets):
+        elastic = stiffness + damping.zeta * internal
+        by[offset_name(mode)] = elastic / (1 + plant.stiffness_offsets[mode - FIRST_OFFSET])
+    return np.array([-by.get(name, 0.0) / slope for name in wrt], dtype=np.complex128)
+
+
+class DecaySpectra:
+    """Discrete Fourier transforms of decays over ``samples`` samples, at some of its bins.
+
+    Parameters
+    ----------
+    samples : int
+        The decays start at the first of them.
+    rate_hz : float
+    omega_rad_s : ndarray, shape (K,)
+        Bins of the transform, multiples of ``2 pi rate_hz / samples``.
+    """
+
+    __slots__ = ("_duration_s", "_period_s", "_turn")
+
+    def __init__(self, samples: int, rate_hz: float, omega_rad_s: NDArray[np.float64]) -> None:
+        self._period_s = 1 / rate_hz
+        self._duration_s = samples / rate_hz
+        self._turn = np.exp(-1j * omega_rad_s * self._period_s)
+
+    def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Spectra of ``Re exp(p t)`` and, if it oscillates, ``Im exp(p t)``: shape (m, K)."""
+        return self._spectra(poles, self._sum)
+
+    def gradient(
+        self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Differentiate ``amplitudes @ columns(poles)`` through the poles, shape (k, K)."""
+        turned = []
+        place = 0
+        for pole in poles:
+            if pole.oscillates:
+                # t exp(p t) times the pole's motion, seen along the two amplitudes.
+                moved = complex(amplitudes[place], -amplitudes[place + 1]) * pole.derivative
+                turned += [moved.real, -moved.imag]
+                place += 2
+            else:
+                turned.append(amplitudes[place] * pole.derivative.real)
+                place += 1
+        parts: NDArray[np.float64] = np.array(turned).T @ self.growing(poles).view(np.float64)
+        total: NDArray[np.complex128] = parts.view(np.complex128)
+        return total
+
+    def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Spectra of the same times the time since the first sample: shape (m, K)."""
+        return self._spectra(poles, self._sum_of_time)
+
+    def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
+        """Spectra of oscillations all through the record, shape (4 n, K).
+
+        Of either phase, and growing from nought: together any amplitude and phase at the beginning
+        and any other at the end, and that is what leaks into distant bins.
+        """
+        none = np.zeros(0, dtype=np.complex128)
+        # All but steady: on a bin's own frequency the sums would be 0 / 0.
+        slow = _HARDLY / self._duration_s
+        poles = [Pole(0, complex(-slow, 2 * np.pi * hz), none) for hz in frequency_hz]
+        return np.concatenate([self.columns(poles), self.growing(poles)])
+
+    def _spectra(
+        self, poles: Sequence[Pole], upper: Callable[[complex], NDArray[np.complex128]]
+    ) -> NDArray[np.complex128]:
+        """Spectra of the real and, if it oscillates, the imaginary part of a complex decay."""
+        rows = np.empty((sum(1 + pole.oscillates for pole in poles), self._turn.size), complex)
+        place = 0
+        for pole in poles:
+            of_pole = upper(pole.at_rad_s)
+            if pole.oscillates:
+                of_conjugate = upper(pole.at_rad_s.conjugate())
+                np.multiply(of_pole + of_conjugate, 0.5, out=rows[place])
+                np.multiply(of_pole - of_conjugate, -0.5j, out=rows[place + 1])
+                place += 2
+            else:
+                rows[place] = of_pole
+                place += 1
+        return rows
+
+    def _sum(self, pole: complex) -> NDArray[np.complex128]:
+        """Sum of ``exp(p t)`` over the samples, turned to each bin."""
+        ratio = np.exp(pole * self._period_s) * self._turn
+        total: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - ratio)
+        return total
+
+    def _sum_of_time(self, pole: complex) -> NDArray[np.complex128]:
+        """Sum of ``t exp(p t)``: the derivative of `_sum` by the pole."""
+        ratio = np.exp(pole * self._period_s) * self._turn
+        over = np.exp(pole * self._duration_s)
+        reciprocal = np.reciprocal(1 - ratio)
+        total: NDArray[np.complex128] = ratio * reciprocal
+        total *= (1 - over) * self._period_s
+        total -= self._duration_s * over
+        total *= reciprocal
+        return total

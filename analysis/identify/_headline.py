@@ -1,0 +1,569 @@
+"""The numbers that a record stands for: from the freest structure that it supports, with flags.
+
+A structure that fixes an order gives narrow intervals which hold only if that order is right, and
+the criterion that selected it forgives an error of 2.7 standard deviations. So what is told first
+comes from the structure in which every order is free: its intervals hold whichever simpler one is
+true. What a simpler one would give stands beside it, as a condition.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+
+from analysis.identify._verdict import BESIDE_DRAG, EXCLUDED, STRONG
+from analysis.models import COEFFICIENT_OF
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping
+
+    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._finding import Finding
+    from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
+    from analysis.identify._verdict import OrderVerdict
+
+_NORMAL_95: Final = 1.959963984540054
+UNEXPLAINED: Final = "part of the record is unexplained"
+MISREAD: Final = "the record and its file do not fit each other"
+_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
+_NOT_DETERMINED: Final = "the record does not determine it"
+_AT_EDGE: Final = "at the edge of what is searched"
+
+_MODES_TO_TELL_DAMPINGS: Final = 2
+ONE_MODE: Final = (
+    "one mode alone does not tell damping of the material from that of the surroundings"
+)
+
+_LAW_ASSUMED: Final = (
+    "the stiffness depends on the deflection, by a law of which only the lowest power was fitted"
+)
+_OF_FREQUENCIES: Final = ("density_over_stiffness", "stiffness_offset")
+
+StructureStatus = Literal["selected", "compatible", "excluded"]
+Damping = Literal["internal", "external"]
+_NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
+    "internal": ("zeta", "alpha"),
+    "external": ("gamma", "lambda"),
+}
+"""Coefficient and order of either damping."""
+
+_DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number with its uncertainty.
+
+    Attributes
+    ----------
+    value : float
+        In SI units.
+    std : float or None
+        Standard deviation, None if the data do not tell.
+    interval_95 : tuple of float or None
+        None as above.
+    flag : str or None
+        Why it must not be taken for a property of the antenna or the rig; None: it may.
+    """
+
+    value: float
+    std: float | None
+    interval_95: tuple[float, float] | None
+    flag: str | None = None
+
+    def flagged(self, flag: str | None) -> Quantity:
+        """Give it a flag, unless it has one.
+
+        Parameters
+        ----------
+        flag : str or None
+        """
+        return replace(self, flag=self.flag or flag)
+
+    def as_json(self) -> dict[str, Any]:
+        """As `json.dumps` takes it."""
+        ends = None if self.interval_95 is None else list(self.interval_95)
+        return {"value": self.value, "std": self.std, "interval_95": ends, "flag": self.flag}
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Loss factor of a damping at the frequency where it depends least on its order.
+
+    Attributes
+    ----------
+    damping : str
+        "internal" or "external".
+    omega_rad_s : float or None
+        That frequency; None if the order is fixed: then it is the coefficient itself.
+    size : Quantity
+        As `DampingSize` has it.
+    """
+
+    damping: Damping
+    omega_rad_s: float | None
+    size: Quantity
+
+    def flagged(self, flag: str) -> Size:
+        """Give it a flag, unless it has one.
+
+        Parameters
+        ----------
+        flag : str
+        """
+        return replace(self, size=self.size.flagged(flag))
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One mode of the beam on a motor that stands still."""
+
+    number: int
+    frequency_hz: Quantity
+    damping_ratio: Quantity
+    shown: bool
+    """Whether the record shows it; else it is computed from the model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simpler:
+    """What a simpler structure would give, on condition that it is the true one.
+
+    Attributes
+    ----------
+    name : str
+        As tables call it.
+    fixed : mapping of str to float
+        What it takes for granted: orders by name.
+    parameters : mapping of str to Quantity
+    """
+
+    name: str
+    fixed: Mapping[str, float]
+    parameters: Mapping[str, Quantity]
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """What one record, or all of a campaign, says in numbers, whatever structure is the true one.
+
+    Attributes
+    ----------
+    name : str
+        The freest structure that the data support, as tables call it.
+    parameters : mapping of str to Quantity
+        What the structure has, by the names of `RecordFit`.
+    sizes : tuple of Size
+    modes : tuple of Mode
+    structures : tuple of (str, str)
+        Every structure fitted, as tables call it, and its status: "selected", the one that the
+        numbers are of; "compatible"; "excluded".
+    simpler : Simpler or None
+        The simplest structure that would do, if it is not that one.
+    """
+
+    name: str
+    parameters: Mapping[str, Quantity]
+    sizes: tuple[Size, ...]
+    modes: tuple[Mode, ...]
+    structures: tuple[tuple[str, StructureStatus], ...]
+    simpler: Simpler | None
+
+
+@dataclass(frozen=True, slots=True)
+class Headline(Numbers):
+    """What one record says in numbers, and the fit that they are of.
+
+    Attributes
+    ----------
+    fit : RecordFit
+        Of the freest structure that the record supports.
+    explained : bool
+        Whether it leaves nothing but noise; else every number carries a flag.
+    """
+
+    fit: RecordFit
+    explained: bool
+
+    @property
+    def flags(self) -> dict[str, str]:
+        """Reasons by parameter, of those that have one."""
+        return {name: each.flag for name, each in self.parameters.items() if each.flag}
+
+    @property
+    def visible_modes(self) -> tuple[int, ...]:
+        """Numbers of the modes that the record shows."""
+        return tuple(mode.number for mode in self.modes if mode.shown)
+
+    def doubted(self, flag: str) -> Headline:
+        """Flag every number that has no flag yet.
+
+        Parameters
+        ----------
+        flag : str
+            The reason.
+        """
+        return replace(
+            self,
+            parameters={name: each.flagged(flag) for name, each in self.parameters.items()},
+            sizes=tuple(each.flagged(flag) for each in self.sizes),
+            modes=tuple(
+                replace(
+                    each,
+                    frequency_hz=each.frequency_hz.flagged(flag),
+                    damping_ratio=each.damping_ratio.flagged(flag),
+                )
+                for each in self.modes
+            ),
+        )
+
+    def with_law_assumed(self) -> Headline:
+        """Flag what rests on the law by which a stiffness was taken to depend on the deflection."""
+        return replace(
+            self,
+            parameters={
+                name: each.flagged(_LAW_ASSUMED) if name.startswith(_OF_FREQUENCIES) else each
+                for name, each in self.parameters.items()
+            },
+            modes=tuple(
+                replace(each, frequency_hz=each.frequency_hz.flagged(_LAW_ASSUMED))
+                for each in self.modes
+            ),
+        )
+
+    def with_status(self, status: StructureStatus) -> tuple[str, ...]:
+        """Names of the structures with a status.
+
+        Parameters
+        ----------
+        status : str
+        """
+        return tuple(name for name, its in self.structures if its == status)
+
+
+def headline(
+    field: Field,
+    orders: tuple[OrderVerdict, OrderVerdict],
+    visible: tuple[int, ...],
+    *,
+    unexplained: str | None,
+) -> Headline:
+    """Put together what is told first.
+
+    Parameters
+    ----------
+    field : Field
+    orders : tuple of OrderVerdict
+        Alpha's and lambda's, judged in the freest structure.
+    visible : tuple of int
+        Modes that the record shows.
+    unexplained : str or None
+        Why nothing is to be believed; None if that structure leaves nothing but noise.
+    """
+    freest = field.freest
+    fractional = frozenset(each.order for each in orders if each.status == "fractional")
+    reasons: dict[str, str] = {
+        each.order: each.reason for each in orders if each.reason is not None
+    }
+    intervals: dict[str, tuple[float, float]] = {
+        each.order: each.profile.interval
+        for each in orders
+        if each.profile.walked and each.order in freest.structure.free
+    }
+    told = of_fit(freest.name, freest.fit, visible, reasons, intervals, unexplained)
+    if field.drag is not None:
+        drag = field.drag
+        at = Quantity(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
+        sizes = (
+            each.flagged(BESIDE_DRAG) if each.damping == "external" else each for each in told.sizes
+        )
+        told = replace(told, parameters={**told.parameters, "drag": at}, sizes=tuple(sizes))
+    simpler = _simpler(field, fractional) if unexplained is None else None
+    for other in field.other_kinds(STRONG):
+        told = _doubted_by(told, other)
+    if len(visible) < _MODES_TO_TELL_DAMPINGS:
+        told = replace(told, sizes=tuple(each.flagged(ONE_MODE) for each in told.sizes))
+    return replace(told, structures=structures(field, fractional), simpler=simpler)
+
+
+def of_fit(
+    name: str,
+    fit: RecordFit,
+    visible: Collection[int],
+    reasons: Mapping[str, str] = _NONE,
+    intervals: Mapping[str, tuple[float, float]] = _NONE,
+    unexplained: str | None = None,
+) -> Headline:
+    """Tell one fit, with flags where they belong.
+
+    Parameters
+    ----------
+    name : str
+        As tables call it.
+    fit : RecordFit
+    visible : collection of int
+        Modes that the record shows.
+    reasons : mapping of str to str
+        Why an order is not to be believed; its coefficient shares the reason.
+    intervals : mapping of str to (float, float)
+        95 % intervals of orders that are better than those of the fit.
+    unexplained : str, optional
+        Why nothing is.
+    """
+    flags: dict[str, str] = {
+        name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
+    }
+    return Headline(
+        name=name,
+        fit=fit,
+        parameters={
+            each: _parameter(fit, each, unexplained or flags.get(each), intervals.get(each))
+            for each in fit.parameters
+            if fit.structure.has(each)
+        },
+        sizes=tuple(
+            # A loss factor is known without its order; a coefficient alone belongs to it.
+            _size(
+                each,
+                size,
+                unexplained or (reasons.get(_NAMES[each][1]) if size.omega_rad_s is None else None),
+            )
+            for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
+            if size is not None
+        ),
+        modes=tuple(_mode(mode, visible, unexplained) for mode in fit.modes),
+        structures=((name, "selected"),),
+        simpler=None,
+        explained=unexplained is None,
+    )
+
+
+def structures(field: Field, fractional: frozenset[str]) -> tuple[tuple[str, StructureStatus], ...]:
+    """Say which structures a record excludes, and which would do.
+
+    A special case of the freest structure on the same beam is excluded by the likelihood ratio;
+    whatever is no special case of it, where its likelihood is as much lower, and its BIC is higher
+    than the lowest by 10. One that explains the record with more than it takes is not excluded.
+    What fixes an order at 1 that the record excludes is excluded with it.
+
+    Parameters
+    ----------
+    field : Field
+        With the candidates ranked.
+    fractional : frozenset of str
+        Orders of which 1 is excluded.
+    """
+    return tuple((each.name, _status(field, each, fractional)) for each in field.candidates)
+
+
+def _status(field: Field, candidate: Candidate, fractional: frozenset[str]) -> StructureStatus:
+    freest = field.freest
+    if candidate is freest:
+        return "selected"
+    simpler = set(candidate.structure.free) < set(freest.structure.free)
+    if not simpler or candidate.kind != freest.kind:
+        behind = candidate.deviance - freest.deviance > EXCLUDED[0]
+        worse = candidate.bic > field.best.bic + STRONG
+        return "excluded" if behind and worse else "compatible"
+    if any(
+        candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
+        for order in fractional
+    ):
+        return "excluded"
+    lacks = freest.parameters - candidate.parameters
+    limit = EXCLUDED[min(lacks, len(EXCLUDED)) - 1]
+    return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
+
+
+def _simpler(field: Field, fractional: frozenset[str]) -> Simpler | None:
+    """Find the simplest structure that would do: of those compatible on the same beam."""
+    freest = field.freest
+    would_do = [
+        each
+        for each in field.candidates
+        if each.kind == freest.kind
+        and each.parameters < freest.parameters
+        and _status(field, each, fractional) == "compatible"
+    ]
+    if not would_do:
+        return None
+    best = min(would_do, key=lambda each: each.bic)
+    fixed = {
+        order: best.structure.fixed[order]  # type: ignore[index]
+        for order, coefficient in COEFFICIENT_OF.items()
+        if order in best.structure.fixed and coefficient in best.structure.free
+    }
+    return Simpler(
+        name=best.name,
+        fixed=fixed,
+        parameters={
+            name: _parameter(best.fit, name, None, None)
+            for name in best.fit.parameters
+            if best.structure.has(name) and name not in fixed
+        },
+    )
+
+
+def _parameter(
+    fit: RecordFit, name: str, reason: str | None, interval: tuple[float, float] | None
+) -> Quantity:
+    free = name in fit.interval
+    ends = interval or fit.interval.get(name)
+    flag = reason
+    if flag is None and name in fit.at_bounds and ends is None:
+        flag = _AT_EDGE
+    if flag is None and free and ends is None:
+        flag = _NOT_DETERMINED
+    return Quantity(fit.parameters[name], fit.std[name] if free else 0.0, ends, flag)
+
+
+def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
+    # Positive, and uncertain by a factor.
+    spread = _NORMAL_95 * size.std / size.value
+    ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
+    return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
+
+
+def _doubted_by(told: Headline, other: Candidate) -> Headline:
+    """Flag what another kind of rig, which explains the record as well, would have elsewhere."""
+    flag = f"type {other.name} explains the record as well, and has it elsewhere"
+    values = other.fit.parameters
+
+    def elsewhere(quantity: Quantity, value: float) -> bool:
+        low, high = quantity.interval_95 or (-math.inf, math.inf)
+        return not low <= value <= high
+
+    def moved(mine: Quantity, value: float) -> Quantity:
+        return mine.flagged(flag) if elsewhere(mine, value) else mine
+
+    parameters = {
+        name: moved(each, values[name]) if name in values else each
+        for name, each in told.parameters.items()
+    }
+    sizes = tuple(
+        each.flagged(flag) if elsewhere(each.size, _loss(values, each)) else each
+        for each in told.sizes
+    )
+    theirs = {mode.number: mode for mode in other.fit.modes}
+
+    modes = tuple(
+        replace(
+            mode,
+            frequency_hz=moved(mode.frequency_hz, theirs[mode.number].frequency_hz),
+            damping_ratio=moved(mode.damping_ratio, theirs[mode.number].damping_ratio),
+        )
+        if mode.number in theirs
+        else mode
+        for mode in told.modes
+    )
+    return replace(told, parameters=parameters, sizes=sizes, modes=modes)
+
+
+def _loss(values: Mapping[str, float], each: Size) -> float:
+    """Loss factor of a damping at the frequency of a size, or its coefficient."""
+    coefficient, order = _NAMES[each.damping]
+    omega = each.omega_rad_s
+    if omega is None:
+        return values[coefficient]
+    stored = 1.0 if each.damping == "internal" else values["density_over_stiffness"] * omega**2
+    lost = values[coefficient] * math.pow(omega, values[order])
+    return lost * math.sin(math.pi / 2 * values[order]) / stored
+
+
+def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> Mode:
+    shown = mode.number in visible
+    if reason is None and not shown:
+        reason = "computed from the model: the record does not show this mode"
+    return Mode(
+        mode.number,
+        _symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
+        _symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
+        shown,
+    )
+
+
+def _symmetric(value: float, std: float, reason: str | None) -> Quantity:
+    half = _NORMAL_95 * std
+    return Quantity(value, std, (value - half, value + half), reason)
+
+
+class JudgedOrder(Protocol):
+    """What is known of one order, from one record or from all of a campaign."""
+
+    @property
+    def order(self) -> str:
+        """Either "alpha" or "lambda"."""
+
+    @property
+    def status(self) -> str:
+        """As `OrderVerdict` has it."""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """95 %."""
+
+
+def headline_json(
+    file: str | None,
+    told: Numbers,
+    orders: Iterable[JudgedOrder],
+    findings: Iterable[Finding],
+) -> dict[str, Any]:
+    """Write a headline as the JSON document has it.
+
+    Parameters
+    ----------
+    file : str or None
+        None for the estimate of a whole campaign.
+    told : Numbers
+    orders : iterable of JudgedOrder
+    findings : iterable of Finding
+
+    Returns
+    -------
+    dict
+        Numbers may be not finite.
+    """
+    return {
+        "file": file,
+        "type": told.name,
+        "parameters": {name: each.as_json() for name, each in told.parameters.items()},
+        "sizes": [
+            {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
+            for each in told.sizes
+        ],
+        "modes": [
+            {
+                "mode": each.number,
+                "frequency_hz": each.frequency_hz.as_json(),
+                "damping_ratio": each.damping_ratio.as_json(),
+            }
+            for each in told.modes
+        ],
+        "structures": [{"type": name, "status": status} for name, status in told.structures],
+        "orders": {
+            each.order: {
+                "status": each.status,
+                "interval_95": None if each.interval is None else list(each.interval),
+            }
+            for each in orders
+        },
+        "conditional": None
+        if told.simpler is None
+        else {
+            "type": told.simpler.name,
+            "on": dict(told.simpler.fixed),
+            "parameters": {n: each.as_json() for n, each in told.simpler.parameters.items()},
+        },
+        "named": [
+            {
+                "what": each.kind,
+                "value": each.value,
+                "interval_95": None if each.interval is None else list(each.interval),
+                "sentence": each.sentence,
+            }
+            for each in findings
+        ],
+    }

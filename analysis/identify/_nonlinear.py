@@ -1,0 +1,323 @@
+"""Stiffness and damping that depend on the deflection: their torque, and a search for them.
+
+What a mode adds to the torque when its stiffness or its damping depends on the deflection.
+
+Mode i, relative to its root, is driven by the angle; a further restoring force n acts on it::
+
+    p r + k⁴ (c r + n) = -p angle        p = rho/EI s² + gamma s^lambda,  c = 1 + zeta s^alpha
+    torque added = -a² EI p k⁴ n / (p + c k⁴)
+
+with, relative to the largest deflection R and the largest speed V that the mode reaches,
+
+* ``n = e r³ / R²``: stiffness that rises by the share e at R; acts at once and three times the
+  drive's frequency (odd harmonics);
+* ``n = e r² / R``: stiffness that differs from side to side; even harmonics;
+* ``n = 2 e r'|r'| / (omega V)``: drag that grows with the square of the speed, as of air; the
+  damping ratio rises by e at V.
+
+To first order in e these are columns of known shape and unknown size. Where e is not small, r is
+that of the mode with the force: found by repeated substitution.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from analysis.identify._candidates import FREE_STIFFNESS
+from analysis.identify._data import fast_length
+from analysis.identify._predictor import torque_channel
+from analysis.identify._refit import Refit, unexplained_part
+from analysis.identify._residual_tests import SURE
+from analysis.identify._verdict import STRONG
+from rigd.beam import clamped_free_eigenvalues, participation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._predictor import Plant
+    from analysis.identify._problem import Comparison
+
+Kind = Literal["cubic stiffness", "quadratic stiffness", "quadratic drag"]
+KINDS: Final[tuple[Kind, ...]] = ("cubic stiffness", "quadratic stiffness", "quadratic drag")
+
+_OVERSAMPLING: Final = 3
+"""The band ends at 0.4 of the rate: up to three times its end nothing folds back into it."""
+
+_PADDED: Final = 1.5
+_DECAY: Final = 9.0
+_SUBSTITUTIONS: Final = 12
+_CONVERGED: Final = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One restoring force that is not linear, of one mode."""
+
+    kind: Kind
+    mode: int
+
+
+class ModalForces:
+    """Columns of a record: torque by restoring forces of unit size.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    plant : Plant
+        The linear part.
+    """
+
+    __slots__ = ("_comparison", "_growth", "_length", "_p", "_plant", "_s", "_samples")
+
+    def __init__(self, comparison: Comparison, plant: Plant) -> None:
+        n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
+        self._comparison, self._plant, self._samples = comparison, plant, n
+        self._length = fast_length(int(np.ceil(_PADDED * n)))
+        # On s = sigma + j omega what wraps round has decayed: see `Prediction`.
+        sigma = _DECAY * rate_hz / self._length
+        bins = np.arange(self._length // 2 + 1)
+        self._s = sigma + 2j * np.pi * rate_hz / self._length * bins
+        fine = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
+        self._growth = np.exp(sigma * fine)
+        damping, ratio = plant.damping, plant.beam.density_over_stiffness
+        self._p = ratio * self._s**2 + damping.gamma * self._s**damping.lambda_
+
+    def column(self, term: Term, size: float = 0.0) -> NDArray[np.complex128]:
+        """Spectrum, shape (K,), of the torque by a force, divided by its `size`.
+
+        Not finite where the repeated substitution leads nowhere: so large a force is not known.
+
+        Parameters
+        ----------
+        term : Term
+        size : float
+            Size e at which the mode moves; 0 for the first order.
+        """
+        k, stiffness = self._stiffness(term.mode)
+        resists = self._p + stiffness
+        angle = self._comparison.angle_rad
+        decayed = angle / self._growth[::_OVERSAMPLING]
+        linear = -self._p / resists * np.fft.rfft(decayed, self._length)
+        force = self._force(term.kind, linear, linear)
+        if size:
+            follows = -size * k / resists
+            with np.errstate(over="ignore", invalid="ignore"):
+                for _ in range(_SUBSTITUTIONS):
+                    again = self._force(term.kind, linear + follows * force, linear)
+                    change, most = np.linalg.norm(again - force), np.linalg.norm(again)
+                    force = again
+                    if not np.isfinite(most):
+                        return np.full(self._comparison.frequency_hz.size, np.nan + 0j)
+                    if change < _CONVERGED * most:
+                        break
+        beam = self._plant.beam
+        share = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
+        torque = -share * k * self._p / resists * force * torque_channel(self._plant, self._s)
+        in_time = np.fft.irfft(torque, self._length)[: self._samples]
+        in_time *= self._growth[::_OVERSAMPLING]
+        spectrum: NDArray[np.complex128] = self._comparison.spectrum(in_time[self._comparison.kept])
+        return spectrum
+
+    def _stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
+        """k⁴ of a mode with its offset, and with its damping."""
+        plant = self._plant
+        k = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
+        if 2 <= mode <= 1 + len(plant.stiffness_offsets):
+            k *= 1 + plant.stiffness_offsets[mode - 2]
+        damped = k * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
+        return k, damped.astype(np.complex128)
+
+    def _force(
+        self, kind: Kind, moved: NDArray[np.complex128], linear: NDArray[np.complex128]
+    ) -> NDArray[np.complex128]:
+        """Transform of n, shape (length // 2 + 1,), for a motion; the linear one sets R and V."""
+        if kind == "quadratic drag":
+            speed = self._fine(moved * self._s)
+            fastest = np.abs(self._fine(linear * self._s)).max()
+            middle = fastest / np.abs(self._fine(linear)).max()
+            n = 2 * speed * np.abs(speed) / (fastest * middle)
+        else:
+            deflection = self._fine(moved)
+            largest = np.abs(self._fine(linear)).max()
+            power = 3 if kind == "cubic stiffness" else 2
+            n = deflection**power / largest ** (power - 1)
+        n /= self._growth
+        spectrum = np.fft.rfft(n, _OVERSAMPLING * self._length)[: self._s.size]
+        return spectrum / _OVERSAMPLING
+
+    def _fine(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Values over the record at the multiple of the rate."""
+        fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
+        values: NDArray[np.float64] = fine[: self._growth.size] * self._growth
+        return values
+
+
+_MOST_TERMS: Final = 2
+_ROUNDS: Final = 6
+_SETTLED: Final = 0.005
+_GAIN: Final = SURE**2 + 2 * math.log(30)
+"""Deviance that a term must save: three forces on three modes and three rounds are tried."""
+
+_HINT: Final = 6.0
+"""Deviance that the most wanted term must promise before any is tried; chance promises as much in
+one record of ten."""
+
+_HOPELESS: Final = 2000.0
+"""Deviance behind the best, to first order, from which no substitution leads back."""
+
+_EXPLAINED: Final = 0.5
+"""Share of what exceeds chance that the terms must explain; else something else is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class NonlinearForce:
+    """A restoring force that is not linear.
+
+    Attributes
+    ----------
+    term : Term
+    size : float
+        Share of the stiffness at the largest deflection, or damping ratio at the largest speed.
+    std : float
+    """
+
+    term: Term
+    size: float
+    std: float
+
+
+def nonlinear_forces(
+    field: Field, modes: tuple[int, ...]
+) -> tuple[Field, tuple[NonlinearForce, ...]]:
+    """Add forces one by one while each saves far more than chance would; fit all anew with them.
+
+    A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
+    order. Where the best candidate has these, the search also starts from those without. But even
+    then such a force leaves its trace, by which the best would gain; without one nothing is tried.
+
+    Parameters
+    ----------
+    field : Field
+        Without such forces.
+    modes : tuple of int
+        Modes that the record shows.
+
+    Returns
+    -------
+    field : Field
+        The one given, if there is nothing.
+    forces : tuple of NonlinearForce
+    """
+    best = field.best
+    here = field.refit(best.structure, best.uniform, best.fit.plant, extras=best.extras)
+    if _gain(best, here.cost, _most_wanted(field, here, modes, [])[1]) < _HINT:
+        return field, ()
+    for lead in _leads(field):
+        found, forces = _added(field, lead, modes)
+        if forces and found.bic < field.bic - STRONG and _explain(field, found):
+            return found, forces
+    return field, ()
+
+
+def _leads(field: Field) -> tuple[Candidate, ...]:
+    """Candidates to start from: the best, and before it those that are simpler."""
+    best = field.best
+    if best.uniform and "alpha" not in best.structure.free:
+        return (best,)
+    simple = (
+        c
+        for c in field.candidates
+        if c.uniform and c.extras == best.extras and c.structure in FREE_STIFFNESS
+    )
+    return (*simple, best)
+
+
+def _added(
+    field: Field, lead: Candidate, modes: tuple[int, ...]
+) -> tuple[Field, tuple[NonlinearForce, ...]]:
+    """Add forces to one candidate, then to all."""
+    terms: list[Term] = []
+    sizes = std = np.zeros(0)
+    best = field.best
+    here = field.refit(lead.structure, lead.uniform, lead.fit.plant, extras=lead.extras)
+    while len(terms) < _MOST_TERMS:
+        term, cost = _most_wanted(field, here, modes, terms)
+        behind = _gain(best, cost, best.fit.cost)
+        if term is None or _gain(best, here.cost, cost) < _GAIN or behind > _HOPELESS:
+            break
+        tried = _with_terms(field, here, [*terms, term], np.append(sizes, 0.0))
+        if tried is None or _gain(best, here.cost, tried[0].cost) < _GAIN:
+            break
+        terms.append(term)
+        here, sizes, std = tried
+    if not terms:
+        return field, ()
+    every = field.with_columns(here.columns, here.noise_here())
+    forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
+    return every, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
+
+
+def _gain(candidate: Candidate, before: float, after: float) -> float:
+    """Deviance saved between two sums of squares."""
+    return candidate.values * math.log(before / after)
+
+
+def _most_wanted(
+    field: Field, refit: Refit, modes: tuple[int, ...], taken: list[Term]
+) -> tuple[Term | None, float]:
+    """Find the term that to first order saves most, and the cost with it."""
+    projected = refit.objective.project(refit.objective.linearise(refit.x), field.noise.weight)
+    forces = ModalForces(field.comparison, refit.plant)
+    # Air that brakes the whole beam has been found already, and no mode is braked by itself.
+    kinds = KINDS if field.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
+    terms = [Term(kind, mode) for kind in kinds for mode in modes]
+    terms = [term for term in terms if term not in taken]
+    if not terms:
+        return None, projected.cost
+    at = refit.objective.linearise(refit.x)
+    known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
+    every = np.array([forces.column(term) for term in terms], dtype=np.complex128)
+    columns = unexplained_part(every * field.noise.weight, known)
+    squares = np.sum(np.abs(columns) ** 2, axis=1)
+    along = (columns.conj() @ projected.residual).real
+    saved = along**2 / np.maximum(squares, np.finfo(float).tiny)
+    most = int(np.argmax(saved))
+    return terms[most], max(projected.cost - float(saved[most]), 1e-3 * projected.cost)
+
+
+def _with_terms(
+    field: Field, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
+) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
+    """Fit with the columns of these terms, at the sizes that they turn out to have.
+
+    None if these are larger than the columns are known for.
+    """
+    std = np.zeros(sizes.size)
+    for _ in range(_ROUNDS):
+        forces = ModalForces(field.comparison, refit.plant)
+        of_terms = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
+        if not np.isfinite(of_terms).all():
+            return None
+        columns = np.concatenate([field.columns, of_terms])
+        refit = Refit.descend(
+            field.comparison, refit.objective.unknowns, refit.x, field.noise, columns
+        )
+        before = sizes
+        sizes, std = (values[len(field.columns) :] for values in refit.amplitudes())
+        if np.all(np.abs(sizes - before) < np.maximum(0.3 * std, _SETTLED * np.abs(sizes))):
+            break
+    return refit, sizes, std
+
+
+def _explain(without: Field, within: Field) -> bool:
+    """Whether the forces explain what the linear beam left, or at least half of it."""
+    power = np.abs(without.best.fit.residual) ** 2
+    before = without.best.fit.cost - without.best.fit.degrees_of_freedom
+    chance = SURE * math.sqrt(2 * power.size * 2)
+    after = within.best.fit.cost - within.best.fit.degrees_of_freedom
+    return after < max(_EXPLAINED * before, chance)

@@ -1,0 +1,481 @@
+"""The vector in which a fit searches, the way from it to a plant, and steps that suit it.
+
+Steps through the unknowns that follow what a record shows.
+
+Where damping is larger than the stiffness or inertia it adds to, loss and order make up for each
+other: what shows is the phase theta of ``1 ± size exp(j order pi/2)``, and at constant theta they
+trade over many powers of ten. A straight step leaves that valley at once, and a descent with
+straight steps takes a hundred of them. So a step is taken along ``ln tan(theta/2)`` and the order
+in place of ``ln loss`` and the order; where the damping is small the two are the same.
+
+The vector in which a whole-record fit searches, and the way from it to a plant.
+
+Damping of a low order acts as stiffness, damping of an order near 2 as inertia. With density and
+stiffness free, such damping and the beam can make up for each other over a long and curved
+valley, in which a descent takes hundreds of steps. So the unknowns are what a record shows
+directly; orders then change alone:
+
+* internal damping by its loss relative to the stiffness, ``ln(z sin(alpha pi/2))`` with
+  ``z = zeta omega_2^alpha`` at the undamped second mode, and ``alpha``;
+* external damping by its loss relative to the inertia, ``ln(g sin(lambda pi/2))`` with
+  ``g = gamma omega_1^lambda / (rho/EI omega_1²)`` at the undamped first mode, and ``lambda``;
+* the stiffness that counts with its damping, ``EI |1 + z exp(j alpha pi/2)|``, and likewise
+  density over stiffness, ``rho/EI |1 - g exp(j lambda pi/2)| / |1 + z exp(j alpha pi/2)|``, both
+  as logarithms relative to the nominal beam's;
+* the delay in ms, the tool's inertia relative to the nominal beam's, and the relative offsets of
+  the modes' stiffness;
+* of the `EXTRAS` those that a candidate carries: the root's compliance relative to the nominal
+  beam's L/EI, the tip's mass relative to its mass, time constants in ms, the clocks' difference in
+  units of 1e-5. To first order a tip mass does what density and stiffness do, and a filter what a
+  delay does. So where they are free, the other unknowns are those of a bare beam whose first mode
+  and torque are the same, and of the delay with the filter's own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import numpy as np
+
+from analysis.identify._predictor import (
+    EXTRAS,
+    FIRST_OFFSET,
+    SETTINGS,
+    Plant,
+    eigenvalues,
+    offset_name,
+)
+from analysis.models import ORDER_RANGE, SIZE_RANGE
+from rigd.beam import Beam, undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._predictor import Setting
+    from analysis.models import Structure
+
+_SHARE: Final = 0.5
+"""Of the way to order 0 or 2, in one step."""
+
+_NEXT_TO_NOTHING: Final = 1e-4
+"""Loss that may vanish in one step."""
+
+_LARGEST_GROWTH: Final = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Where steps from a vector of unknowns lead, and how far they may go.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (k,)
+        Bounds of the unknowns.
+    dampings : tuple of (int, int, bool)
+        Places of the loss and of the order of each damping whose order is free, and whether it adds
+        to the stiffness; otherwise it takes from the inertia.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    dampings: tuple[tuple[int, int, bool], ...]
+    straight: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, unknowns: Unknowns) -> Steps:
+        """Find the dampings in a vector of unknowns."""
+        names = unknowns.names
+        dampings = tuple(
+            (names.index(coefficient), names.index(order), coefficient == "zeta")
+            for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
+            if order in names
+        )
+        return cls(*unknowns.bounds, dampings)
+
+    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest step in each unknown, shape (k,).
+
+        Orders approach 0 and 2 by a share of the way at a time: what damping does goes with the
+        logarithm of that distance. Damping that has vanished keeps its order.
+        """
+        least, most = self.lower - x, self.upper - x
+        for loss, order, _ in self.dampings:
+            share = _SHARE if x[loss] > self.lower[loss] else 0.0
+            least[order] = max(least[order], -share * x[order])
+            most[order] = min(most[order], share * (2 - x[order]))
+        return least, most
+
+    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Point within the bounds that a step leads to, shape (k,).
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+        step : ndarray, shape (k,)
+            Within the `limits`; tangent to the way at `x`.
+        """
+        end = np.clip(x + step, self.lower, self.upper)
+        for i, j, elastic in self.dampings:
+            if step[i] != 0:
+                before, after = _turn(x[j], elastic), _turn(end[j], elastic)
+                most = math.exp(self.upper[i])
+                loss, turn = _along(math.exp(x[i]), float(step[i]), before, after, most)
+                end[i] = math.log(loss) if loss > 0 else self.lower[i]
+                if turn != after:
+                    end[j] = _order(turn, elastic)
+        clipped: NDArray[np.float64] = np.clip(end, self.lower, self.upper)
+        return clipped
+
+
+def _along(
+    loss: float, step: float, before: float, after: float, most: float
+) -> tuple[float, float]:
+    """Loss and turn to which a step of ``ln loss`` leads while the turn goes from before to after.
+
+    The turn comes out otherwise where no loss up to `most` shows at `after` what is to show: then
+    that largest loss is combined with the turn at which it does.
+    """
+    size = loss / math.sin(before)
+    real = 1 + size * math.cos(before)
+    # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
+    along = (step + size / math.sin(before) * (after - before)) / math.hypot(real, loss)
+    if along <= -1 and loss < _NEXT_TO_NOTHING:
+        return 0.0, after  # in proportion to its effect it would change sign
+    theta = math.atan2(loss, real)
+    theta = 2 * math.atan(math.tan(theta / 2) * math.exp(min(along, _LARGEST_GROWTH)))
+    if theta < after:
+        loss = math.sin(theta) / math.sin(after - theta) * math.sin(after)
+        if loss <= most:
+            return loss, after
+    return most, theta + math.asin(min(math.sin(theta) ** 2 / most, 1.0))
+
+
+def _turn(order: float, elastic: bool) -> float:
+    """Phase of the damping against the stiffness or the inertia, 0 to pi."""
+    turn = math.pi / 2 * float(order)
+    return turn if elastic else math.pi - turn
+
+
+def _order(turn: float, elastic: bool) -> float:
+    return (turn if elastic else math.pi - turn) / (math.pi / 2)
+
+
+_BEAM_RANGE: Final = math.log(3.0)
+_DELAY_UNIT_S: Final = 1e-3
+_DELAY_RANGE_S: Final = 0.02
+_OFFSET_RANGE: Final = 0.5
+_TIME_CONSTANT_UNIT_S: Final = 1e-3
+_CLOCK_UNIT: Final = 1e-5
+_EXTRA_RANGES: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
+    {
+        "root_compliance_rad_per_nm": (0.0, 0.5),
+        "tip_mass_kg": (0.0, 1.0),
+        "filter_time_constant_s": (0.0, 10.0),
+        "second_order_filter_time_constant_s": (0.0, 10.0),
+        "clock_rate_difference": (-100.0, 100.0),
+    }
+)
+_TIP: Final = "tip_mass_kg"
+_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
+FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
+    {"filter_time_constant_s": 1.0, "second_order_filter_time_constant_s": 2**0.5}
+)
+"""Delay of a filter at low frequency over its time constant."""
+
+_NEWTON_STEPS: Final = 30
+_GRADIENT_NAMES: Final[Mapping[str, str]] = {
+    "density_over_stiffness": "ln_density_over_stiffness",
+    "bending_stiffness_n_m2": "ln_stiffness",
+}
+_QUARTER_TURN: Final = math.pi / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Unknowns:
+    """Vector of unknowns of one structure: its damping, the free settings, offsets and extras.
+
+    Attributes
+    ----------
+    structure : Structure
+    nominal : Plant
+        Settings that are not free stay at its values; its damping does not matter.
+    free : tuple of str
+        Free settings, in the order of `SETTINGS`.
+    offsets : tuple of str
+        Free offsets of the modes' stiffness: "stiffness_offset_2", ….
+    omega_rad_s : tuple of float
+        Undamped first and second mode of the nominal beam.
+    extras : tuple of str
+        Free extras, in the order of `EXTRAS`.
+    """
+
+    structure: Structure
+    nominal: Plant
+    free: tuple[Setting, ...]
+    offsets: tuple[str, ...]
+    omega_rad_s: tuple[float, float]
+    extras: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        structure: Structure,
+        nominal: Plant,
+        free: tuple[Setting, ...],
+        modes: int = 1,
+        extras: Collection[str] = (),
+    ) -> Unknowns:
+        """Unknowns of a structure with some settings free, and the stiffness of all but mode 1.
+
+        Parameters
+        ----------
+        modes : int
+            How many modes count; with 1 the beam is uniform.
+        extras : collection of str
+            Of `EXTRAS`, those that are free.
+        """
+        first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
+        ordered = tuple(name for name in SETTINGS if name in free)
+        offsets = tuple(offset_name(mode) for mode in range(FIRST_OFFSET, modes + 1))
+        free_extras = tuple(name for name in EXTRAS if name in extras)
+        return cls(structure, nominal, ordered, offsets, (first, second), free_extras)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the vector's order."""
+        return (*self.structure.free, *self.free, *self.offsets, *self.extras)
+
+    @property
+    def gradient_names(self) -> tuple[str, ...]:
+        """The same as the prediction names what it differentiates by."""
+        return tuple(_GRADIENT_NAMES.get(name, name) for name in self.names)
+
+    @property
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper bounds, shape (k,)."""
+        size = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
+        delay = _DELAY_RANGE_S / _DELAY_UNIT_S
+        ranges = {
+            "zeta": size,
+            "alpha": ORDER_RANGE,
+            "gamma": size,
+            "lambda": ORDER_RANGE,
+            "density_over_stiffness": (-_BEAM_RANGE, _BEAM_RANGE),
+            "bending_stiffness_n_m2": (-_BEAM_RANGE, _BEAM_RANGE),
+            "delay_s": (-delay, delay),
+            "tool_inertia_kg_m2": (0.0, 1.0),
+        }
+        ranges |= dict.fromkeys(self.offsets, (-_OFFSET_RANGE, _OFFSET_RANGE))
+        ranges |= _EXTRA_RANGES
+        low, high = zip(*(ranges[name] for name in self.names), strict=True)
+        return np.array(low), np.array(high)
+
+    def start(self, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vector with damping as `analysis.paper._fit` gives it, settings at their nominal values.
+
+        Parameters
+        ----------
+        sizes : ndarray, shape (len(structure.free),)
+            ``ln z``, ``alpha``, ``ln g`` and ``lambda``, those that are free.
+        """
+        nominal = self.nominal
+        at: dict[str, float] = {
+            **dict(self.structure.fixed.items()),
+            **dict(zip(self.structure.free, sizes.tolist(), strict=True)),
+            "density_over_stiffness": 0.0,
+            "bending_stiffness_n_m2": 0.0,
+            "delay_s": nominal.delay_s / _DELAY_UNIT_S,
+            "tool_inertia_kg_m2": nominal.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
+            **dict.fromkeys(self.offsets, 0.0),
+            **{name: value / self.units[name] for name, value in nominal.extras.items()},
+        }
+        for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
+            if coefficient in self.names:
+                at[coefficient] += math.log(math.sin(_QUARTER_TURN * at[order]))
+        return np.array([at[name] for name in self.names])
+
+    def plant(self, x: NDArray[np.float64]) -> Plant:
+        """Everything the prediction depends on, at `x`."""
+        values = self._values(x)[0]
+        ratio, stiffness = values["density_over_stiffness"], values["bending_stiffness_n_m2"]
+        return Plant(
+            beam=Beam(self.nominal.beam.length_m, ratio * stiffness, stiffness),
+            damping=self.structure.damping({name: values[name] for name in self.structure.free}),
+            delay_s=values["delay_s"],
+            tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
+            stiffness_offsets=tuple(values[name] for name in self.offsets),
+            **{name: values[name] for name in EXTRAS},
+        )
+
+    def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """All parameters at `x`, those of `names` even where they are neutral."""
+        plant = self.plant(x)
+        return plant.parameters | {name: plant.extras[name] for name in self.extras}
+
+    @property
+    def units(self) -> dict[str, float]:
+        """What 1 stands for in the unknowns that are linear."""
+        beam = self.nominal.beam
+        return {
+            "delay_s": _DELAY_UNIT_S,
+            "tool_inertia_kg_m2": beam.inertia_kg_m2,
+            **dict.fromkeys(self.offsets, 1.0),
+            "root_compliance_rad_per_nm": beam.length_m / beam.bending_stiffness_n_m2,
+            "tip_mass_kg": beam.density_kg_per_m * beam.length_m,
+            "filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
+            "second_order_filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
+            "clock_rate_difference": _CLOCK_UNIT,
+        }
+
+    def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
+
+        Those of `LOGARITHMIC` count as logarithms.
+        """
+        derivative: NDArray[np.float64] = self._values(x)[1]
+        return derivative
+
+    def gradient_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Differentiate what the prediction is differentiated by (`gradient_names`).
+
+        That is zeta and gamma themselves, not their logarithms.
+        """
+        values, derivative = self._values(x)
+        coefficients = ("zeta", "gamma")
+        units = [values[name] if name in coefficients else 1.0 for name in self.names]
+        scaled: NDArray[np.float64] = derivative * np.array(units)[:, None]
+        return scaled
+
+    def _values(self, x: NDArray[np.float64]) -> tuple[dict[str, float], NDArray[np.float64]]:
+        """All parameters at `x`, and `estimates_by_unknowns`."""
+        place = {name: i for i, name in enumerate(self.names)}
+        given: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
+        values: dict[str, float] = {
+            **self.nominal.parameters,
+            **self.nominal.extras,
+            **dict(self.structure.fixed.items()),
+        }
+        derivative = np.eye(x.size)
+        first, second = self.omega_rad_s
+        # How much the damping adds to stiffness and inertia, as logarithms, and who moves that.
+        stiffening, inertial = np.zeros((2, x.size + 1))
+        if self.structure.internal:
+            values["alpha"] = order = given.get("alpha", values["alpha"])
+            ln_z, slope = _size(given["zeta"], order)
+            values["zeta"] = math.exp(ln_z - order * math.log(second))
+            stiffening = self._addition(ln_z, order, 1.0, "zeta", "alpha", slope)
+            if "alpha" in place:
+                derivative[place["zeta"], place["alpha"]] = slope - math.log(second)
+        if self.structure.external:
+            values["lambda"] = order = given.get("lambda", values["lambda"])
+            ln_g, slope = _size(given["gamma"], order)
+            inertial = self._addition(ln_g, order, -1.0, "gamma", "lambda", slope)
+            if "lambda" in place:
+                derivative[place["gamma"], place["lambda"]] = slope - math.log(first)
+        for name, (moved, slope) in zip(_BEAM, _bare_beam(given.get(_TIP, 0.0)), strict=True):
+            if name in place and _TIP in place:
+                values[name] *= math.exp(moved)
+                derivative[place[name], place[_TIP]] = slope
+        for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
+            if name in place:
+                added = sign * stiffening - (inertial if sign > 0 else 0.0)
+                values[name] *= math.exp(given[name] + added[-1])
+                derivative[place[name]] += added[:-1]
+        if self.structure.external:
+            ratio = values["density_over_stiffness"]
+            values["gamma"] = ratio * math.exp(ln_g + (2 - values["lambda"]) * math.log(first))
+            if "density_over_stiffness" in place:
+                derivative[place["gamma"]] += derivative[place["density_over_stiffness"]]
+        units = self.units
+        for name in units.keys() & place.keys():
+            values[name] = given[name] * units[name]
+            derivative[place[name], place[name]] = units[name]
+        for name, share in FILTER_DELAYS.items():
+            if name in place and "delay_s" in place:
+                values["delay_s"] -= share * values[name]
+                derivative[place["delay_s"], place[name]] = -share * units[name]
+        return values, derivative
+
+    def _addition(
+        self, ln_size: float, order: float, sign: float, coefficient: str, of: str, slope: float
+    ) -> NDArray[np.float64]:
+        """Slopes of ``ln |1 ± size exp(j order pi/2)|`` by the unknowns, and last the value.
+
+        `slope` is that of `ln_size` by the order at constant loss.
+        """
+        size, angle = sign * math.exp(ln_size), _QUARTER_TURN * order
+        square = 1 + 2 * size * math.cos(angle) + size * size
+        by_ln_size = size * (math.cos(angle) + size) / square
+        addition = np.zeros(len(self.names) + 1)
+        addition[self.names.index(coefficient)] = by_ln_size
+        if of in self.names:
+            turning = -_QUARTER_TURN * size * math.sin(angle) / square
+            addition[self.names.index(of)] = by_ln_size * slope + turning
+        addition[-1] = math.log(square) / 2
+        return addition
+
+
+def _size(ln_loss: float, order: float) -> tuple[float, float]:
+    """``ln size`` of a damping of that loss, and its slope by the order."""
+    angle = _QUARTER_TURN * order
+    return ln_loss - math.log(math.sin(angle)), -_QUARTER_TURN / math.tan(angle)
+
+
+def bare_beam(share: float) -> tuple[float, float]:
+    """Logarithms of rho/EI and EI of a beam with a tip mass, over those of one without.
+
+    Of one whose first mode is at the same frequency, and whose torque is the same to first order.
+
+    Parameters
+    ----------
+    share : float
+        Of the tip's mass, relative to the nominal beam's.
+    """
+    (ln_ratio, _), (ln_stiffness, _) = _bare_beam(share)
+    return ln_ratio, ln_stiffness
+
+
+def ln_stiffness_with_tip(mode: int, share: float) -> float:
+    """Logarithm of the stiffness of a mode with a tip mass over that without, and all else equal.
+
+    Parameters
+    ----------
+    mode : int
+        From 1.
+    share : float
+        Of the tip's mass, relative to the beam's.
+    """
+    return _with_tip(float(eigenvalues(mode)[-1]), share)[0]
+
+
+def _bare_beam(share: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Give the same as `bare_beam`, each with its slope by the share."""
+    return _with_tip(float(eigenvalues(1)[0]), share), (share, 1.0)
+
+
+def _with_tip(bare: float, share: float) -> tuple[float, float]:
+    """Fourth power of a mode's root over that of the bare beam: logarithm, and slope by share."""
+    z = bare
+    for _ in range(_NEWTON_STEPS if share else 0):
+        value, by_z, _ = _tip_equation(z, share)
+        z -= value / by_z
+        if abs(value / by_z) < 1e-15 * z:
+            break
+    _, by_z, by_share = _tip_equation(z, share)
+    return 4 * math.log(z / bare), -4 * by_share / (by_z * z)
+
+
+def _tip_equation(z: float, share: float) -> tuple[float, float, float]:
+    """``1 + cos z cosh z - share z (sin z cosh z - cos z sinh z)``, its slopes by z and share."""
+    sine, cosine, sinh, cosh = math.sin(z), math.cos(z), math.sinh(z), math.cosh(z)
+    pinned = sine * cosh - cosine * sinh
+    return (
+        1 + cosine * cosh - share * z * pinned,
+        -pinned - share * (pinned + 2 * z * sine * sinh),
+        -z * pinned,
+    )

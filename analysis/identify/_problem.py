@@ -1,0 +1,552 @@
+"""The least-squares problem of a record: what of it can be compared, and the whitened residual.
+
+What of the motor's angle follows its reference, and what the rig's controller made of noise.
+
+The controller feeds the measured torque forward and the measured angle back, so the motor moves
+with the noise of the sensor. A fit of the torque to all of the angle takes part of that noise for
+response: in a closed loop noise and input are correlated, and a fit that leaves out all beyond its
+band is biased by it (U. Forssell and L. Ljung, Automatica 35 (1999) 1215-1241): a chirp's tool
+inertia by 1.4 and its stiffness by 0.24 standard deviations at 1e-2 N·m. The reference was known
+beforehand and owes nothing to the noise, so only what follows it is taken for input. The torque
+that the rest makes is computed with the beam found so far, and taken out. Fitting what remains is
+the instrumental-variable estimate with the reference as instrument, which is unbiased whatever that
+beam was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._data import Decimation, MeasurementError, fast_length, fast_length_below
+from analysis.identify._drag_torque import DragExpansion, DragResponse
+from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
+from analysis.identify._optimizer import NormalEquations, Recent
+from analysis.identify._predictor import Prediction
+from analysis.models import LARGEST_SHARE_OF_RATE
+from rigd.beam import undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._data import Measurement
+    from analysis.identify._drag_torque import DragLaw
+    from analysis.identify._free_decay import Pole
+    from analysis.identify._hum import Hum
+    from analysis.identify._parametrization import Unknowns
+    from analysis.identify._predictor import Plant
+
+_MEMORY_S: Final = 0.4
+"""Standard deviation of the window over the lags of the correlations, that is how long the loop may
+remember its reference: 0.4 Hz in frequency. A longer one lets noise pass for response; what a
+shorter one misses of a sharp feature of the loop costs a little precision and nothing else."""
+
+_RETURN_S: Final = 4.0
+"""For which both are taken to return to 0 after the record. A reference that ended elsewhere and
+fell to 0 at once would do so without the lag of the loop."""
+
+_FLOOR: Final = 1e-12
+"""Of the reference's largest power: with less there is none at a frequency."""
+
+
+def following(
+    angle_rad: NDArray[np.float64], reference_rad: NDArray[np.float64], rate_hz: float
+) -> NDArray[np.float64]:
+    """Part of the angle that follows the reference, shape (n,).
+
+    By the response that windowed correlations give (R. B. Blackman and J. W. Tukey, Bell System
+    Technical Journal 37 (1958) 185-282): at each frequency the least squares over its neighbours.
+
+    Parameters
+    ----------
+    angle_rad, reference_rad : ndarray, shape (n,)
+        Both taken as 0 before.
+    rate_hz : float
+    """
+    way_back = 0.5 * (1 + np.cos(np.linspace(0, np.pi, round(_RETURN_S * rate_hz) + 1)[1:]))
+    length = fast_length(2 * (angle_rad.size + way_back.size))
+    angle, reference = (
+        np.fft.rfft(np.concatenate([values, values[-1] * way_back]), length)
+        for values in (angle_rad, reference_rad)
+    )
+    lag_s = np.fft.fftfreq(length) * (length / rate_hz)
+    window = np.exp(-0.5 * (lag_s / _MEMORY_S) ** 2)
+    across, own = (
+        np.fft.rfft(window * np.fft.irfft(power, length))
+        for power in (angle * reference.conj(), np.abs(reference) ** 2)
+    )
+    if not own.real.max() > 0:
+        return np.zeros(angle_rad.size)
+    response = across / np.maximum(own.real, _FLOOR * own.real.max())
+    followed: NDArray[np.float64] = np.fft.irfft(response * reference, length)[: angle_rad.size]
+    return followed
+
+
+_FEWEST_BINS: Final = 50
+_LARGEST_REST: Final = 0.3
+"""Share of the angle's power that may be apart from the reference. With more it was not this
+reference that the motor followed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One record in one band, ready to be compared with any plant.
+
+    Attributes
+    ----------
+    angle_rad, torque_nm : ndarray, shape (m,)
+        Both channels in the band at the decimated rate; unknown torque filled by what is expected.
+    decimation : Decimation
+    kept : slice
+        Samples that are compared.
+    prediction : Prediction
+    bins : slice
+        Bins of the residual's transform that lie in the band.
+    frequency_hz : ndarray, shape (K,)
+    visible_modes : int
+        Modes of the nominal beam within the band, whose free decay is projected out.
+    decays : DecaySpectra
+    apart_nm : ndarray, shape (samples,)
+        Torque that was taken out because it followed no reference, at the samples kept.
+    apart_at_unknown_nm : ndarray, shape (u,)
+        The same at the ticks whose torque is unknown.
+    hum : tuple of Hum
+        What was taken out besides, as well as it was known; the rest of it is projected out.
+    rest_rad : ndarray, shape (m,), or float
+        Angle that followed no reference, 0 where all of it counts.
+    rest_nm, rest_at_unknown_nm : ndarray or float
+        Torque that was taken out for it, at the samples kept and at the ticks without torque.
+    drag : DragExpansion, optional
+        The torque by drag that was taken out, and what it changes by with the beam.
+    """
+
+    measurement: Measurement
+    angle_rad: NDArray[np.float64]
+    torque_nm: NDArray[np.float64]
+    decimation: Decimation
+    kept: slice
+    prediction: Prediction
+    bins: slice
+    frequency_hz: NDArray[np.float64]
+    visible_modes: int
+    decays: DecaySpectra
+    apart_nm: NDArray[np.float64] | float = 0.0
+    apart_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    hum: tuple[Hum, ...] = ()
+    rest_rad: NDArray[np.float64] | float = 0.0
+    rest_nm: NDArray[np.float64] | float = 0.0
+    rest_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    drag: DragExpansion | None = None
+
+    @classmethod
+    def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
+        """Bring a measurement into the band.
+
+        The mean of the residual is never compared: it is the torque sensor's zero.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used, or is too short for the band.
+        """
+        lowest_hz, highest_hz = band_hz
+        limit_hz = LARGEST_SHARE_OF_RATE * measurement.rate_hz
+        if not 0 <= lowest_hz < highest_hz <= limit_hz:
+            raise MeasurementError(
+                f"{measurement.name}: the band {lowest_hz:g}-{highest_hz:g} Hz is empty, negative "
+                f"or beyond {LARGEST_SHARE_OF_RATE:g} of the sampling rate ({limit_hz:g} Hz); "
+                "choose another --band."
+            )
+        measurement.check(highest_hz)
+        decimation = Decimation.to_band(measurement.rate_hz, highest_hz)
+        angle_rad = decimation.apply(measurement.angle_from_rest(highest_hz))
+        inside = decimation.inside(measurement.angle_rad.size)
+        samples = inside.stop - inside.start
+        if samples > 0:
+            samples = fast_length_below(samples)
+        all_hz = np.arange(samples // 2 + 1) * (decimation.rate_hz / max(samples, 1))
+        first = max(int(np.searchsorted(all_hz, lowest_hz)), 1)
+        bins = slice(first, int(np.searchsorted(all_hz, highest_hz, side="right")))
+        if bins.stop - bins.start < _FEWEST_BINS:
+            raise MeasurementError(
+                f"{measurement.name}: {measurement.angle_rad.size / measurement.rate_hz:.3g} s of "
+                f"record are too short for the band {lowest_hz:g}-{highest_hz:g} Hz: "
+                f"{max(bins.stop - bins.start, 0)} frequencies, at least {_FEWEST_BINS} are "
+                "needed; record longer or widen the band."
+            )
+        kept = slice(inside.start, inside.start + samples)
+        frequency_hz = all_hz[bins]
+        beam = measurement.beam
+        known, torque = measurement.torque_known, measurement.torque_nm
+        ticks = np.arange(torque.size)
+        interpolated = torque if known.all() else np.interp(ticks, ticks[known], torque[known])
+        return cls(
+            measurement=measurement,
+            angle_rad=angle_rad,
+            torque_nm=decimation.apply(interpolated),
+            decimation=decimation,
+            kept=kept,
+            prediction=Prediction(angle_rad, decimation.rate_hz, kept),
+            bins=bins,
+            frequency_hz=frequency_hz,
+            visible_modes=int(
+                np.sum(undamped_frequencies_rad_s(beam, 50) < 2 * np.pi * highest_hz)
+            ),
+            decays=DecaySpectra(samples, decimation.rate_hz, 2 * np.pi * frequency_hz),
+        )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return int(self.kept.stop - self.kept.start)
+
+    def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Transform of samples kept, shape (..., samples), in the band: (..., K)."""
+        return np.fft.rfft(values)[..., self.bins]
+
+    def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Turn a spectrum in the band, shape (K,), into the samples kept, shape (samples,)."""
+        every = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
+        every[self.bins] = spectrum
+        return np.fft.irfft(every, self.samples)
+
+    def followed_rad(self) -> NDArray[np.float64]:
+        """Part of the angle that follows the reference, shape (m,).
+
+        All of it without a reference, or with one that does not explain it.
+        """
+        reference_rad = self.measurement.reference_rad
+        if reference_rad is None:
+            return self.angle_rad
+        # Later samples fall to 0 with the filter's end, behind everything that is compared.
+        end = self.decimation.inside(self.measurement.angle_rad.size).stop
+        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])
+        followed = self.angle_rad.copy()
+        followed[:end] = following(
+            self.angle_rad[:end], reference_rad[:end], self.decimation.rate_hz
+        )
+        # By its speed: an angle that drifts follows no reference, and disturbs nothing.
+        own, apart = (
+            np.sum(np.diff(angle_rad[self.kept]) ** 2)
+            for angle_rad in (self.angle_rad, self.angle_rad - followed)
+        )
+        return followed if apart < _LARGEST_REST * own else self.angle_rad
+
+    def following_reference(self, plant: Plant) -> Comparison:
+        """Take for input only what follows the reference, and take out what the rest does.
+
+        Parameters
+        ----------
+        plant : Plant
+            As found so far. Its error adds to the noise and makes no bias.
+
+        Returns
+        -------
+        Comparison
+            `self` if all of the angle counts as such: see `followed_rad`.
+        """
+        followed = self.followed_rad()
+        if followed is self.angle_rad:
+            return self
+        split = replace(
+            self,
+            angle_rad=followed,
+            prediction=self.prediction.of_other(followed),
+            rest_rad=self.angle_rad - followed,
+        )
+        return split.with_rest_of(plant)
+
+    def with_rest_of(self, plant: Plant) -> Comparison:
+        """Take out what a plant makes of the angle that followed no reference, in place of before.
+
+        Parameters
+        ----------
+        plant : Plant
+        """
+        if not isinstance(self.rest_rad, np.ndarray):
+            return self
+        rest = self.prediction.of_other(self.rest_rad)
+        rest_nm = rest.torque(plant)[0]
+        at_unknown_nm = rest.torque_between(
+            plant, self.decimation.factor, self._places(~self.measurement.torque_known)
+        )[0]
+        torque_nm = self.torque_nm.copy()
+        torque_nm[self.kept] -= rest_nm - self.rest_nm
+        return replace(
+            self,
+            torque_nm=torque_nm,
+            apart_nm=self.apart_nm + (rest_nm - self.rest_nm),
+            apart_at_unknown_nm=self.apart_at_unknown_nm
+            + (at_unknown_nm - self.rest_at_unknown_nm),
+            rest_nm=rest_nm,
+            rest_at_unknown_nm=at_unknown_nm,
+        )
+
+    @property
+    def hum_nm(self) -> NDArray[np.float64] | float:
+        """Hum that was taken out, at the samples kept."""
+        return self._hum_at(np.arange(self.samples) / self.decimation.rate_hz)
+
+    def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
+        """Take out hum, in place of what was taken out before."""
+        other = replace(self, hum=hum)
+        more = other.hum_nm - self.hum_nm
+        ticks = self._places(~self.measurement.torque_known)
+        first_s = self.kept.start / self.decimation.rate_hz
+        time_s = ticks / self.measurement.rate_hz - first_s
+        torque_nm = self.torque_nm.copy()
+        torque_nm[self.kept] -= more
+        return replace(
+            other,
+            torque_nm=torque_nm,
+            apart_nm=self.apart_nm + more,
+            apart_at_unknown_nm=self.apart_at_unknown_nm
+            + (other._hum_at(time_s) - self._hum_at(time_s)),
+        )
+
+    def with_drag(self, plant: Plant, law: DragLaw) -> Comparison:
+        """Take the torque by drag out, and tell what it changes by.
+
+        Parameters
+        ----------
+        plant : Plant
+            The beam whose drag it is.
+        law : DragLaw
+
+        Raises
+        ------
+        DragError
+            The drag is too large to be followed.
+        """
+        # All that moves is braked, whether or not it followed a reference.
+        moved_rad = self.angle_rad + self.rest_rad
+        response = DragResponse(moved_rad, self.decimation.rate_hz, plant)
+        found = response.torque(law, range(1, self.visible_modes + 1))
+
+        def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return self.spectrum(values[..., self.kept])
+
+        unknown = self._places(~self.measurement.torque_known)
+        between = np.fft.irfft(
+            self.decimation.factor * np.fft.rfft(found.torque_nm),
+            self.decimation.factor * found.torque_nm.size,
+        )
+        return replace(
+            self,
+            torque_nm=self.torque_nm - found.torque_nm,
+            apart_nm=self.apart_nm + found.torque_nm[self.kept],
+            apart_at_unknown_nm=self.apart_at_unknown_nm + between[unknown],
+            drag=DragExpansion(
+                plant=plant,
+                law=law,
+                response=response,
+                band=band,
+                by_pole={mode: band(rows) for mode, rows in found.by_pole.items()},
+                by_external=band(found.by_external),
+                by_ln_density=band(found.by_ln_density),
+                by_delay=band(found.by_delay),
+                by_law=band(found.by_law),
+                speed_m_s=found.speed_m_s,
+                top_speed_m_s=found.top_speed_m_s,
+            ),
+        )
+
+    def _hum_at(self, time_s: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        return sum((hum.torque(time_s) for hum in self.hum), start=0.0)
+
+    def nuisance(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
+        """Spectra of what has amplitudes that nobody knows, shape (m, K).
+
+        Free decays, hum, and last a zero of the torque sensor that drifts in proportion to time:
+        the jump from the record's end to its beginning would leak into all bins.
+        """
+        hum = self.decays.hum([hum.frequency_hz for hum in self.hum])
+        drift = self.spectrum(np.linspace(-0.5, 0.5, self.samples))
+        return np.concatenate([self.decays.columns(poles), hum, drift[None]])
+
+    def filled(self, plant: Plant) -> Comparison:
+        """Put what `plant` predicts where the torque is unknown, so that it does not count there.
+
+        The squares that remain have their minimum where that of the known samples is, once the
+        fit has settled.
+        """
+        known = self.measurement.torque_known
+        if known.all():
+            return self
+        torque = self.measurement.torque_nm.copy()
+        torque[~known] = (
+            self.apart_at_unknown_nm
+            + self.prediction.torque_between(plant, self.decimation.factor, self._places(~known))[0]
+        )
+        torque_nm = self.decimation.apply(torque)
+        torque_nm[self.kept] -= self.apart_nm
+        return replace(self, torque_nm=torque_nm)
+
+    def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
+        """Compute what unknown torques would have given to the gradient's spectra, (k, K)."""
+        unknown = ~self.measurement.torque_known
+        lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
+        if unknown.any():
+            _, gradient = self.prediction.torque_between(
+                plant, self.decimation.factor, self._places(unknown), wrt
+            )
+            for row, values in zip(lost, gradient, strict=True):
+                only = np.zeros(unknown.size)
+                only[unknown] = values
+                row[:] = self.spectrum(self.decimation.apply(only)[self.kept])
+        return lost
+
+    def _places(self, ticks: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Ticks counted from the first decimated sample on."""
+        return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Residual, prediction minus measurement, and its derivatives at one point.
+
+    Attributes
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Not whitened.
+    jacobian : ndarray of complex, shape (k, K)
+        By the unknowns.
+    poles : tuple of Pole
+        Differentiated by the unknowns.
+    columns : ndarray of complex, shape (m, K)
+        Spectra of their free decays.
+    """
+
+    residual: NDArray[np.complex128]
+    jacobian: NDArray[np.complex128]
+    poles: tuple[Pole, ...]
+    columns: NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Projected:
+    """A linearisation whitened, with what free decay explains taken out.
+
+    Attributes
+    ----------
+    residual : ndarray of complex, shape (K,)
+        Real and imaginary parts of variance 1 where the noise is as assumed.
+    jacobian : ndarray of complex, shape (k, K)
+    amplitudes : ndarray, shape (m,)
+        Of the free decays, in N·m, at the first sample compared.
+    amplitude_gram : ndarray, shape (m, m)
+        Inverse covariance of the amplitudes.
+    """
+
+    residual: NDArray[np.complex128]
+    jacobian: NDArray[np.complex128]
+    amplitudes: NDArray[np.float64]
+    amplitude_gram: NDArray[np.float64]
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(np.vdot(self.residual, self.residual).real)
+
+    def normal_equations(self) -> NormalEquations:
+        """As the descent wants them."""
+        jacobian = _parts(self.jacobian)
+        return NormalEquations(
+            cost=self.cost,
+            gradient=jacobian @ _parts(self.residual),
+            hessian=jacobian @ jacobian.T,
+        )
+
+
+class Objective:
+    """Sum of squares of one structure on one record, as a function of the unknowns.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    unknowns : Unknowns
+    """
+
+    __slots__ = ("_recent", "comparison", "unknowns")
+
+    def __init__(self, comparison: Comparison, unknowns: Unknowns) -> None:
+        self.comparison = comparison
+        self.unknowns = unknowns
+        self._recent: Recent[Linearisation] = Recent()
+
+    def linearise(self, x: NDArray[np.float64]) -> Linearisation:
+        """Residual and derivatives at `x`; the last two points cost nothing again."""
+        return self._recent.at(x, self._linearise)
+
+    def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
+        comparison, unknowns = self.comparison, self.unknowns
+        plant, names = unknowns.plant(x), unknowns.gradient_names
+        torque, gradient = comparison.prediction.torque(plant, names)
+        chain = unknowns.gradient_by_unknowns(x)
+        poles = tuple(
+            Pole(pole.mode, pole.at_rad_s, pole.derivative @ chain)
+            for pole in mode_poles(plant, comparison.visible_modes, names)
+        )
+        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.kept])
+        jacobian = (chain.T @ _parts(comparison.spectrum(gradient))).view(np.complex128)
+        if comparison.drag is not None:
+            change, slopes = comparison.drag.beside(plant, poles, unknowns.names, chain)
+            residual += change
+            jacobian += slopes
+        return Linearisation(
+            residual=residual,
+            jacobian=jacobian,
+            poles=poles,
+            columns=comparison.nuisance(poles),
+        )
+
+    def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
+        """Whiten, and take out what free decay explains (variable projection).
+
+        The amplitudes that fit best at each point are linear in the residual; the Jacobian is
+        Kaufman's (BIT 15 (1975) 49-57), with the poles' motion.
+
+        Parameters
+        ----------
+        at : Linearisation
+        weight : ndarray, shape (K,), or float
+            That of `Noise`, or 1 not to whiten.
+        """
+        residual, jacobian = at.residual * weight, at.jacobian * weight
+        if not len(at.columns):
+            return Projected(residual, jacobian, np.zeros(0), np.zeros((0, 0)))
+        columns = _parts(at.columns * weight)
+        scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
+        scale[scale == 0] = 1.0  # a decay that is over at once
+        columns /= scale[:, None]
+        gram = columns @ columns.T
+        inverse = np.linalg.inv(gram + 1e-12 * np.eye(scale.size))
+        amplitudes = -inverse @ (columns @ _parts(residual))
+        jacobian += weight * self.comparison.decays.gradient(at.poles, amplitudes / scale)
+        parts = _parts(jacobian)
+        parts -= ((parts @ columns.T) @ inverse) @ columns
+        return Projected(
+            residual=residual + (amplitudes @ columns).view(np.complex128),
+            jacobian=jacobian,
+            amplitudes=amplitudes / scale,
+            amplitude_gram=gram * np.outer(scale, scale),
+        )
+
+    def normal_equations(
+        self, x: NDArray[np.float64], weight: NDArray[np.float64]
+    ) -> NormalEquations:
+        """Sum of squares at `x`, with what a Gauss-Newton step needs."""
+        return self.project(self.linearise(x), weight).normal_equations()
+
+
+def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Real and imaginary parts side by side, shape (..., 2 K), of the same memory.
+
+    Products of these are the real parts of those of the complex values, at half the price.
+    """
+    parts: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
+    return parts

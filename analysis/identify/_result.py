@@ -1,0 +1,178 @@
+"""What a whole-record fit finds, and how sure it is of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._noise import Line
+    from analysis.identify._predictor import Plant
+    from analysis.identify._problem import Comparison
+    from analysis.models import Structure
+
+
+@dataclass(frozen=True, slots=True)
+class DampingSize:
+    """Loss factor of a damping at the frequency where it depends least on its order.
+
+    Attributes
+    ----------
+    omega_rad_s : float or None
+        That frequency, not below the first mode; None if the order is fixed or not determined.
+    value, std : float
+        ``zeta omega^alpha sin(alpha pi/2)`` of internal damping, of external damping
+        ``gamma omega^lambda sin(lambda pi/2)`` over ``rho/EI omega²``: what is lost in a radian
+        over what is stored. Without that frequency zeta or gamma itself.
+    """
+
+    omega_rad_s: float | None
+    value: float
+    std: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModeEstimate:
+    """One mode of the beam on a motor that stands still, from the fitted plant."""
+
+    number: int
+    frequency_hz: float
+    """Of the free decay, 0 if over-damped."""
+    frequency_std_hz: float
+    damping_ratio: float
+    damping_ratio_std: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ringing:
+    """Free decay with which the record begins, beyond what the motor caused since.
+
+    Attributes
+    ----------
+    amplitude_nm : tuple of float
+        By mode, at the first sample compared.
+    chi_square : float
+        Of all its amplitudes together, beside the hum if there is some.
+    degrees_of_freedom : int
+    """
+
+    amplitude_nm: tuple[float, ...]
+    chi_square: float
+    degrees_of_freedom: int
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance would give as much in fewer than one record of ten thousand.
+
+        By the cube-root approximation of Wilson and Hilferty (PNAS 17 (1931) 684-688).
+        """
+        if not self.degrees_of_freedom:
+            return False
+        spread = 2 / (9 * self.degrees_of_freedom)
+        z = ((self.chi_square / self.degrees_of_freedom) ** (1 / 3) - 1 + spread) / spread**0.5
+        return bool(z > 3.72)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordFit:
+    """One structure fitted to a whole record.
+
+    Attributes
+    ----------
+    structure : Structure
+    plant : Plant
+        What was found, ready for `rigd.beam`.
+    parameters : dict of str to float
+        zeta, alpha, gamma, lambda, density_over_stiffness (s²/m⁴), bending_stiffness_n_m2, delay_s
+        and tool_inertia_kg_m2, the fixed ones included; stiffness_offset_2, … if modes were free.
+    std : dict of str to (float or None)
+        Standard deviations of the same: 0 for the fixed ones, None for those that rest on a bound
+        or that the data do not determine. Of a tool's inertia that rests on 0: what it would be
+        without that bound. An estimate that cannot be negative of a value that is 0 lies 0 to one
+        side of it half of the time and a half-normal error to the other: on average it is
+        1/sqrt(2 pi) = 0.40 of this deviation too large, and it scatters by 0.58 of it.
+    interval : dict of str to ((float, float) or None)
+        95 % confidence intervals of the free ones, None as above. Of the positive parameters they
+        are symmetric in the logarithm; that of a tool's inertia ends at 0 (`interval_from_zero`).
+    determined : tuple of str
+        Free parameters in the order of `covariance`.
+    covariance : ndarray, shape (k, k)
+        Of the determined parameters, zeta, gamma, density over stiffness and stiffness counted as
+        logarithms.
+    at_bounds : tuple of str
+        Free parameters that rest on the edge of their range.
+    internal, external : DampingSize or None
+        Decorrelated sizes of the damping; None where absent or not determined.
+    modes : tuple of ModeEstimate
+        Those within the band.
+    ringing : Ringing
+    cost : float
+        Sum of squares of the whitened residual.
+    degrees_of_freedom : int
+        How large the cost would be on average by chance alone.
+    residual : ndarray of complex, shape (K,)
+        Whitened spectrum of the residual in the band (prediction minus measurement): real and
+        imaginary parts of variance 1 if chance is all that remains.
+    """
+
+    structure: Structure
+    plant: Plant
+    parameters: Mapping[str, float]
+    std: Mapping[str, float | None]
+    interval: Mapping[str, tuple[float, float] | None]
+    determined: tuple[str, ...]
+    covariance: NDArray[np.float64]
+    at_bounds: tuple[str, ...]
+    internal: DampingSize | None
+    external: DampingSize | None
+    modes: tuple[ModeEstimate, ...]
+    ringing: Ringing
+    cost: float
+    degrees_of_freedom: int
+    residual: NDArray[np.complex128]
+
+    @property
+    def correlation(self) -> NDArray[np.float64]:
+        """Correlations of the determined parameters, shape (k, k)."""
+        std = np.sqrt(np.diag(self.covariance))
+        correlation: NDArray[np.float64] = self.covariance / np.outer(std, std)
+        return correlation
+
+    @property
+    def free_parameters(self) -> int:
+        """Number of parameters that were estimated."""
+        return len(self.determined) + len(self.at_bounds)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordAnalysis:
+    """All structures fitted to one record, under one spectrum of the noise.
+
+    Attributes
+    ----------
+    fits : tuple of RecordFit
+        In the order asked for; their costs can be compared.
+    frequency_hz : ndarray, shape (K,)
+        Bins of the residuals.
+    compared : ndarray of bool, shape (K,)
+        False at the lines; the residuals are 0 there.
+    noise_nm2_per_hz : ndarray, shape (K,)
+        One-sided power spectral density of the torque's noise, without lines.
+    lines : tuple of Line
+        Hum found in the torque, which no structure was compared with.
+    comparison : Comparison
+        What they were compared with.
+    """
+
+    fits: tuple[RecordFit, ...]
+    frequency_hz: NDArray[np.float64]
+    compared: NDArray[np.bool_]
+    noise_nm2_per_hz: NDArray[np.float64]
+    lines: tuple[Line, ...]
+    comparison: Comparison

@@ -1,0 +1,358 @@
+"""The way to the lowest minimum of one structure: rough response first, then the whole record.
+
+Where the descents on the whole record start: fits of a coarse frequency response.
+
+The ratio of the whole record's two transforms is exact but for what rings before and after it. A
+few hundred of its points, densest at the resonances, tell the minima apart in a hundredth of the
+time.
+"""
+
+from __future__ import annotations
+
+import itertools
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._hum import hum_beside_modes, resonance_reach_hz
+from analysis.identify._noise import Noise, noise_of
+from analysis.identify._optimizer import NormalEquations, descend
+from analysis.identify._parametrization import Steps
+from analysis.identify._predictor import ResponseGrid
+from analysis.identify._problem import Objective
+from analysis.paper import thinned
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._hum import Hum
+    from analysis.identify._noise import Noise
+    from analysis.identify._optimizer import Minimum
+    from analysis.identify._parametrization import Unknowns
+    from analysis.identify._predictor import Plant
+    from analysis.identify._problem import Comparison
+
+_SCANS: Final = {"density_over_stiffness": np.linspace(-0.3, 0.3, 61)}
+_OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)
+_MODERATE: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0}
+"""Damping for these scans, as `Unknowns.start` takes it."""
+
+
+def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArray[np.float64]:
+    """Find what brings the resonances of a vector of unknowns to where they are, shape (k,).
+
+    With a resonance off by more than it is wide, no descent would find it: all of them by rho/EI,
+    then one by one where modes have offsets of their own.
+
+    Parameters
+    ----------
+    cost : callable
+        Of a plant, on few points of a frequency response.
+    unknowns : Unknowns
+    """
+    moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
+    shift = np.zeros(moderate.size)
+    for place, name in enumerate(unknowns.names):
+        if name in _SCANS or name in unknowns.offsets:
+            steps = _SCANS.get(name, _OFFSET_SCAN)
+            costs = []
+            for step in steps:
+                shift[place] = step
+                costs.append(cost(unknowns.plant(moderate + shift)))
+            shift[place] = steps[int(np.argmin(costs))]
+    return shift
+
+
+_POINTS: Final = 400
+_TOLERANCE: Final = 1e-2
+_SAME_MINIMUM: Final = 0.05
+"""Minima whose plants differ by less than this share of the cost are one."""
+
+_MAX_EVALUATIONS: Final = 60
+_SIZES: Final = {name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zeta", "gamma")}
+"""Relative to stiffness and to inertia at a mode: about twice a damping ratio."""
+
+_ORDERS: Final = (0.5, 1.5)
+
+
+class RoughResponse:
+    """Few points of the whole record's frequency response, with their weights."""
+
+    __slots__ = ("_frequency_hz", "_measured", "_response", "_weights")
+
+    def __init__(self, comparison: Comparison) -> None:
+        length = comparison.angle_rad.size
+        hz = np.fft.rfftfreq(length, 1 / comparison.decimation.rate_hz)
+        first, last = comparison.frequency_hz[[0, -1]]
+        band = np.flatnonzero((hz >= first) & (hz <= last))
+        angle = np.fft.rfft(comparison.angle_rad)[band]
+        torque = np.fft.rfft(comparison.torque_nm)[band]
+        # Where nothing was asked of the motor it moved with the noise: no response is seen there.
+        given = np.fft.rfft(comparison.followed_rad())[band]
+        power = given.real**2 + given.imag**2
+        excited = power > 1e-12 * power.max()
+        response, weights = torque[excited] / angle[excited], power[excited]
+        index, self._weights = thinned(response, weights / weights.sum(), _POINTS)
+        self._measured = response[index]
+        self._frequency_hz = hz[band][excited][index]
+        self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
+
+    def whitened(self, noise: Noise, frequency_hz: NDArray[np.float64]) -> RoughResponse:
+        """Take the same points with the weights that they have under a noise.
+
+        Parameters
+        ----------
+        noise : Noise
+        frequency_hz : ndarray, shape (K,)
+            Its bins.
+        """
+        weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
+        other = copy(self)
+        other._weights = self._weights * weight / (self._weights @ weight)
+        return other
+
+    def cost(self, plant: Plant) -> float:
+        """Weighted mean square of the deviation, in (N·m/rad)²."""
+        return self._mean_square(self._response.evaluate(plant)[0] - self._measured)
+
+    def distance(self, one: Plant, other: Plant) -> float:
+        """Weighted mean square of the difference between two plants."""
+        return self._mean_square(
+            self._response.evaluate(one)[0] - self._response.evaluate(other)[0]
+        )
+
+    def alike(self, one: Plant, other: Plant) -> bool:
+        """Whether two plants stand for the same minimum."""
+        return self.distance(one, other) <= _SAME_MINIMUM * min(self.cost(one), self.cost(other))
+
+    def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
+        """Compute the same and its derivatives by the unknowns."""
+        response, *gradient = self._response.evaluate(unknowns.plant(x), unknowns.gradient_names)
+        deviation = response - self._measured
+        jacobian = unknowns.gradient_by_unknowns(x).T @ np.array(gradient)
+        weighted = jacobian.conj() * self._weights
+        return NormalEquations(
+            cost=self._mean_square(deviation),
+            gradient=(weighted @ deviation).real,
+            hessian=(weighted @ jacobian.T).real,
+        )
+
+    def _mean_square(self, deviation: NDArray[np.complex128]) -> float:
+        return float(self._weights @ (deviation.real**2 + deviation.imag**2))
+
+
+def rough_starts(rough: RoughResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
+    """Points from which descents lead to all minima of interest, each of shape (k,).
+
+    The damping that fits best with all orders 1, which most materials and air come close to; then
+    the same losses with the orders apart.
+    """
+    shift = resonance_shift(rough.cost, unknowns)
+    sizes = [_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
+    found = [unknowns.start(np.array(point)) + shift for point in itertools.product(*sizes)]
+    first = min(found, key=lambda x: rough.cost(unknowns.plant(x)))
+    points = [first]
+    orders = [i for i, name in enumerate(unknowns.names) if name in ("alpha", "lambda")]
+    for values in itertools.product(_ORDERS, repeat=len(orders)) if orders else ():
+        point = first.copy()
+        point[orders] = values
+        points.append(point)
+    return points
+
+
+def rough_minima(
+    rough: RoughResponse, unknowns: Unknowns, points: Iterable[NDArray[np.float64]]
+) -> list[Minimum]:
+    """Different minima of the rough response's cost, the lowest first, from some points."""
+    steps = Steps.of(unknowns)
+    found = [
+        descend(
+            lambda x: rough.normal_equations(unknowns, x),
+            point,
+            steps,
+            relative_tolerance=_TOLERANCE,
+            max_evaluations=_MAX_EVALUATIONS,
+        )
+        for point in points
+    ]
+    kept: list[Minimum] = []
+    for minimum in sorted(found, key=lambda m: m.cost):
+        plant = unknowns.plant(minimum.x)
+        if not any(rough.alike(plant, unknowns.plant(other.x)) for other in kept):
+            kept.append(minimum)
+    return kept
+
+
+_BETWEEN_RIVALS: Final = 1e-2
+"""Relative tolerance that tells which of several minima is lower."""
+
+_RIVALS: Final = 2
+_NO_RIVAL: Final = 1.5
+"""A rough minimum whose cost is larger than the lowest one's by this factor is not gone after."""
+
+_CLEARLY: Final = 0.9
+"""Cost, relative to where a descent has ended, that makes another rough minimum worth a look."""
+
+_MOST_MINIMA: Final = 4
+_LOOKS: Final = 3
+"""As often hum is looked for: the first fit took part of it for the beam's doing."""
+
+_FILLINGS: Final = 8
+_SETTLED: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Descent:
+    """Where one structure has come to."""
+
+    objective: Objective
+    x: NDArray[np.float64]
+
+    @property
+    def plant(self) -> Plant:
+        """The plant there."""
+        return self.objective.unknowns.plant(self.x)
+
+    def lower(self, noise: Noise, tolerance: float) -> Descent:
+        """Descend under a noise spectrum, unknown torques as predicted here."""
+        objective = self.objective
+        refilled = objective.comparison.filled(objective.unknowns.plant(self.x))
+        if refilled is not objective.comparison:
+            objective = Objective(refilled, objective.unknowns)
+        weight = noise.weight
+        minimum = descend(
+            lambda x: objective.normal_equations(x, weight),
+            self.x,
+            Steps.of(objective.unknowns),
+            relative_tolerance=tolerance,
+        )
+        return Descent(objective, minimum.x)
+
+    def settled(self, noise: Noise, tolerance: float) -> Descent:
+        """Descend to the minimum; again, while what is put for unknown torques moves it."""
+        here = self.lower(noise, tolerance)
+        if self.objective.comparison.measurement.torque_known.all():
+            return here
+        for _ in range(_FILLINGS):
+            before, here = here, here.lower(noise, tolerance)
+            if np.abs(here.x - before.x).max() < _SETTLED:
+                break
+        return here
+
+    def hum(self) -> tuple[Hum, ...]:
+        """Look for what hums beside a mode, with the beam found so far."""
+        comparison = self.objective.comparison
+        at, noise = self.objective.linearise(self.x), self.noise()
+        amplitudes = self.objective.project(at, noise.weight).amplitudes
+        decays = sum(1 + pole.oscillates for pole in at.poles)
+        decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
+        return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+
+    def without_hum(self, tolerance: float) -> Descent:
+        """Take out what hums beside a mode, and settle again; `self` if nothing does."""
+        here = self
+        for _ in range(_LOOKS):
+            hum = here.hum()
+            if not hum:
+                return self
+            objective = Objective(
+                here.objective.comparison.without_hum(hum), here.objective.unknowns
+            )
+            here = Descent(objective, here.x)
+            here = here.settled(here.noise(), tolerance)
+        return here
+
+    def noise(self, *, with_lines: bool = False) -> Noise:
+        """Take for noise what remains here and is no free decay."""
+        objective, comparison = self.objective, self.objective.comparison
+        at = objective.linearise(self.x)
+        near_mode = None
+        if with_lines:
+            hz = comparison.frequency_hz
+            near_mode = np.zeros(hz.size, dtype=bool)
+            for pole in at.poles:
+                width = resonance_reach_hz(pole, float(hz[1] - hz[0]))
+                near_mode |= np.abs(hz - abs(pole.at_rad_s.imag) / (2 * np.pi)) < width
+        return noise_of(
+            objective.project(at, 1.0).residual,
+            comparison.frequency_hz,
+            comparison.samples,
+            comparison.measurement.torque_share,
+            near_mode,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """One structure on one record: where its minima may lie.
+
+    Attributes
+    ----------
+    objective : Objective
+    rough : RoughResponse
+    first : ndarray, shape (k,)
+        Where the orders are 1.
+    minima : list of Minimum
+        Of the rough response, noise taken for white; the lowest first.
+    """
+
+    objective: Objective
+    rough: RoughResponse
+    first: NDArray[np.float64]
+    minima: list[Minimum]
+
+    @classmethod
+    def of(cls, objective: Objective, rough: RoughResponse) -> Search:
+        """Look over the whole range of the unknowns."""
+        starts = rough_starts(rough, objective.unknowns)
+        return cls(objective, rough, starts[0], rough_minima(rough, objective.unknowns, starts))
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """What is searched for."""
+        return self.objective.unknowns
+
+    def on(self, comparison: Comparison) -> Search:
+        """Compare with something else, from the same starts."""
+        return replace(self, objective=Objective(comparison, self.unknowns))
+
+    def lowest(self) -> Descent:
+        """Where the rough response is lowest."""
+        return Descent(self.objective, self.minima[0].x)
+
+    def under(self, noise: Noise, near: Descent | None = None) -> Descent:
+        """Go next to the lowest minimum of the whole record.
+
+        Under another noise another minimum may be the lowest: all are looked at again on the rough
+        response, which costs little, and the best few descended to.
+
+        Parameters
+        ----------
+        noise : Noise
+        near : Descent, optional
+            Where one of the minima is known already.
+        """
+        rough = self.rough.whitened(noise, self.objective.comparison.frequency_hz)
+        points = [minimum.x for minimum in self.minima[:_MOST_MINIMA]]
+        found = rough_minima(rough, self.unknowns, [*points, self.first])
+        rivals = [
+            Descent(self.objective, minimum.x)
+            for minimum in found[:_RIVALS]
+            if minimum.cost < _NO_RIVAL * found[0].cost
+        ]
+        if near is not None:
+            plant = self.unknowns.plant(near.x)
+            rivals = [near] + [
+                rival
+                for rival in rivals
+                if not rough.alike(plant, self.unknowns.plant(rival.x))
+                and rough.cost(self.unknowns.plant(rival.x)) < _CLEARLY * rough.cost(plant)
+            ]
+        if len(rivals) == 1:
+            return rivals[0]
+        ends = [rival.lower(noise, _BETWEEN_RIVALS) for rival in rivals]
+        return min(ends, key=lambda end: end.objective.normal_equations(end.x, noise.weight).cost)

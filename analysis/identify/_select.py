@@ -1,0 +1,489 @@
+"""Selection of a structure for one record: candidates, tests, profiles, verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from analysis.identify._candidates import Field
+from analysis.identify._diagnostics import findings, unexplained
+from analysis.identify._drag import damping_with_amplitude, with_air_drag
+from analysis.identify._finding import doubted
+from analysis.identify._fit import BAND_HZ
+from analysis.identify._headline import MISREAD, ONE_MODE, UNEXPLAINED, Headline, headline
+from analysis.identify._nonlinear import nonlinear_forces
+from analysis.identify._profile_likelihood import Profile, profiled
+from analysis.identify._residual_tests import (
+    InputRelation,
+    Whiteness,
+    harmonics,
+    in_time,
+    input_relation,
+    whiteness,
+)
+from analysis.identify._result import RecordAnalysis
+from analysis.identify._time_varying import along_time, changing
+from analysis.identify._verdict import (
+    EVEN,
+    STRONG,
+    Row,
+    Verdict,
+    deviance_of_one,
+    order_verdict,
+    rivals,
+    untold_reason,
+)
+from analysis.identify._visible_modes import driven, visible_modes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._data import Measurement
+    from analysis.identify._finding import Finding
+    from analysis.identify._headline import Headline, Quantity, Simpler
+    from analysis.identify._predictor import Setting
+    from analysis.identify._result import RecordFit
+    from analysis.identify._time_varying import Change
+    from analysis.identify._verdict import OrderVerdict
+
+_DAMPING: Final = {
+    "I": "Damping by the material only",
+    "II": "Damping by the surroundings only",
+    "III": "Damping by material and surroundings",
+    "IV": "Damping by the material only",
+    "V": "Damping by the surroundings only",
+    "VI": "Damping by material and surroundings",
+    "VII": "Damping by material and surroundings",
+}
+_SEVERAL: Final = 2
+_FREE: Final = "modes free"
+_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+
+
+def of_headline(
+    told: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, alone: bool
+) -> list[str]:
+    """Say what the beam does, what is excluded, and what would do.
+
+    Parameters
+    ----------
+    told : Headline
+    orders : tuple of OrderVerdict
+        Alpha's and lambda's.
+    alone : bool
+        Whether nothing else explains the record as well.
+    """
+    free = told.fit.structure
+    kind = told.name.partition(", ")[2]
+    beam = ", on a beam whose modes each have a stiffness of their own" if kind == _FREE else ""
+    if kind and not beam:
+        beam = f", beside {kind}"
+    if len(told.visible_modes) < _SEVERAL:
+        said = [f"{ONE_MODE.capitalize()}, and nothing of orders."]
+    else:
+        said = [
+            f"{_DAMPING[free.name]}{beam}: the numbers are those of type {told.name}, every order "
+            "free."
+        ]
+        excluded = told.with_status("excluded")
+        if told.explained and excluded:
+            said.append(f"Excluded: {_types(excluded)}.")
+        if told.simpler is not None and told.simpler.fixed:
+            said.append(_condition(told.simpler))
+    said += [order(each) for each in orders]
+    if told.explained:
+        said.append(
+            "What it leaves is noise: nothing in the record asks for more."
+            if alone
+            else "What it leaves is noise, but something else explains the record as well."
+        )
+    return said
+
+
+def _types(names: tuple[str, ...]) -> str:
+    """List structures, those of a uniform beam first."""
+    plain = sorted(name for name in names if "," not in name)
+    others: dict[str, list[str]] = {}
+    for name in sorted(set(names) - set(plain)):
+        structure, beam = name.split(", ", 1)
+        others.setdefault(beam, []).append(structure)
+    groups = [_listed(plain)] if plain else []
+    groups += [f"with {beam} {_listed(each)}" for beam, each in others.items()]
+    return f"type{'s' if len(names) > 1 else ''} {'; '.join(groups)}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _condition(simpler: Simpler) -> str:
+    """Say what a simpler structure would give."""
+    taken = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
+    numbers = [
+        f"{name} = {_with_interval(simpler.parameters[name])}"
+        for name in ("zeta", "alpha", "gamma", "lambda")
+        if name in simpler.parameters
+    ]
+    they = "it is" if len(simpler.fixed) == 1 else "they are"
+    return (
+        f"{taken[0].upper()}{taken[1:]} {'is' if they == 'it is' else 'are'} not excluded (type "
+        f"{simpler.name}); only if {they} true, {', '.join(numbers)}."
+    )
+
+
+def _with_interval(quantity: Quantity) -> str:
+    """Write a number with its 95 % interval, to the digits that this gives a meaning."""
+    if quantity.interval_95 is None or not quantity.std:
+        return f"{quantity.value:.4g}"
+    low, high = quantity.interval_95
+    power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
+    scale = 10.0**power if power < -2 else 1.0
+    digits = max(0, 1 - math.floor(math.log10(quantity.std / scale)))
+    exponent = f"e{power}" if power < -2 else ""
+    return (
+        f"{quantity.value / scale:.{digits}f}{exponent} "
+        f"({low / scale:.{digits}f}{exponent} to {high / scale:.{digits}f}{exponent})"
+    )
+
+
+def order(verdict: OrderVerdict) -> str:
+    """Say what is known of one order.
+
+    Parameters
+    ----------
+    verdict : OrderVerdict
+    """
+    profile = verdict.profile
+    low, high = profile.interval
+    name, of = verdict.order, _OF[verdict.order]
+    value = f"{profile.estimate:.3f} (95 %: {low:.3f} to {high:.3f})"
+    if verdict.status == "absent":
+        return f"No {of} shows, so its order {name} means nothing here."
+    if verdict.status == "not identifiable":
+        return f"The order {name} of the {of} is not identifiable: {_why_not(verdict)}."
+    if verdict.reason is not None:
+        return (
+            f"The order {name} of the {of} stays open: {value} would fit, but {verdict.reason}. It "
+            "must not be taken for a property of the beam."
+        )
+    if verdict.status == "compatible":
+        return f"The order {name} of the {of} is {value}: 1 would do."
+    if verdict.status == "fractional":
+        return f"The order {name} of the {of} is {value}; 1 is excluded."
+    return (
+        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (chance would "
+        f"be as far off in one record of {_one_in(deviance_of_one(profile))})."
+    )
+
+
+def _why_not(verdict: OrderVerdict) -> str:
+    profile = verdict.profile
+    low, high = profile.interval
+    if verdict.reason is not None and (profile.identifiable or not profile.walked):
+        return verdict.reason
+    if len(profile.valleys) > 1:
+        equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
+        return (
+            f"{equal} explain the record equally well, each with a damping of its own "
+            f"(95 %: {low:.3f} to {high:.3f}, with all that lies between)"
+        )
+    return (
+        "any value between 0 and 2 fits"
+        if profile.open_below and profile.open_above
+        else f"anything below {high:.2f} fits"
+        if profile.open_below
+        else f"anything above {low:.2f} fits"
+        if profile.open_above
+        else f"anything from {low:.2f} to {high:.2f} fits"
+    )
+
+
+def _one_in(deviance: float) -> int:
+    """Of how many records chance gives one with such a deviance, of one degree of freedom."""
+    return 10 * round(0.1 / math.erfc(math.sqrt(deviance / 2)))
+
+
+_ENOUGH: Final = 2
+_SECOND: Final = 6.267
+"""Frequency of the second mode of a uniform beam over that of the first."""
+
+_ORDINALS: Final = {1: "first", 2: "second"}
+
+
+def experiments(
+    field: Field,
+    orders: tuple[OrderVerdict, ...],
+    visible: tuple[int, ...],
+    found: tuple[Finding, ...],
+    close: tuple[Candidate, ...],
+) -> list[str]:
+    """Say what would tell more, each piece of advice once."""
+    advice = []
+    unknown = [o for o in orders if o.status == "not identifiable"]
+    if unknown:
+        names = " and ".join(o.order for o in unknown)
+        if len(visible) < _ENOUGH:
+            advice.append(f"To find {names}, {_for_two_modes(field, visible)}")
+        else:
+            advice.append(
+                f"To find {names}, measure longer where it counts: narrow, slow sweeps round "
+                "the modes, or a wider sweep that reaches one more mode."
+            )
+    unexplained = any(finding.kind == "unexplained" for finding in found)
+    if close or (not unexplained and any(o.status == "open" for o in orders)):
+        advice.append(
+            "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
+        )
+    advice += [finding.remedy for finding in found if finding.remedy]
+    return list(dict.fromkeys(advice))
+
+
+def _for_two_modes(field: Field, visible: tuple[int, ...]) -> str:
+    """Say how both of the first two modes would show."""
+    modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
+    first_hz = modes.get(1, 0.0)
+    at_hz = {1: first_hz, 2: modes.get(2, _SECOND * first_hz)}
+    missing = next(number for number in (1, 2) if number not in visible)
+    other = 3 - missing
+    last_hz = float(field.comparison.frequency_hz[-1])
+    if at_hz[missing] > last_hz:
+        return (
+            f"analyse and excite the {_ORDINALS[missing]} mode as well: band and sweep up to at "
+            f"least {1.3 * at_hz[missing]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
+        )
+    if not driven(field.comparison, at_hz[missing], relative_to_hz=at_hz[other]):
+        return f"excite the {_ORDINALS[missing]} mode as well: sweep " + (
+            f"up to at least {1.3 * at_hz[2]:.0f} Hz."
+            if missing == 2
+            else f"from below {0.7 * at_hz[1]:.1f} Hz."
+        )
+    return (
+        f"let the {_ORDINALS[missing]} mode stand out of the noise: the motor was driven at its "
+        f"{at_hz[missing]:.1f} Hz, so sweep louder (twice the amplitude), slower, or several "
+        "times, not wider."
+    )
+
+
+_CLIPPED: Final = "the torque is clipped"
+_MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
+_OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
+"""All that is said where the record and its file do not fit each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """A verdict with what it rests on.
+
+    Attributes
+    ----------
+    verdict : Verdict
+    headline : Headline
+        The numbers to be told first, with flags.
+    candidates : tuple of Candidate
+        All fits, the lowest BIC first.
+    analysis : RecordAnalysis
+        The same fits with the noise and the bins that are theirs.
+    """
+
+    verdict: Verdict
+    headline: Headline
+    candidates: tuple[Candidate, ...]
+    analysis: RecordAnalysis
+
+    @property
+    def fit(self) -> RecordFit:
+        """The fit that the headline's numbers are of."""
+        return self.headline.fit
+
+
+def select(
+    measurement: Measurement,
+    *,
+    fixed: Iterable[Setting] = (),
+    band_hz: tuple[float, float] = BAND_HZ,
+) -> Selection:
+    """Choose the structure that a record supports, and say what is known.
+
+    All structures are fitted under one spectrum of the noise, on a uniform beam, and those of
+    integer internal order also with the modes' stiffness free; where it promises something, also
+    with an elastic clamp, a tip mass, a filter or another clock. On the kind of rig with the lowest
+    BIC the orders are freed as well, and kinds of rig are told apart by these freest structures.
+    The numbers told are theirs, so that intervals hold whichever simpler one is true. If drag of
+    the air along the beam makes the lowest lower, all are fitted with it. If restoring forces that
+    are not linear, or a change along the record, save far more than chance would, all are fitted
+    again with these beside the beam.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    fixed : iterable of str
+        Settings that stay as the file states them.
+    band_hz : tuple of float
+
+    Raises
+    ------
+    MeasurementError
+        The record cannot be used.
+    ValueError
+        There is no such setting.
+    """
+    linear = Field.of(measurement, tuple(fixed), band_hz)
+    visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
+    field, forces = (
+        (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
+    )
+    field, changes = along_time(field.with_orders_free())
+    if untold_reason(field, visible) is None:
+        field, of_alpha, of_lambda = profiled(field)
+    else:
+        of_alpha, of_lambda = (
+            Profile.unwalked(field.freest, "alpha"),
+            Profile.unwalked(field.freest, "lambda"),
+        )
+    told = field.led_by(field.freest)
+    white, related = _tests(told)
+    comparison, fit = field.comparison, told.best.fit
+    multiples = harmonics(
+        comparison.angle_rad[comparison.kept],
+        in_time(fit.residual, comparison.bins, comparison.samples),
+        comparison.decimation.rate_hz,
+        band_hz,
+    )
+    explained = white.white and not related.related
+    found = findings(told, forces, multiples, visible)
+    kinds = {finding.kind for finding in found}
+    wrong = (
+        MISREAD
+        if kinds & _MISREAD_KINDS
+        else UNEXPLAINED
+        if "harmonics" in kinds or not explained
+        else None
+    )
+    doubt = wrong or _doubt(changes, clipped="clipping" in kinds)
+    orders = (
+        order_verdict(field, of_alpha, visible, doubt=doubt),
+        order_verdict(field, of_lambda, visible, doubt=doubt),
+    )
+    close = rivals(field, EVEN)
+    if wrong == MISREAD:
+        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    else:
+        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        if not explained:
+            found = (*found, unexplained(white, related, fit.modes))
+    numbers = headline(field, orders, visible, unexplained=wrong)
+    if doubt is not None:
+        numbers = numbers.doubted(doubt)
+    if "nonlinear stiffness" in kinds:
+        numbers = numbers.with_law_assumed()
+    best = field.best
+    of_numbers = of_headline(numbers, orders, alone=doubt is None and not field.other_kinds(STRONG))
+    advice = (
+        dict.fromkeys(each.remedy for each in found if each.remedy)
+        if wrong == MISREAD
+        else experiments(field, orders, visible, found, close)
+    )
+    return Selection(
+        candidates=field.candidates,
+        headline=numbers,
+        analysis=_analysis(field),
+        verdict=Verdict(
+            name=measurement.name,
+            structure=best.structure.name,
+            uniform=best.uniform,
+            rivals=tuple(c.name for c in close),
+            parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
+            adequate=wrong is None,
+            alpha=orders[0],
+            lambda_=orders[1],
+            visible_modes=visible,
+            findings=found,
+            table=_table(field),
+            whiteness=white,
+            input_relation=related,
+            harmonics=multiples,
+            sentences=(
+                *(() if wrong == MISREAD else of_numbers),
+                *(each.sentence for each in found),
+            ),
+            experiments=tuple(advice),
+            damping_with_amplitude=damping_with_amplitude(told),
+        ),
+    )
+
+
+def _doubt(changes: tuple[Change, ...], *, clipped: bool) -> str | None:
+    """Say why no number is to be believed though all of the record is explained; None: it may."""
+    if clipped:
+        return _CLIPPED
+    if len(changes) == 1 and changes[0].certain:
+        return None
+    return next((f"{change.name} would explain the record as well" for change in changes), None)
+
+
+def _as_sure(
+    beside: tuple[Finding, ...],
+    along: tuple[Finding, ...],
+    wrong: str | None,
+    doubt: str | None,
+    *,
+    explained: bool,
+) -> tuple[Finding, ...]:
+    """Tell as facts only what is sure.
+
+    Parameters
+    ----------
+    beside, along : tuple of Finding
+        Beside the beam, and what changes along the record, which says itself how sure it is.
+    wrong, doubt : str or None
+        Why the model is not to be believed, and why no number of it.
+    explained : bool
+        Whether harmonics are all that remains: then they are what they seem to be.
+    """
+    if doubt is not None:
+        beside = tuple(
+            each if each.kind == "harmonics" and explained else doubted(each, doubt)
+            for each in beside
+        )
+    if wrong is not None:
+        along = tuple(doubted(each, wrong) for each in along)
+    return (*beside, *along)
+
+
+def _analysis(field: Field) -> RecordAnalysis:
+    comparison, noise = field.comparison, field.noise
+    return RecordAnalysis(
+        fits=tuple(candidate.fit for candidate in field.candidates),
+        frequency_hz=comparison.frequency_hz,
+        compared=noise.counts,
+        noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
+        lines=noise.lines,
+        comparison=comparison,
+    )
+
+
+def _tests(field: Field) -> tuple[Whiteness, InputRelation]:
+    comparison, residual = field.comparison, field.best.fit.residual
+    counts = field.noise.counts
+    angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
+    return (
+        whiteness(residual[counts], comparison.frequency_hz[counts]),
+        input_relation(residual, angle, comparison.frequency_hz),
+    )
+
+
+def _table(field: Field) -> tuple[Row, ...]:
+    best, least_aic = field.best, min(c.aic for c in field.candidates)
+    return tuple(
+        Row(
+            structure=c.structure.name,
+            uniform=c.uniform,
+            parameters=c.parameters,
+            cost=c.fit.cost,
+            delta_bic=c.bic - best.bic,
+            delta_aic=c.aic - least_aic,
+        )
+        for c in field.candidates
+    )

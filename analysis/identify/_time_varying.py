@@ -1,0 +1,366 @@
+"""Changes along the record, and the motor's play.
+
+How a mode remembers the damping that it had: a correction to what is read off at each moment.
+
+A damping that changes as ``1 + e w(t)`` puts, to first order in e, another force on mode i. With
+``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``S = c k⁴ / (c k⁴ + p)`` and
+``R = p / (c k⁴ + p)``, the torque gains e times::
+
+    a² EI (S w gamma s^lambda S + k⁴ R w zeta s^alpha R) angle
+
+where w multiplies in time what stands to its right. To read the derivative of the response off at
+each moment is to put w in front of all; a mode that rings for seconds does not follow so soon.
+
+Changes along the record, and the motor's play.
+
+Columns of known shape and unknown size, as `analysis.identify._refit` takes them: what the torque
+would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
+follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
+damping that drifts competes with an order of the damping, and a gain that drifts with a filter. A
+delay that rises so is what clocks of different rates make: see `analysis.identify._rivals`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from analysis.identify._data import fast_length
+from analysis.identify._finding import Finding
+from analysis.identify._predictor import eigenvalues, torque_channel
+from analysis.identify._refit import Refit, unexplained_part
+from analysis.identify._residual_tests import SURE
+from analysis.identify._verdict import STRONG
+from analysis.models import STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._finding import Kind
+    from analysis.identify._predictor import Plant
+    from analysis.identify._problem import Comparison
+
+_PADDED: Final = 1.5
+_DECAY: Final = 9.0
+"""As in `analysis.identify._nonlinear`: on s = sigma + j omega what wraps round has decayed."""
+
+
+def late_damping(
+    comparison: Comparison, plant: Plant, change: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Torque by damping that changes, less what is read off at each moment, shape (samples,).
+
+    Parameters
+    ----------
+    comparison : Comparison
+    plant : Plant
+    change : ndarray, shape (samples,)
+        w at the samples kept; before and after as at its ends.
+    """
+    n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
+    length = fast_length(int(np.ceil(_PADDED * n)))
+    sigma = _DECAY * rate_hz / length
+    s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
+    growth = np.exp(sigma * np.arange(n) / rate_hz)
+    kept = comparison.kept
+    w = np.interp(np.arange(n), np.arange(kept.start, kept.stop), change)
+    damping, beam = plant.damping, plant.beam
+    internal = damping.zeta * s**damping.alpha
+    external = damping.gamma * s**damping.lambda_
+    inertial = beam.density_over_stiffness * s * s + external
+    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
+    total = np.zeros(n)
+
+    def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
+        return values
+
+    uniform = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
+    offsets = np.zeros(uniform.size)
+    offsets[1 : 1 + len(plant.stiffness_offsets)] = plant.stiffness_offsets
+    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * uniform)
+    for share, k in zip(shares.tolist(), (uniform * (1 + offsets)).tolist(), strict=True):
+        resists = (1 + internal) * k + inertial
+        ways = (
+            ((1 + internal) * k / resists, external),
+            (inertial / resists, k * internal),
+        )
+        for through, damper in ways:
+            moved = damper * through * angle
+            later = through * np.fft.rfft(w * in_time(moved) / growth, length)
+            total += share * (in_time(later) - w * in_time(through * moved))
+    return total[kept]
+
+
+What = Literal["damping", "stiffness", "gain", "play"]
+
+_LEADS: Final = tuple(STRUCTURES[name] for name in ("III", "VII", "VI"))
+_GRADIENT: Final = ("zeta", "gamma", "ln_stiffness", "ln_density_over_stiffness")
+_GAIN: Final = SURE**2 + 2 * math.log(20)
+"""Deviance that a column must save: four of them are tried on four candidates."""
+
+_UNIT_PLAY_RAD: Final = 1e-4
+_ROUNDS: Final = 4
+_SETTLED: Final = 0.01
+_MANY: Final = 40
+_NORMAL_95: Final = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One thing that changes along the record, or the play.
+
+    Attributes
+    ----------
+    what : str
+    size, std : float
+        Change from the first sample to the last, relative; the play in rad.
+    behind : float
+        BIC with it above the lowest without it.
+    """
+
+    what: What
+    size: float
+    std: float
+    behind: float
+
+    @property
+    def name(self) -> str:
+        """As sentences begin."""
+        return _NAMES[self.what]
+
+    @property
+    def certain(self) -> bool:
+        """Whether nothing else explains the record as well."""
+        return self.behind < -STRONG
+
+
+def along_time(field: Field) -> tuple[Field, tuple[Change, ...]]:
+    """Find what changes along the record; fit all anew beside it if nothing explains it as well.
+
+    Parameters
+    ----------
+    field : Field
+
+    Returns
+    -------
+    field : Field
+        The one given, unless something changes for certain.
+    changes : tuple of Change
+        What explains the record best of all, or as well as the best candidate.
+    """
+    if field.misread:
+        return field, ()
+    lag = _lag_of_play(field.comparison)
+    tried: dict[What, tuple[float, Refit]] = {}
+    for lead in _leads(field):
+        for what, promised in _promising(field, lead, lag):
+            if promised < tried.get(what, (math.inf,))[0]:
+                refit, bic = _fitted(field, lead, what, lag)
+                if bic < tried.get(what, (math.inf,))[0]:
+                    tried[what] = (bic, refit)
+    found = []
+    for what, (bic, refit) in tried.items():
+        sizes, std = refit.amplitudes()
+        unit = _UNIT_PLAY_RAD if what == "play" else 1.0
+        change = Change(what, unit * float(sizes[-1]), unit * float(std[-1]), bic - field.best.bic)
+        if change.behind < STRONG and _possible(change):
+            found.append((change, refit))
+    found.sort(key=lambda pair: pair[0].behind)
+    if not found:
+        return field, ()
+    first, refit = found[0]
+    changes = tuple(c for c, _ in found if c.behind < first.behind + STRONG)
+    if not first.certain or len(changes) > 1:
+        return field, changes
+    return field.with_columns(refit.columns, refit.noise_here()), changes
+
+
+def _possible(change: Change) -> bool:
+    """Whether a size is one: play is positive, and nothing changes by more than it is."""
+    return change.size > 0 if change.what == "play" else abs(change.size) < 1
+
+
+def _leads(field: Field) -> Iterator[Candidate]:
+    """Give the best candidate, and the simple ones that something may stand beside instead."""
+    yield field.best
+    for candidate in field.candidates[1:]:
+        if candidate.uniform and not candidate.extras and candidate.structure in _LEADS:
+            yield candidate
+
+
+def _promising(
+    field: Field, lead: Candidate, lag: NDArray[np.float64]
+) -> Iterator[tuple[What, float]]:
+    """Columns that to first order would make a candidate the best, with the BIC they promise."""
+    refit = field.refit(lead.structure, lead.uniform, lead.fit.plant, 1, lead.extras)
+    at = refit.objective.linearise(refit.x)
+    projected = refit.objective.project(at, field.noise.weight)
+    known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
+    for what, column in _columns(field.comparison, lead.fit.plant, lag).items():
+        (free,) = unexplained_part((column * field.noise.weight)[None], known)
+        saved = float(np.vdot(free, projected.residual).real) ** 2
+        saved /= max(float(np.vdot(free, free).real), np.finfo(float).tiny)
+        left = max(projected.cost - saved, 1e-3 * projected.cost)
+        gain = lead.values * math.log(projected.cost / left)
+        bic = lead.bic - gain + math.log(lead.values)
+        if gain > _GAIN and bic < field.best.bic + STRONG:
+            yield what, bic
+
+
+def _fitted(
+    field: Field, lead: Candidate, what: What, lag: NDArray[np.float64]
+) -> tuple[Refit, float]:
+    """Fit a candidate with one column beside it; give its BIC as well."""
+    unknowns = field.unknowns(lead.structure, lead.uniform, lead.extras)
+    refit = field.refit(lead.structure, lead.uniform, lead.fit.plant, 1, lead.extras)
+    size = 0.0
+    for _ in range(_ROUNDS):
+        column = _column(field.comparison, refit.plant, lag, what, size)
+        columns = np.concatenate([field.columns, column[None]])
+        before = refit.cost
+        refit = Refit.descend(
+            field.comparison, unknowns, refit.x, field.noise, columns, max_evaluations=_MANY
+        )
+        moved, size = size, float(refit.amplitudes()[0][-1])
+        settled = abs(size - moved) < _SETTLED * abs(size)
+        if settled and abs(lead.values * math.log(before / refit.cost)) < 1:
+            break
+    deviance = lead.values * math.log(refit.cost / lead.values)
+    return refit, deviance + (lead.parameters + 1) * math.log(lead.values)
+
+
+def _columns(
+    comparison: Comparison, plant: Plant, lag: NDArray[np.float64]
+) -> dict[What, NDArray[np.complex128]]:
+    """Spectra of the torque by a change of 1 from the first sample to the last, each of (K,)."""
+    _, (zeta, gamma, gain, ratio) = comparison.prediction.torque(plant, _GRADIENT)
+    ramp = np.linspace(-0.5, 0.5, comparison.samples)
+    changes: dict[What, NDArray[np.float64]] = {
+        "damping": plant.damping.zeta * zeta + plant.damping.gamma * gamma,
+        "stiffness": gain - ratio,  # EI rises, rho stays
+        "gain": gain,
+    }
+    spectra = {what: comparison.spectrum(ramp * values) for what, values in changes.items()}
+    spectra["damping"] += comparison.spectrum(late_damping(comparison, plant, ramp))
+    spectra["play"] = comparison.spectrum(comparison.prediction.of_other(lag).torque(plant)[0])
+    return spectra
+
+
+def _column(
+    comparison: Comparison, plant: Plant, lag: NDArray[np.float64], what: What, size: float
+) -> NDArray[np.complex128]:
+    """Column at a size that is not small, divided by it, shape (K,).
+
+    As if the rig were at each moment as it is then: between the torques at the beginning's, the
+    middle's and the end's state a parabola is laid.
+    """
+    if size == 0 or what in ("gain", "play"):
+        return _columns(comparison, plant, lag)[what]
+    place = np.linspace(-1, 1, comparison.samples)
+    first, middle, last = (
+        comparison.prediction.torque(_changed(plant, what, share * size))[0]
+        for share in (-0.5, 0.0, 0.5)
+    )
+    change = place * (last - first) / 2 + place**2 * ((first + last) / 2 - middle)
+    change /= size
+    if what == "damping":
+        change += late_damping(comparison, plant, place / 2)
+    return comparison.spectrum(change)
+
+
+def _changed(plant: Plant, what: What, size: float) -> Plant:
+    """Plant whose damping or stiffness is larger by a share."""
+    if what == "damping":
+        damping, factor = plant.damping, max(1 + size, 0.0)
+        return replace(
+            plant,
+            damping=replace(damping, zeta=factor * damping.zeta, gamma=factor * damping.gamma),
+        )
+    stiffness = max(1 + size, 0.1) * plant.beam.bending_stiffness_n_m2
+    return replace(plant, beam=replace(plant.beam, bending_stiffness_n_m2=stiffness))
+
+
+def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
+    """Hub's angle less the shaft's with a play of `_UNIT_PLAY_RAD`, at the decimated rate."""
+    highest_hz = float(comparison.frequency_hz[-1])
+    half, here, hub = _UNIT_PLAY_RAD / 2, 0.0, []
+    shaft = comparison.measurement.angle_from_rest(highest_hz)
+    for angle in shaft.tolist():
+        here = min(max(here, angle - half), angle + half)
+        hub.append(here)
+    lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub) - shaft)
+    return lag
+
+
+def changing(changes: tuple[Change, ...]) -> Iterator[Finding]:
+    """Put in words what changes along the record."""
+    alone = len(changes) == 1
+    for change in changes:
+        finding = _finding(change)
+        if alone and change.certain:
+            yield finding
+        else:
+            yield replace(
+                finding,
+                sentence=(
+                    f"{_NAMES[change.what]} would explain the record "
+                    + ("as well as anything else does" if alone else "as well as the others named")
+                    + f" ({_size(change)}): in one sweep, time and frequency go together."
+                ),
+                value=None,
+                interval=None,
+            )
+
+
+_NAMES: Final[dict[What, str]] = {
+    "damping": "Damping that changes along the record",
+    "stiffness": "Stiffness that changes along the record",
+    "gain": "A torque gain that changes along the record",
+    "play": "Play between encoder and beam",
+}
+_KINDS: Final[dict[What, Kind]] = {
+    "damping": "drifting damping",
+    "stiffness": "drifting stiffness",
+    "gain": "drifting gain",
+    "play": "play",
+}
+
+
+def _size(change: Change) -> str:
+    if change.what == "play":
+        return f"{1e3 * change.size:.2g} mrad"
+    return f"{100 * change.size:+.2g} % from beginning to end"
+
+
+def _finding(change: Change) -> Finding:
+    half = _NORMAL_95 * change.std
+    of_play = change.what == "play"
+    scale = 1e3 if of_play else 100.0
+    return Finding(
+        kind=_KINDS[change.what],
+        sentence=(
+            f"{_NAMES[change.what]} shows: {_size(change)} (± {scale * half:.1g}; 95 %). It was "
+            "fitted beside the beam"
+            + (
+                ", to first order in its size."
+                if of_play
+                else "; all parameters are those at the middle of the record."
+            )
+        ),
+        value=change.size,
+        interval=(change.size - half, change.size + half),
+        unit="rad" if of_play else "1",
+        remedy=(
+            "Take the play out of gear and clamp."
+            if of_play
+            else "Repeat with the sweep from high to low frequency: that tells a change with time "
+            "from one with frequency."
+        ),
+    )

@@ -1,0 +1,265 @@
+"""The verdict on one record: structure, orders, what is not known, and what would tell."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._drag import DampingAt
+    from analysis.identify._finding import Finding
+    from analysis.identify._profile_likelihood import Order, Profile
+    from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
+
+Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
+
+STRONG: Final = 10.0
+"""Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
+Statistical Association 90 (1995) 773-795); below `EVEN` the data do not tell the two apart."""
+
+EVEN: Final = 6.0
+
+EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
+"""Deviance above the freest structure's from which a simpler one is excluded, by the number of
+parameters that it lacks: chi-square's 0.1 %. A true one is excluded once in a thousand records."""
+
+BESIDE_DRAG: Final = (
+    "drag of the air takes part in it, by a law that is known to a few percent only"
+)
+"""Why external damping beside drag must not be taken for a property of the beam: of two records
+of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
+
+_MODES_FOR_AN_ORDER: Final = 2
+
+
+@dataclass(frozen=True, slots=True)
+class OrderVerdict:
+    """One order of the damping.
+
+    Attributes
+    ----------
+    order : str
+        "alpha" (internal damping, of the material) or "lambda" (external, of the surroundings).
+    status : str
+        "compatible": the 95 % interval holds 1; "fractional": the record excludes 1; "open": 1 is
+        doubtful but not excluded, or something else explains as much; "not identifiable": it could
+        be almost anything; "absent": such damping does not show, though the record would show it.
+    value : float or None
+        The estimate with the order free, where the order is identifiable.
+    interval : tuple of float or None
+        Its 95 % interval, by the likelihood ratio.
+    reason : str or None
+        Why the number must not be taken for a property of the beam; None: it may.
+    profile : Profile
+    """
+
+    order: Order
+    status: Status
+    value: float | None
+    interval: tuple[float, float] | None
+    reason: str | None
+    profile: Profile
+
+
+def order_verdict(
+    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+) -> OrderVerdict:
+    """Judge one order.
+
+    Parameters
+    ----------
+    field : Field
+    profile : Profile
+        Of the order, in the freest structure on the beam selected.
+    visible : tuple of int
+        Modes that the record shows.
+    doubt : str or None
+        Why nothing that rests on that structure is to be believed; None: it may be.
+    """
+    status, reason = _judged(field, profile, visible, doubt=doubt)
+    known = status not in ("not identifiable", "absent")
+    return OrderVerdict(
+        order=profile.order,
+        status=status,
+        value=profile.estimate if known else None,
+        interval=profile.interval if known else None,
+        reason=reason,
+        profile=profile,
+    )
+
+
+def _judged(
+    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+) -> tuple[Status, str | None]:
+    freest, order = field.freest, profile.order
+    untold = untold_reason(field, visible)
+    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
+        return "absent", "no such damping shows"
+    if untold is not None:
+        return "not identifiable", untold
+    if not profile.identifiable:
+        return "not identifiable", "the record does not tell the order"
+    if doubt is not None:
+        return "open", doubt
+    if order == "lambda" and field.drag is not None:
+        return "open", BESIDE_DRAG
+    for rival in field.of_other_kinds(STRONG):
+        if _integer(rival, order):
+            return "open", "order 1 on another kind of rig explains the record about as well"
+        if _elsewhere(rival, profile):
+            return "open", "another order on another kind of rig explains the record about as well"
+    if profile.admits_one:
+        return "compatible", None
+    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
+
+
+def untold_reason(field: Field, visible: tuple[int, ...]) -> str | None:
+    """Say why no order can be told from a record, whatever its likelihood says; None if it may.
+
+    Parameters
+    ----------
+    field : Field
+    visible : tuple of int
+        Modes that the record shows.
+    """
+    freest = field.freest
+    # The loss at one frequency is all that one mode shows; what may narrow an order then is how
+    # exactly the beam is uniform.
+    if len(visible) < _MODES_FOR_AN_ORDER:
+        return "one mode alone shows how much damping there is, not of which order"
+    if not freest.uniform and len(freest.structure.free) > len(visible):
+        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
+        return f"on a beam that is not uniform it rests on {len(visible)} loss factors alone"
+    return None
+
+
+def deviance_of_one(profile: Profile) -> float:
+    """Deviance of order 1 above the lowest; infinite where the walk along the order ended before.
+
+    Parameters
+    ----------
+    profile : Profile
+    """
+    return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
+
+
+def _integer(candidate: Candidate, order: Order) -> bool:
+    """Whether a structure has this damping with an order of 1."""
+    return candidate.structure.fixed.get(order) == 1.0
+
+
+def _elsewhere(candidate: Candidate, profile: Profile) -> bool:
+    """Whether a candidate with this damping has its order where the profile excludes it."""
+    low, high = profile.interval
+    here = low <= candidate.fit.parameters[profile.order] <= high
+    return candidate.structure.has(profile.order) and not here
+
+
+def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
+    """Candidates whose BIC is less than so much above that of the first, without the first."""
+    limit = field.best.bic + within
+    return tuple(c for c in field.candidates[1:] if c.bic < limit)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table of candidates.
+
+    Attributes
+    ----------
+    structure : str
+        "I" to "VII".
+    uniform : bool
+        Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
+    parameters : int
+    cost : float
+        Sum of squares of the whitened residual.
+    delta_bic, delta_aic : float
+        Above the lowest of all.
+    """
+
+    structure: str
+    uniform: bool
+    parameters: int
+    cost: float
+    delta_bic: float
+    delta_aic: float
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What can be said of one record.
+
+    Attributes
+    ----------
+    name : str
+        The file.
+    structure : str
+        Of the lowest BIC: "I" to "VII".
+    uniform : bool
+        Whether its beam is uniform.
+    rivals : tuple of str
+        Structures that the data cannot tell from it.
+    parameters : mapping of str to float
+        Of the freest structure on that beam, as `RecordFit` names them; those that carry a flag
+        are left out.
+    adequate : bool
+        Whether what remains of that is noise.
+    alpha, lambda_ : OrderVerdict
+    visible_modes : tuple of int
+        Modes that stand out of the noise.
+    findings : tuple of Finding
+        What else is in the record.
+    table : tuple of Row
+        All candidates, the lowest BIC first.
+    whiteness : Whiteness
+    input_relation : InputRelation
+    harmonics : tuple of Harmonic
+    sentences : tuple of str
+        The verdict in words, the most important first.
+    experiments : tuple of str
+        What would tell more.
+    damping_with_amplitude : tuple of DampingAt
+        Of free vibration, where the air brakes the beam; else empty.
+    """
+
+    name: str
+    structure: str
+    uniform: bool
+    rivals: tuple[str, ...]
+    parameters: Mapping[str, float]
+    adequate: bool
+    alpha: OrderVerdict
+    lambda_: OrderVerdict
+    visible_modes: tuple[int, ...]
+    findings: tuple[Finding, ...]
+    table: tuple[Row, ...]
+    whiteness: Whiteness
+    input_relation: InputRelation
+    harmonics: tuple[Harmonic, ...]
+    sentences: tuple[str, ...]
+    experiments: tuple[str, ...]
+    damping_with_amplitude: tuple[DampingAt, ...] = ()
+
+    def as_json(self) -> dict[str, object]:
+        """As `json.dumps` takes it; what is not finite becomes null."""
+        plain = _plain(dataclasses.asdict(self))
+        assert isinstance(plain, dict)
+        return plain
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {str(key).rstrip("_"): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

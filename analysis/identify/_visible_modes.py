@@ -1,0 +1,118 @@
+"""Which modes a record shows, and whether the motor was driven where the others are."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.identify._noise import Noise
+    from analysis.identify._problem import Comparison
+    from analysis.identify._result import RecordFit
+
+_EVIDENCE: Final = 400.0
+"""Deviance by which a response with a resonance must be better than a smooth one: the resonance is
+then known to a twentieth of its height, and its damping to about a tenth."""
+
+_OVER_NOISE: Final = 1.4
+"""What remains of a smooth response, over the noise, which is itself known to 10-20 % only."""
+
+_NEAR: Final = 0.05
+_HALF_WIDTHS: Final = 4.0
+_FARTHEST: Final = 0.4
+"""Window to either side of a mode, relative to its frequency: at least, in half-widths of the
+resonance, and at most."""
+
+_FEWEST_BINS: Final = 8
+"""To either side."""
+
+_DEGREE: Final = 2
+"""Of the polynomial in frequency that a response without a resonance is near the mode."""
+
+_DRIVEN: Final = 0.2
+"""Amplitude of what the motor was asked for, relative to that at mode 1, from which a mode counts
+as driven: a sweep has 1 there at all modes it passes, a step 1/6 at mode 2."""
+
+
+def visible_modes(comparison: Comparison, noise: Noise, fit: RecordFit) -> tuple[int, ...]:
+    """Modes without whose resonance the record cannot be explained.
+
+    Near each mode, the torque is compared with the best response to the angle that is smooth
+    there. What that leaves is noise alone, with chi-square of known mean and scatter, unless there
+    is a resonance: its energy against the noise is the evidence. Nothing is said of where exactly
+    in the window it lies, so a beam that is not uniform shows its modes as well.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    noise : Noise
+    fit : RecordFit
+        Tells where the modes are, and how wide.
+    """
+    torque = comparison.spectrum(comparison.torque_nm[comparison.kept])
+    angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
+    found = []
+    for mode in fit.modes:
+        offset = comparison.frequency_hz - mode.frequency_hz
+        reach_hz = _reach_hz(comparison, mode.frequency_hz, mode.damping_ratio)
+        near = (np.abs(offset) < reach_hz) & noise.counts
+        freedom = 2 * (int(np.count_nonzero(near)) - _DEGREE - 1)
+        if freedom < _FEWEST_BINS:
+            continue
+        weight = noise.weight[near]
+        left = _chi_square_of_smooth(
+            torque[near] * weight, angle[near] * weight, offset[near] / reach_hz
+        )
+        # Chance does neither: together they are nearly eight standard deviations, or more.
+        if left - freedom > _EVIDENCE and left > _OVER_NOISE * freedom:
+            found.append(mode.number)
+    return tuple(found)
+
+
+def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
+    """Whether the motor was driven near one frequency nearly as much as near another.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    frequency_hz, relative_to_hz : float
+    """
+    measurement = comparison.measurement
+    asked = measurement.reference_rad
+    asked_rad = measurement.angle_from_rest(1.0) if asked is None else asked - asked[0]
+    power = np.abs(np.fft.rfft(asked_rad)) ** 2
+    hz = np.fft.rfftfreq(asked_rad.size, 1 / measurement.rate_hz)
+
+    def amplitude(at_hz: float) -> float:
+        near = np.abs(hz - at_hz) <= max(_NEAR * at_hz, _FEWEST_BINS * hz[1])
+        return math.sqrt(float(np.mean(power[near]))) if near.any() else 0.0
+
+    return amplitude(frequency_hz) > _DRIVEN * amplitude(relative_to_hz) > 0
+
+
+def _reach_hz(comparison: Comparison, frequency_hz: float, damping_ratio: float) -> float:
+    """How far to either side of a mode is looked."""
+    spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
+    share = min(max(_NEAR, _HALF_WIDTHS * damping_ratio), _FARTHEST)
+    return max(share * frequency_hz, (_FEWEST_BINS + 0.5) * spacing_hz)
+
+
+def _chi_square_of_smooth(
+    torque: NDArray[np.complex128], angle: NDArray[np.complex128], place: NDArray[np.float64]
+) -> float:
+    """Sum of squares that the best smooth response leaves.
+
+    Parameters
+    ----------
+    torque, angle : ndarray of complex, shape (K,)
+        Whitened spectra.
+    place : ndarray, shape (K,)
+        Within the window, -1 to 1.
+    """
+    columns, _ = np.linalg.qr(np.array([place**k * angle for k in range(_DEGREE + 1)]).T)
+    left = torque - columns @ (columns.conj().T @ torque)
+    return float(np.vdot(left, left).real)

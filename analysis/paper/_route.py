@@ -1,0 +1,394 @@
+"""The paper's route from a record to models: Welch estimate, twelve fits, indices, modes, peaks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
+from analysis.paper._estimate import EstimateError, SettingsError, estimate, estimate_warnings
+from analysis.paper._fit import FitError, FrfFit, fit_many
+from rigd.beam import modes, transfer, undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from analysis.models import WelchSettings
+    from analysis.record import Record
+    from rigd.beam import Beam, Damping, Mode
+    from rigd.spectral import FrequencyResponse, Segmentation
+
+
+@dataclass(frozen=True, slots=True)
+class Indices:
+    """Distance between two frequency responses of a torque to an angle.
+
+    Attributes
+    ----------
+    mse : float
+        Mean square error, Eq. (28), in (N·m/rad)².
+    wmse : float
+        Mean square error weighted with 1/omega, Eq. (29), in (N·m/rad)².
+    md : float
+        Maximum deviation, Eq. (30), in N·m/rad.
+    """
+
+    mse: float
+    wmse: float
+    md: float
+
+
+def fit_indices(
+    omega_rad_s: NDArray[np.float64],
+    measured: NDArray[np.complex128],
+    model: NDArray[np.complex128],
+) -> Indices:
+    """Evaluate Eqs. (28) to (30) on complex deviations ``|G - Ĝ|``, all of shape (n,)."""
+    deviation = np.abs(measured - model)
+    square = deviation**2
+    return Indices(
+        mse=float(square.mean()),
+        wmse=float(weights(omega_rad_s, "omega") @ square),
+        md=float(deviation.max()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A resonant peak: the bin where the magnitude is largest, and the magnitude there."""
+
+    frequency_hz: float
+    magnitude_db: float
+
+
+@dataclass(frozen=True, slots=True)
+class PeakDeviation:
+    """One session's term of Eqs. (31) and (32) for one mode."""
+
+    frequency_rad_s: float
+    magnitude_db: float
+
+
+def resonant_peaks(
+    frequency_hz: NDArray[np.float64],
+    response: NDArray[np.complex128],
+    mode_hz: NDArray[np.float64],
+) -> tuple[Peak | None, ...]:
+    """Resonant peaks on the bins, as the paper takes them (not interpolated).
+
+    Parameters
+    ----------
+    frequency_hz : ndarray, shape (n,)
+        Positive, increasing.
+    response : ndarray of complex, shape (n,)
+    mode_hz : ndarray, shape (m,)
+        Where the modes are expected, increasing: a peak is sought between the geometric means of
+        neighbours, beyond the first and last as far again. The undamped frequencies will do.
+
+    Returns
+    -------
+    tuple of Peak or None, length m
+        None where no bin between those limits is a local maximum: the mode is damped away, or
+        lies outside the band. In dB re 1 unit of the response.
+    """
+    magnitude = np.abs(response)
+    ratio = np.sqrt(mode_hz[1:] / mode_hz[:-1])
+    # A lone mode is sought within half an octave.
+    first, last = (ratio[0], ratio[-1]) if ratio.size else (np.sqrt(2.0), np.sqrt(2.0))
+    lower = mode_hz / np.concatenate(([first], ratio))
+    upper = mode_hz * np.concatenate((ratio, [last]))
+    inner = magnitude[1:-1]
+    summits = 1 + np.flatnonzero((inner > magnitude[:-2]) & (inner >= magnitude[2:]))
+    peaks: list[Peak | None] = []
+    for low, high in zip(lower, upper, strict=True):
+        candidates = summits[(frequency_hz[summits] >= low) & (frequency_hz[summits] <= high)]
+        if candidates.size == 0:
+            peaks.append(None)
+            continue
+        best = candidates[np.argmax(magnitude[candidates])]
+        peaks.append(Peak(float(frequency_hz[best]), 20 * float(np.log10(magnitude[best]))))
+    return tuple(peaks)
+
+
+def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
+    """Deviations ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` in dB, Eqs. (31) and (32).
+
+    The paper averages them over sessions; this is the term of one.
+    """
+    return PeakDeviation(
+        frequency_rad_s=2 * np.pi * abs(measured.frequency_hz - model.frequency_hz),
+        magnitude_db=abs(measured.magnitude_db - model.magnitude_db),
+    )
+
+
+_DECAY_OVER_RECORD = 2.7
+"""sigma T: what wraps around shrinks by exp(-2 sigma T), rounding errors grow by exp(sigma T)."""
+
+
+def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
+    """Causal response of the exact model to the whole record's measured angle.
+
+    The beam is taken to rest before the first sample, at the angle of the segment ``rest`` or else
+    at the first angle. The record times exp(-sigma t) is padded with zeros and transformed: that
+    is its transform on s = sigma + j omega, where what wraps around has decayed. There it is
+    multiplied with ``G(s) + J_tool s²`` and the difference of the two channels' delays, then
+    transformed back, and the exponential undone.
+
+    Parameters
+    ----------
+    record
+        Its angle, beam, tool inertia and delays are used.
+    damping
+        Parameters of Eq. 25.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Torque in N·m as the sensor would give it at the record's time stamps.
+    """
+    samples = len(record.angle_rad)
+    padded = 1 << (2 * samples - 1).bit_length()
+    duration_s = samples / record.rate_hz
+    sigma = _DECAY_OVER_RECORD / duration_s
+    decay = np.exp(-sigma * np.arange(samples) / record.rate_hz)
+    s = sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1.0 / record.rate_hz)
+    origin_rad = record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
+    angle = np.fft.rfft((record.angle_rad - origin_rad) * decay, padded)
+    response = transfer(s, record.beam, damping) + record.tool_inertia_kg_m2 * s**2
+    response *= np.exp(-s * (record.torque_delay_s - record.angle_delay_s))
+    return np.asarray(np.fft.irfft(angle * response, padded)[:samples] / decay)
+
+
+def band_limited(
+    values: NDArray[np.float64], rate_hz: float, band_hz: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Values without what lies outside a band, by masking their Fourier transform (no delay).
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+    rate_hz
+        Sampling rate.
+    band_hz
+        First and last frequency that pass.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    padded = 1 << (2 * len(values) - 1).bit_length()
+    frequency_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
+    spectrum = np.fft.rfft(values, padded)
+    spectrum[(frequency_hz < band_hz[0]) | (frequency_hz > band_hz[1])] = 0.0
+    return np.asarray(np.fft.irfft(spectrum, padded)[: len(values)])
+
+
+def loudest_moment_s(
+    values: NDArray[np.float64], rate_hz: float, frequency_hz: float, *, bandwidth: float = 0.1
+) -> float:
+    """Time at which the oscillation near a frequency is largest.
+
+    The envelope is the magnitude of the analytic signal in ``frequency_hz (1 ± bandwidth)``, so
+    it works for a chirp as for any other excitation.
+
+    Returns
+    -------
+    float
+        Seconds from the first value.
+    """
+    padded = 1 << (len(values) - 1).bit_length()
+    frequencies_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
+    near = np.abs(frequencies_hz / frequency_hz - 1.0) <= bandwidth
+    analytic = np.zeros(padded, dtype=np.complex128)
+    analytic[: len(frequencies_hz)][near] = np.fft.rfft(values, padded)[near]
+    envelope = np.abs(np.fft.ifft(analytic)[: len(values)])
+    return float(np.argmax(envelope)) / rate_hz
+
+
+MODES: Final = 3
+LARGEST_SHIFT: Final = 0.1
+"""Of a mode's frequency against the undamped beam's: as much as a damping ratio of 0.4 makes."""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedModel:
+    """One fit with all that is said of it.
+
+    Attributes
+    ----------
+    fit : FrfFit
+    response : ndarray of complex, shape (n,)
+        The model with the tool's inertia on the bins that were fitted, in N·m/rad.
+    indices : Indices
+    modes : tuple of Mode
+        Of the beam alone, from its poles; empty where damping is so strong that one has none.
+    followed : tuple of bool
+        Mode by mode, whether it vibrates, and within `LARGEST_SHIFT` of the undamped beam's
+        frequency. If not, the fit has let go of that resonance: the mode is not the antenna's.
+    peaks : tuple of Peak or None
+        Resonant peaks of `response`, mode by mode.
+    deviations : tuple of PeakDeviation or None
+        From the measured peaks; None where either has no peak.
+    """
+
+    fit: FrfFit
+    response: NDArray[np.complex128]
+    indices: Indices
+    modes: tuple[Mode, ...]
+    followed: tuple[bool, ...]
+    peaks: tuple[Peak | None, ...]
+    deviations: tuple[PeakDeviation | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WelchAnalysis:
+    """Results for one record.
+
+    Attributes
+    ----------
+    record : Record
+    settings : WelchSettings
+        As asked for.
+    segmentation : Segmentation
+        As used: the settings at the record's rate.
+    response : FrequencyResponse
+        In the band, without the channels' delays.
+    whole_record : FrequencyResponse
+        Ratio of the transforms of the whole record, likewise, for comparison.
+    peaks : tuple of Peak or None
+        Measured resonant peaks, mode by mode.
+    models : tuple of FittedModel
+        By type, then by weighting, in the order of the settings.
+    warnings : tuple of str
+        What an analyst should read beside the results, the record's included.
+    """
+
+    record: Record
+    settings: WelchSettings
+    segmentation: Segmentation
+    response: FrequencyResponse
+    whole_record: FrequencyResponse
+    peaks: tuple[Peak | None, ...]
+    models: tuple[FittedModel, ...]
+    warnings: tuple[str, ...]
+
+
+def analyse(
+    record: Record,
+    settings: WelchSettings,
+    on_step: Callable[[str], None] = lambda _done: None,
+) -> WelchAnalysis:
+    """Estimate the frequency response of a record and fit the models to it.
+
+    Parameters
+    ----------
+    record : Record
+    settings : WelchSettings
+    on_step : callable, optional
+        Called with a few words after each step: the estimate, then every type.
+
+    Raises
+    ------
+    SettingsError
+        The segments, the band or the weightings make no sense.
+    EstimateError
+        Nothing was excited, or the record is too short for the segments.
+    """
+    _check_excited(record)
+    response, whole_record = estimate(record, settings)
+    on_step("frequency response")
+    peaks = _peaks(record.beam, response.frequency_hz, response.response)
+    beam_on_tool = FrequencyResponseModel(
+        response.frequency_hz, record.beam, record.tool_inertia_kg_m2
+    )
+    models: list[FittedModel] = []
+    for name in settings.types:
+        # A type at a time, so that progress can be shown; sharing among types is not worth much.
+        try:
+            fits = fit_many(
+                response.frequency_hz,
+                response.response,
+                record.beam,
+                [STRUCTURES[name]],
+                settings.weightings,
+                tool_inertia_kg_m2=record.tool_inertia_kg_m2,
+            )
+        except (FitError, WeightingError) as error:
+            raise SettingsError(f"{record.path}: {error}") from error
+        models.extend(_judged(fit, record.beam, response, beam_on_tool, peaks) for fit in fits)
+        on_step(f"type {name}")
+    return WelchAnalysis(
+        record=record,
+        settings=settings,
+        segmentation=settings.segmentation(record.rate_hz),
+        response=response,
+        whole_record=whole_record,
+        peaks=peaks,
+        models=tuple(models),
+        warnings=record.warnings + estimate_warnings(record, settings, response),
+    )
+
+
+def _check_excited(record: Record) -> None:
+    """Refuse a record in which the motor did not move, before segments and bands are discussed."""
+    angles = record.angle_rad[record.angle_known]
+    if record.metadata.get("excitation") == "hold":
+        raise EstimateError(
+            f"{record.path}: nothing was excited: the motor was held; record an excitation, such "
+            "as rigd run chirp."
+        )
+    if angles.size == 0 or np.ptp(angles) == 0:
+        raise EstimateError(
+            f"{record.path}: nothing was excited: the angle never changes; check the encoder and "
+            "that the motor moved."
+        )
+
+
+def _judged(
+    fit: FrfFit,
+    beam: Beam,
+    measured: FrequencyResponse,
+    beam_on_tool: FrequencyResponseModel,
+    measured_peaks: tuple[Peak | None, ...],
+) -> FittedModel:
+    """Evaluate a fitted model and all indices of it."""
+    response = beam_on_tool.evaluate(fit.damping)
+    peaks = _peaks(beam, measured.frequency_hz, response)
+    try:
+        found = modes(beam, fit.damping, MODES)
+    except ArithmeticError:
+        found = ()
+    return FittedModel(
+        fit=fit,
+        response=response,
+        indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, response),
+        modes=found,
+        followed=_followed(found, beam),
+        peaks=peaks,
+        deviations=tuple(
+            None if seen is None or modelled is None else peak_deviation(seen, modelled)
+            for seen, modelled in zip(measured_peaks, peaks, strict=True)
+        ),
+    )
+
+
+def _followed(found: tuple[Mode, ...], beam: Beam) -> tuple[bool, ...]:
+    """Tell the modes that vibrate about where the undamped beam's do."""
+    undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
+    return tuple(
+        mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_SHIFT
+        for mode, own_hz in zip(found, undamped_hz[: len(found)], strict=True)
+    )
+
+
+def _peaks(
+    beam: Beam, frequency_hz: NDArray[np.float64], response: NDArray[np.complex128]
+) -> tuple[Peak | None, ...]:
+    """Resonant peaks near the beam's first undamped frequencies."""
+    mode_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
+    return resonant_peaks(frequency_hz, response, mode_hz)

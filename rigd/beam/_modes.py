@@ -1,0 +1,219 @@
+"""Modes of the damped beam: clamped–free eigenvalues and shapes, complex poles, participation.
+
+G is a sum over the modes of the undamped clamped–free beam, which fractional damping does not
+couple::
+
+    G = sum_i a_i² P Q k_i⁴ / (Q k_i⁴ + P),   P = rho s² + c_v s^lambda,  Q = EI (1 + zeta s^alpha)
+
+with ``k_i = z_i / L``, ``1 + cos z_i cosh z_i = 0`` and ``a_i² = 4 L³ / z_i⁴``. Each mode's poles
+are the zeros of ``Q k_i⁴ + P`` on the principal sheet of the powers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rigd.beam._model import Beam, Damping
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+_HOMOTOPY_STEPS = (8, 64)
+"""Steps in which damping grows: few, and more for the beams where that loses a path."""
+
+_ON_THE_CUT = 1e-9
+"""How far beyond pi an argument may be, by rounding, of a pole that is all but real."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One mode of the beam on a motor that stands still."""
+
+    number: int
+    """From 1, in the order of the clamped–free eigenvalues."""
+    poles_rad_s: tuple[complex, complex]
+    """A conjugate pair (positive frequency first), or two real poles, slow one first."""
+    frequency_hz: float
+    """Of the free decay, ``|Im p| / 2 pi``: 0 if over-damped."""
+    natural_frequency_rad_s: float
+    """``sqrt(p_1 p_2)``."""
+    damping_ratio: float
+    """``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``: above 1 if over-damped."""
+
+
+def clamped_free_eigenvalues(n: int) -> Real:
+    """First `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,), to full precision."""
+    i = np.arange(1, n + 1)
+    middle = (i - 0.5) * np.pi
+    sign = np.where(i % 2 == 1, 1.0, -1.0)
+    # With z = (i - 1/2) pi + d the equation is sin d = ±sech z: no growing term, small d.
+    d = np.zeros(n)
+    for _ in range(8):
+        decay = np.exp(-(middle + d))
+        sech = 2 * decay / (1 + decay * decay)
+        tanh = (1 - decay * decay) / (1 + decay * decay)
+        d -= (np.sin(d) - sign * sech) / (np.cos(d) + sign * sech * tanh)
+    return middle + d
+
+
+def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
+    """First `n` natural frequencies of the beam without damping, shape (n,), in rad/s."""
+    z = clamped_free_eigenvalues(n)
+    frequencies: Real = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
+    return frequencies
+
+
+def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
+    """Shape of a mode (1, 2, …) at ``x / L`` in 0…1, with mean square 1 and 2 at the tip.
+
+    Written without growing exponentials, so high modes are as accurate as low ones.
+    """
+    z = float(clamped_free_eigenvalues(number)[-1])
+    x = z * np.asarray(x_over_length, dtype=np.float64)
+    cosine, sine, decay = np.cos(z), np.sin(z), np.exp(-z)
+    sum_ = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
+    one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
+    grown = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
+    sign = 1.0 if number % 2 == 1 else -1.0
+    shape: Real = sign * (np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + grown)
+    return shape
+
+
+def participation(beam: Beam, n: int) -> Real:
+    """First `n` factors ``a_i² = 4 L³ / z_i⁴``, shape (n,), in m³.
+
+    Times rho, a factor is the mode's share of the rigid beam's moment of inertia: all of them add
+    up to L³/3.
+    """
+    factors: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
+    return factors
+
+
+def poles(beam: Beam, damping: Damping, n: int) -> Complex:
+    """Poles of the first `n` modes, shape (n, 2), in rad/s.
+
+    A row holds a conjugate pair (positive frequency first), or two real poles (slow one first)
+    where integer-order damping exceeds the critical one.
+
+    Raises
+    ------
+    ArithmeticError
+        If a mode has no pole: damping so strong, with one order above 1 and the other below, that
+        it leaves the principal sheet.
+    """
+    found = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
+    missing = np.flatnonzero(np.isnan(found[:, 0]))
+    if missing.size:
+        raise ArithmeticError(
+            f"Mode {missing[0] + 1} has no pole on the principal sheet with {damping}."
+        )
+    return found
+
+
+def poles_for_eigenvalues(z: Real, beam: Beam, damping: Damping) -> Complex:
+    """Both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as `poles` has them.
+
+    With the roots of ``tan z = tanh z`` in place of the clamped–free eigenvalues these are the
+    zeros of G. A row is NaN if there is no root on the principal sheet.
+    """
+    omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
+    damper = damping.gamma / beam.density_over_stiffness
+    internal_first_order = damping.zeta == 0 or damping.alpha == 1
+    external_first_order = damping.gamma == 0 or damping.lambda_ == 1
+    if internal_first_order and external_first_order:
+        return _second_order_poles(omega_squared, damper + damping.zeta * omega_squared)
+    for steps in _HOMOTOPY_STEPS:
+        upper = _continued_poles(omega_squared, damper, damping, steps)
+        lost = np.isnan(upper)
+        if not lost.any():
+            break
+    else:
+        upper[lost] = _searched_poles(omega_squared[lost], damper, damping)
+    return np.stack([upper, upper.conj()], axis=1)
+
+
+def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
+    """First `n` modes of the beam; raises as `poles` does."""
+    found = []
+    for i, (first, second) in enumerate(poles(beam, damping, n)):
+        natural = float(np.sqrt((first * second).real))
+        found.append(
+            Mode(
+                number=i + 1,
+                poles_rad_s=(complex(first), complex(second)),
+                frequency_hz=float(abs(first.imag) / (2 * np.pi)),
+                natural_frequency_rad_s=natural,
+                damping_ratio=float((-first - second).real / (2 * natural)),
+            )
+        )
+    return tuple(found)
+
+
+def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
+    """Roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
+    half = -0.5 * rate
+    first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
+    second = first.conj()
+    over_damped = half * half > omega_squared
+    fast = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
+    second[over_damped] = fast[over_damped]
+    first[over_damped] = omega_squared[over_damped] / fast[over_damped]  # no cancellation
+    return np.stack([first, second], axis=1)
+
+
+def _continued_poles(omega_squared: Real, damper: float, damping: Damping, steps: int) -> Complex:
+    """Poles in the upper half plane, followed from the undamped ones while damping grows.
+
+    NaN where the path was lost or has left the principal sheet.
+    """
+    log_s: Complex = 0.5 * np.log(omega_squared) + 0.5j * np.pi
+    for fraction in (np.arange(1, steps + 1) / steps) ** 2:
+        log_s = _newton(log_s, omega_squared, fraction * damper, fraction * damping.zeta, damping)
+    poles: Complex = np.exp(log_s)
+    return poles
+
+
+def _searched_poles(omega_squared: Real, damper: float, damping: Damping) -> Complex:
+    """Poles in the upper half plane from many starts, most of them near the cut.
+
+    Near critical damping of a nearly first order, a pole turns along the cut so sharply that no
+    reasonable step follows it. NaN where no start leads to a pole on the principal sheet.
+    """
+    angles = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
+    starts: Complex = np.add.outer(1j * angles, np.linspace(-6, 6, 49)).ravel()
+    log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + starts
+    log_s = _newton(log_s, omega_squared[:, None], damper, damping.zeta, damping)
+    found = ~np.isnan(log_s)
+    first = np.argmax(found, axis=1)[:, None]
+    poles: Complex = np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
+    return poles
+
+
+def _newton(
+    log_s: Complex,
+    omega_squared: Real,
+    damper: float,
+    zeta: float,
+    damping: Damping,
+) -> Complex:
+    """Roots of the characteristic equation by Newton's method in ln s.
+
+    There a pole moves almost linearly, and one that leaves the principal sheet shows as an argument
+    beyond pi. NaN where nothing was found, or not in the upper half of the principal sheet.
+    """
+    with np.errstate(all="ignore"):  # a start that leads nowhere overflows
+        for _ in range(40):
+            inertial = np.exp(2 * log_s)
+            external = damper * np.exp(damping.lambda_ * log_s)
+            internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
+            residual = inertial + external + internal + omega_squared
+            slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
+            step = residual / slope
+            log_s = log_s - step
+            if not np.nanmax(np.abs(step), initial=0.0) > 1e-12:
+                break
+        scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
+        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _ON_THE_CUT)
+        solved = np.abs(residual) < 1e-9 * scale
+        return np.where(solved & on_sheet, log_s, np.nan + 0j)

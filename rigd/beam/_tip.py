@@ -1,0 +1,123 @@
+"""Motion of the beam's free end, predicted from the motor's angle.
+
+Of the boundary value problem of the beam, clamped on the shaft and free at its tip, the tip's
+displacement and slope over the angle are, with ``z = beta L`` as in
+`rigd.beam._model`::
+
+    Y(L)  = L (sin z + sinh z) / (z (1 + cos z cosh z))
+    Y'(L) = (cos z + cosh z) / (1 + cos z cosh z)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam._model import Beam, Damping
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complexfloating]
+
+SMALL_SLOPE_RAD = 0.14
+"""Slope of the tip against the root up to which the linear model holds.
+
+No part of a clamped beam slopes more than its tip. In the first mode this is a deflection of 10 %
+of the length, in the second of 3 %. What the model leaves out grows with the square: the tip comes
+nearer to the axis by up to a third of it in lengths, here 0.6 %, and curvature and inertia differ
+from the linear ones by shares of that size, which is what a careful session measures.
+"""
+
+_PADDED = 1.125
+_DECAY = 7.0
+_BLOCK = 1 << 15
+"""Frequencies that are evaluated at once, lest an hour at 1 kHz take a gigabyte."""
+
+
+@dataclass(frozen=True, slots=True)
+class TipMotion:
+    """Largest motion of the free end."""
+
+    deflection_m: float
+    """Relative to the line that the root points along."""
+    slope_rad: float
+    """Against that line."""
+    speed_m_s: float
+    """Through still air: with what the root's turning adds."""
+
+
+def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) -> TipMotion:
+    """Predict the largest motion of the tip.
+
+    Parameters
+    ----------
+    beam, damping
+        Of the exact model; no drag of the air.
+    angle_rad
+        Of the motor, from rest, shape (n,).
+    rate_hz
+        Samples a second.
+    """
+    n = angle_rad.size
+    padded = _quick_length(int(np.ceil(_PADDED * n)))
+    # On s = sigma + j omega what wraps round has decayed.
+    sigma = _DECAY * rate_hz / padded
+    s = sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz)
+    growth = np.exp(sigma * np.arange(n) / rate_hz)
+    # The angle stays where it ends: a jump back would ring at the last samples.
+    angle = np.full(padded, angle_rad[-1] - angle_rad[0])
+    angle[:n] = angle_rad - angle_rad[0]
+    turned = np.fft.rfft(angle * np.exp(-sigma * np.arange(padded) / rate_hz))
+    displaced, sloped = np.empty((2, s.size), dtype=np.complex128)
+    for start in range(0, s.size, _BLOCK):
+        some = slice(start, start + _BLOCK)
+        displaced[some], sloped[some] = tip_response(beam, damping, s[some])
+    displaced *= turned
+    sloped = (sloped - 1) * turned
+
+    def largest(spectrum: Complex) -> float:
+        return float(np.max(np.abs(np.fft.irfft(spectrum, padded)[:n] * growth)))
+
+    return TipMotion(
+        deflection_m=largest(displaced - beam.length_m * turned),
+        slope_rad=largest(sloped),
+        speed_m_s=largest(s * displaced),
+    )
+
+
+def _quick_length(least: int) -> int:
+    """Length of which a transform is quick: at most an eighth more than the least one."""
+    unit = 1 << max(0, least.bit_length() - 4)
+    return -(-least // unit) * unit
+
+
+def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
+    """Motion of the tip over the angle.
+
+    Parameters
+    ----------
+    beam, damping
+        Of the exact model.
+    s
+        In rad/s, not 0.
+
+    Returns
+    -------
+    displacement
+        In m/rad, of the shape of `s`.
+    slope
+        Dimensionless, likewise.
+    """
+    external = damping.gamma * s**damping.lambda_
+    internal = 1 + damping.zeta * s**damping.alpha
+    fourth = -(beam.density_over_stiffness * s * s + external) / internal
+    z = beam.length_m * np.sqrt(np.sqrt(fourth))
+    # Numerators and denominator over exp(z - j sign z): nothing overflows.
+    sign = np.where(z.imag < 0, -1.0, 1.0)
+    turn, fade = np.exp(1j * sign * z), np.exp(-z)
+    a, b = fade * fade, turn * turn
+    reciprocal = 1 / (4 * turn * fade + (1 + b) * (1 + a))
+    sines = 2 * turn * (1 - a) + 2j * sign * fade * (1 - b)
+    cosines = 2 * turn * (1 + a) + 2 * fade * (1 + b)
+    displacement: Complex = beam.length_m * sines * reciprocal / z
+    slope: Complex = cosines * reciprocal
+    return displacement, slope

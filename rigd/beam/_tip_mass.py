@@ -1,0 +1,226 @@
+"""Transfer function of the beam with a point mass at its tip and an elastic clamp, and its poles.
+
+With ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``q = z⁴ = -L⁴ p / c`` and the
+share ``mu = m s² / (L EI p)``, the tip's condition ``EI c y''' = m s² y`` turns Eq. 25 into::
+
+    G = -(EI/L) c (F + mu U) / (1 - mu F),    U = 2 z² sin z sinh z / (1 + cos z cosh z)
+
+F as in `rigd.beam._model`. A clamp that turns by kappa for a torque on the beam's root
+makes ``G / (1 + kappa G)`` of it.
+
+F and U are functions of q alone; ``q d/dq`` of them needs one more, ``B = z (cos z sinh z +
+sin z cosh z) / (1 + cos z cosh z)``::
+
+    q F' = (F + U + F²) / 4,    q U' = U/2 + z² B/2 + U F/4
+"""
+
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam._model import Beam, Damping
+from rigd.beam._modes import poles_for_eigenvalues
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_SERIES_LIMIT = 40.0
+_POWERS = (-4.0) ** np.arange(10)
+_D = np.array([_POWERS[k] / factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
+_N = np.array(
+    [
+        [scale * _POWERS[k] / factorial(4 * k + last) for k in range(10)]
+        for scale, last in ((4.0, 3), (4.0, 2), (2.0, 1))
+    ]
+)
+"""Power series in q of ``1 + cos z cosh z`` and of the numerators of F, U and z² B over q."""
+
+_HOMOTOPY_STEPS = 12
+_NEWTON_STEPS = 60
+_CONVERGED = 1e-13
+_ASIDE = 1e-7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedResponse:
+    """G of the beam with a tip mass, and what it changes by.
+
+    All of the shape of s; c, p and the mass are varied one at a time, EI and the length held.
+    """
+
+    response: Complex
+    by_elastic: Complex
+    """By c."""
+    by_inertial: Complex
+    """By p."""
+    by_mass: Complex
+    """By the tip's mass, in N·m/(rad kg)."""
+
+
+def loaded_response(
+    s_squared: Complex, elastic: Complex, inertial: Complex, beam: Beam, tip_mass_kg: float
+) -> LoadedResponse:
+    """Evaluate G with a tip mass on a rigid clamp.
+
+    Parameters
+    ----------
+    s_squared : ndarray of complex
+        In rad²/s², not 0.
+    elastic, inertial : ndarray of complex
+        c and p there.
+    beam : Beam
+        Its stiffness and length; its density is in p.
+    tip_mass_kg : float
+    """
+    stiffness, length = beam.bending_stiffness_n_m2, beam.length_m
+    f, u, f_slope, u_slope = _functions(-(length**4) * inertial / elastic)
+    per_mass = s_squared / (length * stiffness * inertial)
+    share = tip_mass_kg * per_mass
+    inverse = 1 / (1 - share * f)
+    loaded = (f + share * u) * inverse
+    by_share = (u + loaded * f) * inverse
+    slope = (f_slope + share * u_slope + share * loaded * f_slope) * inverse
+    per_length = -stiffness / length
+    return LoadedResponse(
+        response=per_length * elastic * loaded,
+        by_elastic=per_length * (loaded - slope),
+        by_inertial=per_length * elastic / inertial * (slope - share * by_share),
+        by_mass=per_length * elastic * per_mass * by_share,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedBeam:
+    """Beam with a tip mass on an elastic clamp.
+
+    Attributes
+    ----------
+    beam : Beam
+    damping : Damping
+    tip_mass_kg : float
+    root_compliance_rad_per_nm : float
+    """
+
+    beam: Beam
+    damping: Damping
+    tip_mass_kg: float = 0.0
+    root_compliance_rad_per_nm: float = 0.0
+
+    def transfer(self, s: Complex) -> Complex:
+        """Coupling torque per motor angle in N·m/rad, of the shape of `s` (rad/s, not 0)."""
+        response = self.at(s).response
+        return response / (1 + self.root_compliance_rad_per_nm * response)
+
+    def at(self, s: Complex) -> LoadedResponse:
+        """Give what the clamp, were it rigid, would have to exert, with its derivatives."""
+        elastic, inertial = self.factors(s)
+        return loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
+
+    def factors(self, s: Complex) -> tuple[Complex, Complex]:
+        """Elastic factor c and inertial factor p."""
+        log_s, damping = np.log(s), self.damping
+        elastic = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
+        external = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
+        return elastic, self.beam.density_over_stiffness * s * s + external
+
+    def slope(self, s: Complex, at: LoadedResponse) -> Complex:
+        """Differentiate `LoadedResponse.response` by s."""
+        log_s, damping = np.log(s), self.damping
+        internal = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
+        external = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
+        inertial = 2 * self.beam.density_over_stiffness * s * s + external
+        by_log_s: Complex = (
+            at.by_elastic * internal + at.by_inertial * inertial + 2 * self.tip_mass_kg * at.by_mass
+        )
+        return by_log_s / s
+
+    def poles(self, z: Real) -> Complex:
+        """Both poles of each mode with the rig's shaft held, shape (len(z), 2), in rad/s.
+
+        Followed from those of the bare beam on a rigid clamp while mass and compliance grow.
+
+        Parameters
+        ----------
+        z : ndarray
+            Clamped-free eigenvalues of the modes.
+
+        Returns
+        -------
+        ndarray of complex
+            As `rigd.beam._modes.poles_for_eigenvalues` has them; NaN where a path was lost.
+        """
+        return self._followed(z, zeros=False)
+
+    def zeros(self, z: Real) -> Complex:
+        """Zeros of the response, in pairs as `poles` has them.
+
+        Parameters
+        ----------
+        z : ndarray
+            Roots of ``tan z = tanh z``: those of the bare beam.
+        """
+        return self._followed(z, zeros=True)
+
+    def _followed(self, z: Real, *, zeros: bool) -> Complex:
+        """Follow poles or zeros from those of the bare beam."""
+        found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
+        if self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0:
+            return found
+        known = ~np.isnan(found[:, 0])
+        here = found[known].ravel() * (1 - _ASIDE)  # G is infinite at an undamped pole
+        for fraction in np.arange(1, _HOMOTOPY_STEPS + 1) / _HOMOTOPY_STEPS:
+            partly = LoadedBeam(
+                self.beam,
+                self.damping,
+                fraction * self.tip_mass_kg,
+                fraction * self.root_compliance_rad_per_nm,
+            )
+            here = partly._newton(here, zeros=zeros)
+        found[known] = here.reshape(-1, 2)
+        return found
+
+    def _newton(self, s: Complex, *, zeros: bool) -> Complex:
+        """Roots of ``1/G + kappa``, or of G, from starts close by; NaN where none is found."""
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON_STEPS):
+                at = self.at(s)
+                step = at.response / self.slope(s, at)
+                step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
+                s = s + step
+                if not np.nanmax(np.abs(step / s), initial=0.0) > _CONVERGED:
+                    return s
+            return np.where(np.abs(step) < 1e-9 * np.abs(s), s, np.nan + 0j)
+
+
+def _functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
+    """F, U, q F' and q U'."""
+    q = np.asarray(q, dtype=np.complex128)
+    f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
+    series = np.abs(q) < _SERIES_LIMIT
+    low = q[series]
+    divisor = np.polynomial.polynomial.polyval(low, _D)
+    for out, numerator in zip((f, u, b), _N, strict=True):
+        out[series] = low * np.polynomial.polynomial.polyval(low, numerator) / divisor
+    for out, values in zip((f, u, b), _scaled(q[~series]), strict=True):
+        out[~series] = values
+    return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
+
+
+def _scaled(q: Complex) -> tuple[Complex, Complex, Complex]:
+    """F, U and z² B from decaying exponentials only."""
+    # Real functions of q: what holds above the real axis, mirrored, holds below.
+    below = q.imag < 0
+    z = np.sqrt(np.sqrt(np.where(below, q.conj(), q)))
+    decay, turn = np.exp(-z), np.exp(1j * z)
+    a, b = decay * decay, turn * turn
+    reciprocal = 1 / (4 * decay * turn + (1 + a) * (1 + b))
+    sine, cosine = 1j * (1 - b) * (1 + a), (1 + b) * (1 - a)
+    found = (
+        z * (sine - cosine) * reciprocal,
+        2j * z**2 * (1 - a) * (1 - b) * reciprocal,
+        z**3 * (sine + cosine) * reciprocal,
+    )
+    first, second, third = (np.where(below, values.conj(), values) for values in found)
+    return first, second, third

@@ -1,0 +1,218 @@
+"""The loop itself, measured: real sessions of the real processes on a simulated rig."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+
+import numpy as np
+
+from rigd.bench._measure import Measurement, UsageMeter, measurement
+from rigd.devices import Selection
+from rigd.engine import ChildError, Phase, SessionJob, Stop, Word, put_reference
+from rigd.excitation import Excitation, hold
+from rigd.profile import Profile, load_profile
+from rigd.runner import Crew, Order, Rig, RigError, SessionFailedError, SessionProgress
+from rigd.runtime import StopRequest
+from rigd.session import decode_samples, read_session
+
+LOOK_S = 0.1
+AROUND_S = 3.5
+"""What a measurement takes beyond its record."""
+_BLOCK = 10_000
+_TARE_S = 0.2
+_NO_LIMIT = 1_000_000_000
+
+OnLook = Callable[[], None]
+
+
+class LoopError(Exception):
+    """The loop could not be measured; the message says why."""
+
+
+def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
+    """Return a profile with the same real-time settings and no hardware.
+
+    Everything is simulated in the control process. What ends a session because of late ticks is
+    measured here and ends nothing.
+
+    Parameters
+    ----------
+    profile
+        Whose settings count.
+    rate_hz
+        Of the loop.
+    spin_us
+        Last part of each wait that is spent polling the clock.
+    """
+    rig = profile.rig
+    return replace(
+        profile,
+        rig=replace(
+            rig,
+            rate_hz=rate_hz,
+            actuation=replace(rig.actuation, delay_s=1.0 / rate_hz),
+            devices=Selection("sim", "sim"),
+            simulation=rig.simulation or load_profile("sim").rig.simulation,
+            can=None,
+            acquisition=None,
+            cia402=None,
+            ati_can=None,
+            ati_serial=None,
+        ),
+        limits=replace(
+            profile.limits,
+            missed_ticks_in_a_row=_NO_LIMIT,
+            missed_percent=100.0,
+            stale_percent=100.0,
+            saturated_ticks_in_a_row=_NO_LIMIT,
+            tare_drift_nm=inf,
+        ),
+        session=replace(
+            profile.session,
+            tare_s=_TARE_S,
+            rest_velocity_rad_s=inf,
+            rest_torque_nm=inf,
+            tare_drift_nm=inf,
+            return_s=_TARE_S,
+        ),
+        realtime=replace(profile.realtime, spin_us=spin_us),
+    )
+
+
+@contextmanager
+def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Crew]]:
+    """Start the processes of a rig and end them.
+
+    Raises
+    ------
+    LoopError
+        If they do not start.
+    """
+    try:
+        with Crew(live=live) as crew:
+            rig = Rig(profile, crew=crew)
+            rig.connect()
+            yield rig, crew
+    except (RigError, SessionFailedError, ChildError, OSError) as error:
+        raise LoopError(str(error)) from error
+
+
+def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Measurement:
+    """Run the loop with nobody but a reader that empties the ring every now and then.
+
+    Parameters
+    ----------
+    name
+        What the measurement is called.
+    profile
+        From :func:`rig_for`.
+    seconds
+        Length of the record.
+    look
+        Called some ten times a second.
+
+    Raises
+    ------
+    LoopError
+        If the session does not go well.
+    """
+    rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
+    with connected(profile) as (_, crew):
+        channels, board = crew.channels, crew.channels.board
+        meter = UsageMeter(crew.control.pid)
+        board[Word.STOP] = Stop.NO
+        board[Word.GO] = 1
+        reference = put_reference(channels.reference_fd, excitation.reference_rad)
+        crew.control.send_object("session", SessionJob(profile, reference))
+        blocks = []
+        finished = None
+        while finished is None or "finished" not in finished:
+            finished = crew.control.poll(LOOK_S)
+            board.beat(Word.SUPERVISOR_BEAT)
+            meter.look(Phase(board[Word.PHASE]))
+            while block := channels.samples.take(_BLOCK):
+                blocks.append(block)
+            channels.controls.discard()
+            channels.timings.discard()
+            look()
+    _require(finished["finished"], finished["reason"])
+    return measurement(
+        name,
+        rate_hz,
+        np.concatenate([decode_samples(block) for block in blocks]),
+        scheduled=excitation.reference_rad.size,
+        cpu_percent=meter.cpu_percent,
+        page_faults=meter.page_faults,
+    )
+
+
+def run_session(
+    name: str, profile: Profile, seconds: float, look: OnLook, *, live: bool = False
+) -> Measurement:
+    """Run a whole session, as ``rigd run`` does, into a temporary file.
+
+    Parameters
+    ----------
+    name, profile, seconds, look
+        As for :func:`run_alone`.
+    live
+        With a live view.
+
+    Raises
+    ------
+    LoopError
+        If the session does not go well.
+    """
+    excitation = _excitation(profile, seconds)
+    with (
+        tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
+        connected(profile, live=live) as (rig, crew),
+    ):
+        order = Order(profile, excitation, Path(folder) / "bench.mcap")
+        meter = UsageMeter(crew.control.pid)
+        stop = StopRequest()
+        if live:
+            rig.show(order, stop)
+
+        def watch(progress: SessionProgress, _: object) -> None:
+            meter.look(progress.phase)
+            look()
+
+        result = rig.run(order, stop, watch)
+        _require(result.outcome, result.reason)
+        assert result.path is not None
+        samples = read_session(result.path).samples
+    return measurement(
+        name,
+        profile.rig.rate_hz,
+        samples,
+        scheduled=excitation.reference_rad.size,
+        cpu_percent=meter.cpu_percent,
+        page_faults=meter.page_faults,
+    )
+
+
+@contextmanager
+def busy_stranger(cores: set[int]) -> Iterator[int]:
+    """Have another program compute without end on some cores; gives its process id."""
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as stranger:
+        try:
+            os.sched_setaffinity(stranger.pid, cores)
+            yield stranger.pid
+        finally:
+            stranger.kill()
+
+
+def _excitation(profile: Profile, seconds: float) -> Excitation:
+    return hold(rate_hz=profile.rig.rate_hz, duration_s=seconds, rest_s=0.0)
+
+
+def _require(outcome: str, reason: str) -> None:
+    if outcome != "complete":
+        raise LoopError(reason)

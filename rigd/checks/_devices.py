@@ -1,0 +1,389 @@
+"""What the devices themselves say: connected, asked and polled, but never enabled.
+
+The exchange of a tick, as a session does it before the drive is enabled: SYNC, poll, replies.
+
+It runs in an ordinary process, which oversleeps now and then; what a device cannot do shows in
+most ticks.
+"""
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from math import isfinite
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from rigd.checks._rows import Row, Verdict, grade, name_of, value_of
+from rigd.devices import (
+    DeviceError,
+    Devices,
+    Reality,
+    RigParameters,
+    find_simulator,
+    open_devices,
+    reality,
+)
+from rigd.devices.cia402 import WATCHDOG, Outfit, Watchdog
+from rigd.engine import RealClock
+from rigd.profile import Profile
+
+_IN_HEX = ("vendor_id", "product_code", "supported_modes")
+
+
+@runtime_checkable
+class InspectableDrive(Protocol):
+    """A drive with an identity; simulated ones in this process have none."""
+
+    def identity(self) -> Mapping[str, object]:
+        """Return what it said of itself when it was connected; the keys end in their units."""
+
+
+@runtime_checkable
+class OutfittedDrive(Protocol):
+    """A drive whose objects were looked through when it was connected."""
+
+    def outfit(self) -> Outfit | None:
+        """Return what it turned out to have."""
+
+
+def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
+    """Show identity and rated torque; what contradicts the profile was refused on connecting."""
+    settings = rig.cia402
+    wanted = {
+        "rated_torque_nm": f"{rig.motor.rated_torque_nm:.4g} N·m",
+        "supported_modes": "0x200 (cyclic torque) among them",
+    }
+    if settings is not None:
+        wanted["vendor_id"] = f"{settings.vendor_id:#x}" if settings.vendor_id else "any"
+        wanted["product_code"] = f"{settings.product_code:#x}" if settings.product_code else "any"
+    for key, value in drive.identity().items():
+        if key in _IN_HEX and isinstance(value, int):
+            found = f"{value:#x}"
+        else:
+            found = "not stated by the drive" if value in (None, "") else value_of(key, value)
+        yield Row("drive", name_of(key), found, wanted.get(key, ""), Verdict.OK)
+    outfit = drive.outfit() if isinstance(drive, OutfittedDrive) else None
+    if outfit is not None:
+        yield from _safeguard_rows(outfit)
+
+
+def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
+    """Tell which watchdog stands, what stands in for what is missing, and what was accepted."""
+    stands, after_s = outfit.watchdog, outfit.watchdog_s
+    unproven = stands in (Watchdog.OWN, Watchdog.NONE)
+    yield Row(
+        "drive",
+        "watchdog",
+        f"{stands.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
+        "takes the torque off when this computer falls silent",
+        Verdict.WARNING if unproven else Verdict.OK,
+        _WATCHDOG_DETAIL.get(stands, ""),
+    )
+    accepted = outfit.accepted
+    for row in outfit.lacks:
+        missing = row.accept in accepted
+        told = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+        if row.accept == WATCHDOG:
+            told = f"stands in: {stands.value}" if stands is not Watchdog.NONE else ""
+        by_name = f'accepted by cia402.accept_without "{row.accept}"' if missing else ""
+        yield Row(
+            "drive",
+            f"object {row.place} ({row.name})",
+            "; ".join(("absent or not usable", *filter(None, (by_name, told)))),
+            "",
+            Verdict.WARNING if missing else Verdict.OK,
+            f"{row.name}: {row.sentence}" if missing else "",
+        )
+    for text in outfit.assigned:
+        yield Row("drive", "object set", text, "read back", Verdict.OK)
+
+
+_WATCHDOG_DETAIL = {
+    Watchdog.OWN: (
+        "Watchdog: its time is what the profile says (cia402.own_watchdog_s), which nothing here "
+        "can read back. Try it at a low torque: kill rigd, and see when the torque goes."
+    ),
+    Watchdog.NONE: (
+        "Watchdog: should this computer fail with the torque on, nothing but the wired stop (STO) "
+        "takes it off."
+    ),
+}
+
+
+MEASURED_S = 1.0
+_ROUNDING = 1.001
+# Of a stream's rate: beyond what clocks differ by, and beyond what the filter's weights stand for.
+_RATE_OFF, _RATE_WRONG = 0.01, 0.05
+
+_UNSTATED = "not stated by the sensor"
+_RANGES = ("range_n_nm", "range")
+_SHOWN = ("sensor", "device", "serial_number", "part_number", "calibration")
+_ALWAYS_SHOWN = ("firmware", "calibration_date")
+_STATUS = "status"
+_ASSUMED = "assumed"
+
+
+@runtime_checkable
+class MeasurableSensor(Protocol):
+    """A sensor whose rate can be measured; simulated ones in this process have none."""
+
+    def measure(self, duration_s: float) -> Mapping[str, float]:
+        """Poll it, or watch its stream, for a while; the keys of the result end in their units."""
+
+
+def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[Row]:
+    """Show identity and calibration, and compare ranges with the profile's."""
+    for key in _SHOWN:
+        if key in found:
+            yield Row("sensor", name_of(key), _value(key, found), _wanted(key, rig), Verdict.OK)
+    for key in _ALWAYS_SHOWN:
+        yield Row("sensor", name_of(key), _value(key, found), "", Verdict.OK)
+    yield _range_row(found, rig.sensor.range)
+    if found.get(_ASSUMED):
+        yield Row(
+            "sensor",
+            "counts and units",
+            "assumed, below",
+            "told by the sensor",
+            Verdict.WARNING,
+            f"Sensor: assumed are {found[_ASSUMED]}; compare with its calibration certificate.",
+        )
+    status = found.get(_STATUS)
+    if status is not None:
+        yield Row(
+            "sensor",
+            "status",
+            value_of(_STATUS, status),
+            "none",
+            grade(fail=False, warn=bool(status)),
+        )
+    more = [
+        f"{name_of(key)} {value_of(key, value)}"
+        for key, value in found.items()
+        if key not in (*_SHOWN, *_ALWAYS_SHOWN, *_RANGES, _STATUS, _ASSUMED, "matrix")
+        and value != ""
+    ]
+    if more:
+        detail = f"Sensor: {'; '.join(more)}."
+        yield Row("sensor", "more", f"{len(more)} values, below", "", Verdict.OK, detail)
+
+
+def measured_rows(measured: Mapping[str, float], rig: RigParameters) -> Iterator[Row]:
+    """Judge rate and turn-round of the sensor."""
+    for key, value in measured.items():
+        wanted, verdict = _judge(key, value, rig)
+        yield Row("sensor", name_of(key), value_of(key, value), wanted, verdict)
+
+
+def _value(key: str, found: Mapping[str, object]) -> str:
+    value = found.get(key)
+    return _UNSTATED if value in (None, "") else value_of(key, value)
+
+
+def _wanted(key: str, rig: RigParameters) -> str:
+    if key != "serial_number":
+        return ""
+    asked = rig.ati_can.serial_number if rig.ati_can else ""
+    return asked or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
+
+
+def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> Row:
+    limits = "profile: " + value_of("range_n_nm", wanted)
+    key = next((key for key in _RANGES if key in found), "")
+    rated = found.get(key)
+    if not isinstance(rated, list | tuple):
+        # Over CAN there is no request for it.
+        return Row("sensor", "range", _UNSTATED, limits, Verdict.OK)
+    beyond = any(ours > _ROUNDING * float(its) for ours, its in zip(wanted, rated, strict=True))
+    return Row("sensor", "range", value_of("range_n_nm", rated), limits, grade(fail=beyond))
+
+
+def _judge(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
+    """Return what a measured value should be, and whether it is."""
+    period_s = 1.0 / rig.rate_hz
+    acquisition = rig.acquisition
+    same_tick = acquisition is not None and acquisition.mode == "same_tick"
+    patience_s = acquisition.deadline_us * 1e-6 if acquisition and same_tick else period_s
+    patience = f"at most {patience_s * 1e3:.4g} ms"
+    if key == "polls_hz":
+        return f"at least {rig.rate_hz:g} Hz", grade(fail=not value >= rig.rate_hz)
+    if key == "records_hz" and rig.ati_serial is not None:
+        stated = rig.ati_serial.stream_hz
+        off = abs(value / stated - 1.0)
+        return f"{stated:g} Hz", grade(fail=not off <= _RATE_WRONG, warn=off > _RATE_OFF)
+    if key == "turnaround_median_s":
+        return patience, grade(fail=not value <= patience_s)
+    if key == "turnaround_p99_s":
+        return patience, grade(fail=False, warn=not value <= patience_s)
+    if key == "longest_gap_s":
+        return f"at most {period_s * 1e3:.4g} ms", grade(fail=False, warn=value > period_s)
+    # Everything else is a count of what should not happen.
+    return "0", grade(fail=False, warn=value > 0)
+
+
+TICKS = 500
+_FEW_MISSING = 0.02
+_MANY_MISSING = 0.2
+_GROUP = "exchange"
+
+
+def exchange_rows(profile: Profile, devices: Devices, moves: Reality) -> Iterator[Row]:
+    """Run some ticks without a torque, and judge how quickly and how surely the replies come.
+
+    Parameters
+    ----------
+    profile
+        Whose limits count.
+    devices
+        Connected, not enabled.
+    moves
+        In lock-step the simulated rig waits for this computer, and times mean nothing.
+
+    Raises
+    ------
+    DeviceError
+        If a device reports an error, or its line is gone.
+    """
+    drive, sensor = devices.drive, devices.sensor
+    period_ns = round(1e9 / profile.rig.rate_hz)
+    waited_ms, angles_rad = np.zeros(TICKS), np.zeros(TICKS)
+    missing_angles = missing_wrenches = saturated = 0
+    clock = RealClock()
+    due_ns = clock.now_ns()
+    for tick in range(TICKS):
+        due_ns = max(due_ns + period_ns, clock.now_ns())
+        clock.wait_until(due_ns)
+        begin_ns = time.monotonic_ns()
+        drive.latch(due_ns)
+        sensor.request(due_ns)
+        angles_rad[tick] = drive.read_angle()
+        sensor.read_wrench()
+        waited_ms[tick] = (time.monotonic_ns() - begin_ns) * 1e-6
+        missing_angles += drive.angle_stale
+        missing_wrenches += sensor.wrench_stale
+        saturated += sensor.wrench_saturated
+
+    yield _reply_row(profile, waited_ms, moves)
+    for what, missing in (
+        ("angles missing", missing_angles),
+        ("wrenches missing", missing_wrenches),
+    ):
+        verdict = grade(fail=missing > _MANY_MISSING * TICKS, warn=missing > _FEW_MISSING * TICKS)
+        yield Row(
+            _GROUP,
+            what,
+            f"{missing} of {TICKS} ticks",
+            f"at most {100 * _FEW_MISSING:.0f} %",
+            verdict,
+        )
+    yield Row(
+        _GROUP, "sensor saturated", f"{saturated} of {TICKS} ticks", "0", grade(fail=saturated > 0)
+    )
+    moved_rad = float(np.ptp(angles_rad))
+    allowed_rad = max(
+        profile.session.rest_velocity_rad_s * TICKS / profile.rig.rate_hz,
+        2.0 * profile.rig.encoder.resolution_rad,
+    )
+    yield Row(
+        _GROUP,
+        "shaft moved",
+        f"{moved_rad:.2g} rad",
+        f"at most {allowed_rad:.2g} rad",
+        grade(fail=False, warn=moved_rad > allowed_rad),
+    )
+
+
+def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: Reality) -> Row:
+    acquisition = profile.rig.acquisition
+    median, late = np.percentile(waited_ms, [50, 99]).tolist()
+    found = f"median {median:.2f} ms, 99 % within {late:.2f} ms"
+    what = "both replies after"
+    if acquisition is None or acquisition.mode == "previous_tick":
+        return Row(_GROUP, what, "a tick takes those of the tick before", "", Verdict.SKIPPED)
+    if moves is Reality.LOCK_STEP:
+        return Row(_GROUP, what, found, "any time (lock-step)", Verdict.OK)
+    limit_ms = acquisition.deadline_us * 1e-3
+    verdict = grade(fail=median >= limit_ms, warn=late >= limit_ms)
+    return Row(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
+
+
+def inspect_devices(profile: Profile) -> list[Row]:
+    """Connect to the devices of a profile, ask them, run some ticks, and let go of them.
+
+    No torque: the drive is never enabled. Whatever happens, both devices are closed.
+    """
+    rig = profile.rig
+    moves = reality(rig)
+    rows = list(_link_rows(rig, moves))
+    try:
+        devices = open_devices(rig)
+        with ExitStack() as closing:
+            closing.callback(devices.sensor.close)
+            closing.callback(devices.drive.close)
+            _ask(profile, devices, moves, rows)
+    except (DeviceError, OSError) as error:
+        rows.append(Row("devices", "open and close", str(error), "", Verdict.FAIL))
+    return rows
+
+
+def _ask(profile: Profile, devices: Devices, moves: Reality, rows: list[Row]) -> None:
+    rig, drive, sensor = profile.rig, devices.drive, devices.sensor
+
+    def about_drive() -> Iterator[Row]:
+        drive.connect()
+        yield Row("drive", "connection", _answer(moves), "an answer, no fault", Verdict.OK)
+        if isinstance(drive, InspectableDrive):
+            yield from drive_rows(drive, rig)
+
+    def about_sensor() -> Iterator[Row]:
+        sensor.connect()
+        yield Row("sensor", "connection", _answer(moves), "an answer, no error", Verdict.OK)
+        yield from calibration_rows(sensor.calibration(), rig)
+
+    def rate() -> Iterator[Row]:
+        if not isinstance(sensor, MeasurableSensor) or moves.any_clock:
+            yield Row("sensor", "rate", f"not measured: {moves.value}", "", Verdict.SKIPPED)
+        else:
+            yield from measured_rows(sensor.measure(MEASURED_S), rig)
+
+    # The drive last: once it is operational it expects a SYNC every period.
+    sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)
+    drive_answers = _try("drive", about_drive(), rows)
+    if moves is Reality.SIMULATED:
+        rows.append(Row("exchange", "ticks", "simulated in this process", "", Verdict.SKIPPED))
+    elif drive_answers and sensor_answers:
+        _try("exchange", exchange_rows(profile, devices, moves), rows)
+    else:
+        why = "not without drive and sensor"
+        rows.append(Row("exchange", "ticks", why, "", Verdict.SKIPPED))
+
+
+def _try(group: str, found: Iterable[Row], rows: list[Row]) -> bool:
+    """Take in rows up to the first error, which becomes one too; say whether there was none."""
+    try:
+        rows.extend(found)
+    except (DeviceError, OSError) as error:
+        rows.append(Row(group, "error", str(error), "", Verdict.FAIL))
+        return False
+    return True
+
+
+def _answer(moves: Reality) -> str:
+    return "simulated in this process" if moves is Reality.SIMULATED else "it answers"
+
+
+def _link_rows(rig: RigParameters, moves: Reality) -> Iterator[Row]:
+    simulator = find_simulator(rig.name)
+    if simulator is not None:
+        where = f"{moves.value} (process {simulator.pid})"
+        yield Row("link", "what moves", where, "", Verdict.OK)
+        return
+    yield Row("link", "what moves", moves.value, "", Verdict.OK)
+    if rig.can is not None:
+        bus = f"{rig.can.channel} ({rig.can.interface})"
+        yield Row("link", "CAN", bus, "", Verdict.OK)
+    if rig.ati_serial is not None:
+        yield Row(
+            "link", "serial", f"{rig.ati_serial.port}, {rig.ati_serial.baud} baud", "", Verdict.OK
+        )

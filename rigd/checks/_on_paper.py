@@ -1,0 +1,393 @@
+"""What profile and EDS alone show: the closed loop, worst travel, identifiers, assumed numbers.
+
+The closed loop on paper: stability, and how far it is from losing it.
+
+What is asked for depends on what a margin stands for (see :mod:`rigd.control._margins`). At the
+angle it is the rule of thumb for the gain of a feedback loop, a factor of 2. At torque command and
+torque reading, where the beam is cancelled and a factor of 2 cannot be had, it is the tolerance of
+a drive's torque constant and of a calibration, taken twice: 20 %. The phase has to bear what such
+an error turns a signal by at most (an error of 20 % across it: 11.5°), together with one period of
+delay at the second mode (16 Hz: 5.8°): 20°, rounded up. The delay has to bear one period more than
+the profile states: a reading or a command that is a tick late.
+
+A loop that misses this is a warning, not a failure: it is stable as described, and whether the
+description is right is what such a session may be for.
+
+How far the shaft still turns when nobody looks at it: the loop has failed, or runs blind.
+
+The worst that the limits allow: at the limit of the angle, moving outwards at the limit of the
+speed, with the peak torque pushing on. Three things end that, each after its own time:
+
+* the drive watches over the loop's heartbeat, and misses it when the loop has stopped;
+* a loop whose angles do not come goes on with the last one, heartbeat included, and ends the
+  session after ``limits.stale_ticks_in_a_row``;
+* a loop that was held up looks again after the ticks it missed, up to
+  ``limits.missed_ticks_in_a_row`` of them.
+
+Each is judged by itself, as if the others did not act. Then the shaft runs out, held back by its
+friction alone.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import degrees, inf, isinf, radians
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rigd.beam import RealisationError
+from rigd.checks._rows import Row, Verdict, grade
+from rigd.control import ControlDesignError, Margins, check_stability, close_loop, loop_margins
+from rigd.devices import AtiSerial, EdsError, RigParameters, read_eds
+from rigd.devices.ati import RECORD_BITS
+from rigd.devices.canbus import MAX_LOAD, BusLoad, bus_load, check_identifiers
+from rigd.devices.cia402 import Grade, judge
+from rigd.profile import Profile
+from rigd.safety import Limits
+
+if TYPE_CHECKING:
+    from rigd.devices import RigParameters
+
+TOLERANCE = 1.2
+"""Factor that the gains of command and torque reading may be wrong by, up and down."""
+LEAST_ANGLE_GAIN = 2.0
+LEAST_PHASE_RAD = radians(20.0)
+LEAST_DELAY_PERIODS = 1.0
+
+
+def loop_rows(profile: Profile) -> Iterator[Row]:
+    """Judge the loop of a profile's rig."""
+    try:
+        loop = close_loop(profile.loop_model())
+        warning = check_stability(loop)
+    except (ControlDesignError, RealisationError) as error:
+        yield Row("loop", "stability", str(error), "stable", Verdict.FAIL)
+        yield Row("loop", "margins", "the loop is not stable", "", Verdict.SKIPPED)
+        return
+    if warning is not None:
+        yield Row("loop", "stability", warning, "stable", Verdict.WARNING)
+        yield Row("loop", "margins", "the loop is not stable", "", Verdict.SKIPPED)
+        return
+    yield Row(
+        "loop",
+        "stability",
+        f"every mode decays, the slowest at {-loop.growth_per_s:.2g} /s",
+        "stable",
+        Verdict.OK,
+    )
+    period_s = 1.0 / profile.rig.rate_hz
+    for margins in loop_margins(loop):
+        least_gain = LEAST_ANGLE_GAIN if margins.cut == "angle reading" else TOLERANCE
+        yield from _margin_rows(margins, least_gain, LEAST_DELAY_PERIODS * period_s)
+
+
+def _margin_rows(margins: Margins, least_gain: float, least_delay_s: float) -> Iterator[Row]:
+    group = f"loop, {margins.cut}"
+    too_strong = (
+        "any" if margins.gain_up == inf else _at(f"{margins.gain_up:.2f}", margins.gain_up_hz)
+    )
+    too_weak = (
+        "0" if margins.gain_down == 0.0 else _at(f"{margins.gain_down:.2f}", margins.gain_down_hz)
+    )
+    yield Row(
+        group,
+        "gain margin",
+        f"factor {too_weak} to {too_strong}",
+        f"{1 / least_gain:.2f} to {least_gain:.2f}",
+        grade(fail=False, warn=margins.gain_up < least_gain or margins.gain_down > 1 / least_gain),
+    )
+    yield Row(
+        group,
+        "phase margin",
+        _at(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
+        f"{degrees(LEAST_PHASE_RAD):.0f}°",
+        grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_RAD),
+    )
+    yield Row(
+        group,
+        "delay margin",
+        "any"
+        if margins.delay_s == inf
+        else _at(f"{margins.delay_s * 1e3:.2f} ms", margins.delay_hz),
+        f"{least_delay_s * 1e3:.2f} ms",
+        grade(fail=False, warn=margins.delay_s < least_delay_s),
+    )
+    yield Row(
+        group,
+        "distance from -1",
+        _at(f"{margins.modulus:.2f}", margins.modulus_hz),
+        "",
+        Verdict.OK,
+    )
+
+
+def _at(value: str, frequency_hz: float) -> str:
+    return value if frequency_hz != frequency_hz else f"{value} ({frequency_hz:.1f} Hz)"
+
+
+_STEP_S = 5e-5
+_FOR_EVER_RAD = 100.0
+_GROUP = "travel"
+_LOOP_FAILS = "if the loop fails"
+
+
+@dataclass(frozen=True, slots=True)
+class Travel:
+    """Angles from where the loop fails, in rad."""
+
+    driven_rad: float
+    """While the torque is still on; infinite beyond 100 rad."""
+    coasting_rad: float
+    """After it; infinite likewise, and if no friction ends it."""
+
+    @property
+    def total_rad(self) -> float:
+        """Angle to where the shaft stands."""
+        return self.driven_rad + self.coasting_rad
+
+
+def worst_travel(
+    rig: RigParameters, limits: Limits, blind_s: float, max_speed_rad_s: float = inf
+) -> Travel:
+    """Return the worst travel while nobody looks.
+
+    Parameters
+    ----------
+    rig, limits
+        Of the profile.
+    blind_s
+        For how long the torque stays on; infinite if nothing ends it.
+    max_speed_rad_s
+        Above which the drive by itself exerts no torque.
+
+    Notes
+    -----
+    What is not known is taken at its worst: while the torque is on the beam does not hold the motor
+    back, and after it all of the beam turns on with the shaft, as if it were rigid.
+    """
+    if isinf(blind_s):
+        return Travel(inf, inf)
+    motor, beam = rig.motor, rig.beam
+    light_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
+    heavy_kg_m2 = light_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
+    speed_rad_s = limits.velocity_rad_s
+    driven_rad = 0.0
+    steps = round(blind_s / _STEP_S)
+    for step in range(steps):
+        torque_nm = motor.peak_torque_nm - _friction_nm(rig, speed_rad_s)
+        faster_rad_s = max(0.0, speed_rad_s + torque_nm / light_kg_m2 * _STEP_S)
+        before_rad_s, speed_rad_s = speed_rad_s, min(faster_rad_s, max_speed_rad_s)
+        driven_rad += 0.5 * (before_rad_s + speed_rad_s) * _STEP_S
+        if speed_rad_s == before_rad_s:  # it goes on like this
+            driven_rad += speed_rad_s * (steps - 1 - step) * _STEP_S
+            break
+        if driven_rad > _FOR_EVER_RAD:
+            break
+    if driven_rad > _FOR_EVER_RAD:
+        return Travel(inf, inf)
+    coasting_rad = 0.0
+    while speed_rad_s > 0.0:
+        slower_rad_s = speed_rad_s - _friction_nm(rig, speed_rad_s) / heavy_kg_m2 * _STEP_S
+        coasting_rad += 0.5 * (speed_rad_s + max(0.0, slower_rad_s)) * _STEP_S
+        if coasting_rad > _FOR_EVER_RAD or slower_rad_s == speed_rad_s:
+            return Travel(driven_rad, inf)
+        speed_rad_s = slower_rad_s
+    return Travel(driven_rad, coasting_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class _Blindness:
+    """One way in which nobody looks at the shaft while the torque stays on."""
+
+    what: str
+    duration_s: float
+    ended_by: str
+    """What ends it, with its key."""
+    key: str
+
+
+def _ways(profile: Profile) -> tuple[_Blindness, ...]:
+    rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
+    assert drive is not None
+    stale, missed = limits.stale_ticks_in_a_row, limits.missed_ticks_in_a_row
+    own = drive.watchdog_s > drive.heartbeat_timeout_s
+    watchdog = "cia402.own_watchdog_s" if own else "cia402.heartbeat_timeout_s"
+    return (
+        _Blindness(
+            _LOOP_FAILS,
+            drive.watchdog_s,
+            f"of the drive's watchdog ({watchdog})",
+            watchdog,
+        ),
+        # The tick that finds one too many switches off, and its command has its own delay.
+        _Blindness(
+            "if no angle comes",
+            (stale + 1) / rig.rate_hz + rig.actuation.delay_s,
+            f"of {stale} old angles (limits.stale_ticks_in_a_row)",
+            "limits.stale_ticks_in_a_row",
+        ),
+        _Blindness(
+            "if ticks are missed",
+            (missed + 1) / rig.rate_hz + rig.actuation.delay_s,
+            f"of {missed} missed ticks (limits.missed_ticks_in_a_row)",
+            "limits.missed_ticks_in_a_row",
+        ),
+    )
+
+
+def travel_rows(profile: Profile) -> Iterator[Row]:
+    """Compare the worst travel of each way with what is left behind the limit of the angle."""
+    rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
+    if drive is None:
+        why = "the drive is part of this program and ends with it"
+        yield Row(_GROUP, _LOOP_FAILS, why, "", Verdict.SKIPPED)
+        return
+    ways = _ways(profile)
+    margin_rad = limits.stop_angle_rad - limits.angle_rad
+    bound = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
+    unbounded = isinf(drive.watchdog_s)
+    if unbounded:
+        ways = tuple(way for way in ways if not isinf(way.duration_s))
+        yield Row(
+            _GROUP,
+            f"worst, {_LOOP_FAILS}",
+            "without bound: the profile accepts a drive without a watchdog",
+            bound,
+            Verdict.WARNING,
+            f"Travel {_LOOP_FAILS}: nothing but the wired stop ends it "
+            '(cia402.accept_without = ["watchdog"]).',
+        )
+    limited = drive.max_speed_rad_s > 0
+    most_rad_s = drive.max_speed_rad_s if limited else inf
+    travels = [worst_travel(rig, limits, way.duration_s, most_rad_s) for way in ways]
+    longest = max(range(len(ways)), key=lambda number: travels[number].total_rad)
+    for number, (way, travel) in enumerate(zip(ways, travels, strict=True)):
+        too_far = not travel.total_rad <= margin_rad
+        detail = ""
+        if number == longest:
+            free = worst_travel(rig, limits, way.duration_s)
+            detail = "" if unbounded else f"Travel: the worst is {way.what}. "
+            detail += (
+                f"It counts on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
+                f"(object 6080); without it, it would be {_angle(free.total_rad)}."
+                if limited
+                else "The drive's own speed limit (object 6080) is not set; "
+                "cia402.max_speed_rad_s shortens it."
+            )
+        if too_far:
+            detail += (
+                f" Travel {way.what}: lower {way.key}, cia402.max_speed_rad_s, "
+                "limits.velocity_rad_s or limits.angle_rad."
+            )
+        worst = "worst, " if number == longest and not unbounded else ""
+        yield Row(
+            _GROUP,
+            f"{worst}{way.what}",
+            f"{_angle(travel.total_rad)}: {_angle(travel.driven_rad)} in the "
+            f"{way.duration_s * 1e3:g} ms {way.ended_by}, {_angle(travel.coasting_rad)} "
+            "running out",
+            bound,
+            grade(fail=too_far),
+            detail.strip(),
+        )
+
+
+def _angle(angle_rad: float) -> str:
+    return f"more than {_FOR_EVER_RAD:g} rad" if isinf(angle_rad) else f"{angle_rad:.2f} rad"
+
+
+def _friction_nm(rig: RigParameters, speed_rad_s: float) -> float:
+    return rig.motor.viscous_nm_s_per_rad * speed_rad_s + rig.motor.coulomb_nm
+
+
+_VERDICTS = {
+    Grade.FITS: Verdict.OK,
+    Grade.STANDS_IN: Verdict.OK,
+    Grade.ASK: Verdict.SKIPPED,
+    Grade.ACCEPTED: Verdict.WARNING,
+    Grade.DOUBT: Verdict.WARNING,
+    Grade.REFUSED: Verdict.FAIL,
+}
+
+
+def eds_rows(path: Path, rig: "RigParameters | None") -> Iterator[Row]:
+    """Hold an EDS file against what rigd asks of a drive.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    rig
+        Of the profile that the drive is to serve, or None.
+    """
+    try:
+        node_id = rig.cia402.node_id if rig is not None and rig.cia402 is not None else 1
+        eds = read_eds(path, node_id)
+    except EdsError as error:
+        yield Row("EDS", "file", str(error), "", Verdict.FAIL)
+        return
+    yield Row("EDS", "file", str(path), "", Verdict.OK)
+    for finding in judge(eds, rig).findings:
+        yield Row(
+            "EDS",
+            finding.what,
+            finding.found,
+            finding.wanted,
+            _VERDICTS[finding.grade],
+            finding.sentence,
+        )
+
+
+HIGH_LOAD = 0.7
+"""Above, one more device does not fit, nor do repeated frames after a disturbance."""
+
+
+def profile_rows(profile: Profile) -> Iterator[Row]:
+    """Say which profile it is, and which of its numbers nobody has verified."""
+    yield Row("profile", profile.name, str(profile.path), "", Verdict.OK)
+    assumed = [key for key, source in profile.sources.items() if source == "assumed"]
+    yield Row(
+        "profile",
+        "numbers assumed",
+        f"{len(assumed)} of {len(profile.sources)}",
+        "none",
+        grade(fail=False, warn=bool(assumed)),
+        f"Assumed: {', '.join(assumed)}." if assumed else "",
+    )
+
+
+def wiring_rows(rig: RigParameters) -> Iterator[Row]:
+    """Judge identifiers and load of what the profile connects."""
+    if rig.can is not None:
+        collisions = check_identifiers(rig)
+        for collision in collisions:
+            yield Row("CAN bus", "identifiers", collision, "no collision", Verdict.FAIL)
+        if not collisions:
+            yield Row("CAN bus", "identifiers", "no collision", "no collision", Verdict.OK)
+        yield _bus_row(bus_load(rig), rig.can.bitrate_bit_s)
+    if rig.ati_serial is not None:
+        yield _line_row(rig.ati_serial)
+
+
+def _bus_row(load: BusLoad, bitrate_bit_s: int) -> Row:
+    frames = ", ".join(
+        f"{t.what} ({t.can_id:#05x}, {t.length} bytes, {t.rate_hz:g} Hz)" for t in load.traffic
+    )
+    return Row(
+        "CAN bus",
+        "load",
+        f"{100 * load.worst:.1f} % at worst, {100 * load.plain:.1f} % without stuffing",
+        f"at most {100 * MAX_LOAD:.0f} %",
+        grade(fail=load.worst > MAX_LOAD, warn=load.worst > HIGH_LOAD),
+        f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames}.",
+    )
+
+
+def _line_row(serial: AtiSerial) -> Row:
+    load = RECORD_BITS * serial.stream_hz / serial.baud
+    return Row(
+        "serial line",
+        "load",
+        f"{100 * load:.1f} % of {serial.baud} bit/s",
+        f"at most {100 * MAX_LOAD:.0f} %",
+        grade(fail=load > MAX_LOAD),
+    )

@@ -1,0 +1,456 @@
+"""The daemon as its clients see it: one blocking connection, and a stop that does not give up."""
+
+import json
+import os
+import signal
+import socket
+import struct
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import fields
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rigd.daemon._address import peer_of, running
+from rigd.live import LiveAddress
+from rigd.live import running as running_views
+
+Document = dict[str, Any]
+
+STOP_SIGNAL = signal.SIGUSR1
+"""Asks the daemon's process for what `stop` asks for."""
+
+_ANSWER_PATIENCE_S = 60.0
+"""Connecting the devices anew takes up to half of it."""
+_CONNECT_PATIENCE_S = 5.0
+_CROWD_PATIENCE_S = 10.0
+"""For a daemon that turns clients away, or takes nobody."""
+_STOP_PATIENCE_S = 10.0
+_STOP_ANSWER_S = 0.5
+_SIGNAL_AFTER_S = 0.3
+_END_PATIENCE_S = 3.0
+"""In which what a dead daemon has left ends by itself."""
+_PAUSE_S = 0.02
+_TIME = struct.Struct("@ll")
+_UNKNOWN = (
+    "Whether a session still runs is not known: look at the rig, and press the wired stop (STO) if "
+    "anything moves."
+)
+
+
+class DaemonGoneError(Exception):
+    """The daemon cannot be reached, or is gone; the message is for the operator.
+
+    Parameters
+    ----------
+    message
+        What is known without looking.
+    lost
+        Process and user of a daemon whose connection was lost.
+    """
+
+    def __init__(self, message: str, lost: tuple[int, int] | None = None) -> None:
+        super().__init__(message)
+        self._lost = lost
+
+    def after_looking(self) -> str:
+        """Say what there still is of a daemon that was lost, which takes up to 3 s to see."""
+        return str(self) if self._lost is None else what_is_left(*self._lost)
+
+
+class RefusedByDaemonError(Exception):
+    """The daemon refuses a request, or it failed; the message is the daemon's."""
+
+    def __init__(self, message: str, *, wrong_use: bool) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
+
+
+class Client:
+    """A connection to a daemon; leaving its context closes it.
+
+    Parameters
+    ----------
+    path
+        Of the socket.
+    connect_s
+        Time for a daemon that takes no connections, being suspended or beset by others.
+    answer_s
+        Time for a reply.
+
+    Attributes
+    ----------
+    pid, uid
+        Of the process that listens there, as the kernel knows it.
+
+    Raises
+    ------
+    DaemonGoneError
+        If nobody listens there, or takes the connection in time.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        connect_s: float = _CONNECT_PATIENCE_S,
+        answer_s: float = _ANSWER_PATIENCE_S,
+    ) -> None:
+        self._path = path
+        self._connect_s = connect_s
+        self._answer_s = answer_s
+        self._events: deque[Document] = deque()
+        self._connect()
+
+    def _connect(self) -> None:
+        self._pending = b""
+        self._link = link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            # The kernel's own time-out: with Python's, a full queue is a failure at once.
+            patience = _TIME.pack(*divmod(round(self._connect_s * 1e6), 1_000_000))
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, patience)
+            link.connect(str(self._path))
+            self.pid, self.uid = peer_of(link)
+        except BlockingIOError:
+            link.close()
+            raise DaemonGoneError(
+                f"The daemon on {self._path} takes no connection within {self._connect_s:g} s: "
+                f"it is suspended, or beset by others. {_UNKNOWN}"
+            ) from None
+        except OSError as error:
+            link.close()
+            raise DaemonGoneError(
+                f"The daemon on {self._path} cannot be reached ({error.strerror or error})."
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let the daemon go; what was started goes on."""
+        self._link.close()
+
+    def ask(self, command: str, **fields: object) -> Document:
+        """Send a request and wait for its reply; events that come meanwhile are kept.
+
+        A daemon that has turned this client away, because there were too many, is asked again: it
+        has not obeyed then.
+
+        Raises
+        ------
+        RefusedByDaemonError
+            If the reply is a refusal.
+        DaemonGoneError
+            If there is none.
+        """
+        deadline_s = time.monotonic() + min(_CROWD_PATIENCE_S, self._answer_s)
+        while True:
+            try:
+                return self._ask_once(command, fields)
+            except _CrowdedError:
+                if time.monotonic() > deadline_s:
+                    raise
+                time.sleep(_PAUSE_S)
+                self.close()
+                self._connect()
+
+    def _ask_once(self, command: str, fields: dict[str, object]) -> Document:
+        self.send(command, **fields)
+        deadline_s = time.monotonic() + self._answer_s
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            message = self._next(left_s)
+            if message is None:
+                continue
+            if "event" in message:
+                self._events.append(message)
+            elif not message.get("ok"):
+                raise _refusal(message)
+            else:
+                return message
+        raise DaemonGoneError(
+            f"The daemon (process {self.pid}) does not answer within {self._answer_s:g} s. "
+            f"{_UNKNOWN}"
+        )
+
+    def send(self, command: str, **fields: object) -> None:
+        """Send a request whose reply nobody waits for.
+
+        Raises
+        ------
+        DaemonGoneError
+            If it cannot be sent.
+        """
+        line = json.dumps({"command": command, **fields}).encode() + b"\n"
+        try:
+            self._link.settimeout(_ANSWER_PATIENCE_S)
+            self._link.sendall(line)
+        except OSError:
+            # It may have said why before it left.
+            self._raise_what_was_said()
+            raise self._gone() from None
+
+    def event(self, timeout_s: float) -> Document | None:
+        """Return the next event (or reply), or None if none comes in time.
+
+        Raises
+        ------
+        DaemonGoneError
+            If the daemon is gone.
+        """
+        return self._events.popleft() if self._events else self._next(timeout_s)
+
+    def _next(self, timeout_s: float) -> Document | None:
+        deadline_s = time.monotonic() + timeout_s
+        while b"\n" not in self._pending:
+            self._link.settimeout(max(1e-3, deadline_s - time.monotonic()))
+            try:
+                data = self._link.recv(65_536)
+            except TimeoutError:
+                return None
+            except OSError:
+                data = b""
+            if not data:
+                raise self._gone()
+            self._pending += data
+        line, self._pending = self._pending.split(b"\n", 1)
+        try:
+            message = json.loads(line)
+        except ValueError:
+            message = None
+        if not isinstance(message, dict):
+            raise DaemonGoneError("What answers on the socket is no daemon of this version.")
+        return message
+
+    def _raise_what_was_said(self) -> None:
+        try:
+            while (message := self._next(0.1)) is not None:
+                if "error" in message:
+                    raise _refusal(message)
+        except DaemonGoneError:
+            return
+
+    def _gone(self) -> DaemonGoneError:
+        return DaemonGoneError(
+            f"The connection to the daemon (process {self.pid}) is lost.", (self.pid, self.uid)
+        )
+
+
+class _CrowdedError(RefusedByDaemonError):
+    """The daemon has not obeyed, because there were too many clients."""
+
+
+def _refusal(message: Document) -> RefusedByDaemonError:
+    kind = _CrowdedError if message.get("crowded") else RefusedByDaemonError
+    return kind(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
+
+
+def stop_session(path: Path) -> Document:
+    """Have a daemon stop what it runs; asks again and again, then sends its process a signal.
+
+    Parameters
+    ----------
+    path
+        Of its socket.
+
+    Returns
+    -------
+    dict
+        Its reply, and ``signalled``: whether its process was sent the signal before. Then what ran
+        may have ended before it replied.
+
+    Raises
+    ------
+    RefusedByDaemonError
+        If it refuses.
+    DaemonGoneError
+        If it has not said for 10 s that it stops; the message tells what was done and seen.
+    """
+    began_s = time.monotonic()
+    seen: tuple[int, int] | None = None
+    signalled = False
+    answer_s = _STOP_ANSWER_S
+    while True:
+        try:
+            with Client(path, answer_s, answer_s) as client:
+                seen = client.pid, client.uid
+                return client.ask("stop") | {"signalled": signalled}
+        except (DaemonGoneError, _CrowdedError) as error:
+            failure = str(error)
+        waited_s = time.monotonic() - began_s
+        if seen is not None and not signalled and waited_s > _SIGNAL_AFTER_S:
+            signalled = _signal_stop(seen[0])
+        if waited_s > _STOP_PATIENCE_S or not path.exists():
+            break
+        # A daemon that is starved of processor time obeys, and answers late.
+        answer_s = min(2.0 * answer_s, _STOP_PATIENCE_S)
+        time.sleep(_PAUSE_S)
+    if seen is None:
+        raise DaemonGoneError(failure)
+    if not signalled:
+        raise DaemonGoneError(failure, seen)
+    raise DaemonGoneError(
+        f"The daemon (process {seen[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
+        f"has said nothing for {waited_s:.0f} s. {_UNKNOWN}"
+    )
+
+
+def await_end(path: Path, patience_s: float) -> Document | None:
+    """Wait until a daemon says that no session runs.
+
+    Returns
+    -------
+    dict or None
+        Its status then; None if it has not said so in that time: it still stops one, or a crowd
+        keeps this client out.
+
+    Raises
+    ------
+    RefusedByDaemonError, DaemonGoneError
+        If it cannot be asked any more.
+    """
+    deadline_s = time.monotonic() + patience_s
+    with Client(path, answer_s=patience_s) as client:
+        while True:
+            try:
+                status = client.ask("status")
+            except _CrowdedError:
+                return None
+            series = status["series"]
+            if status["state"] not in ("running", "stopping") and not (
+                series is not None and series["running"]
+            ):
+                return status
+            if time.monotonic() > deadline_s:
+                return None
+            time.sleep(_PAUSE_S)
+
+
+def what_is_left(pid: int, uid: int) -> str:
+    """Say what there still is of a daemon that does not answer, after looking for some seconds.
+
+    Parameters
+    ----------
+    pid, uid
+        Of its process and user.
+    """
+    deadline_s = time.monotonic() + _END_PATIENCE_S
+    while True:
+        daemon, control = _is_there(pid), list(_control_processes(pid))
+        if not (daemon or control) or time.monotonic() > deadline_s:
+            break
+        time.sleep(_PAUSE_S)
+    if daemon:
+        return (
+            f"The connection to the daemon (process {pid}) is lost, though it runs; see rigd "
+            f"status. {_UNKNOWN}"
+        )
+    begin_again = "see the daemon's log for why, and start it again with rigd serve."
+    if control:
+        return (
+            f"The daemon is gone (process {pid}), and its control process {control[0]} still runs "
+            "and may move the motor: press the wired stop (STO). Then " + begin_again
+        )
+    if uid != os.getuid() and not _sees_other_users():
+        return f"The daemon is gone (process {pid}). {_UNKNOWN} Then {begin_again}"
+    return (
+        "The daemon is gone. Its control process, which alone moves the motor, has ended too: see "
+        "that the rig stands still. What was recorded of a session is in the daemon's output "
+        f"folder; {begin_again}"
+    )
+
+
+def _is_there(pid: int) -> bool:
+    """Whether a process of that number runs, be it another user's."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    with suppress(OSError, IndexError):  # dead, and not yet buried by its parent
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return True
+
+
+def _sees_other_users() -> bool:
+    """Whether the system shows the processes of other users (mount option hidepid of /proc)."""
+    try:
+        return bool(Path("/proc/1/cmdline").read_bytes())
+    except OSError:
+        return False
+
+
+def _control_processes(pid: int) -> Iterator[int]:
+    """Return the control processes of a supervisor: its number is their only argument."""
+    from rigd.engine import CONTROL
+
+    wanted = [b"-m", CONTROL.module.encode(), str(pid).encode()]
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with suppress(OSError):
+                if (entry / "cmdline").read_bytes().split(b"\0")[1:4] == wanted:
+                    yield int(entry.name)
+
+
+def _signal_stop(pid: int) -> bool:
+    """Send the daemon its signal, if it is one that handles it: others would die of it."""
+    with suppress(OSError, ValueError, IndexError):
+        status = Path(f"/proc/{pid}/status").read_text()
+        caught = int(status.partition("SigCgt:")[2].split()[0], 16)
+        if caught >> (STOP_SIGNAL - 1) & 1:
+            os.kill(pid, STOP_SIGNAL)
+            return True
+    return False
+
+
+def find_views(rig: str | None) -> list[LiveAddress]:
+    """Return the live views of a rig, or of all.
+
+    Parameters
+    ----------
+    rig
+        The profile's name; None: of any.
+    """
+    own = running_views()
+    views = [view for view in own if rig in (None, view.rig)]
+    if not views:
+        # The runtime folder of a daemon that belongs to somebody else cannot be looked into.
+        told = (_of_daemon(path) for path in running())
+        views = [view for view in told if view is not None and rig in (None, view.rig)]
+    return views
+
+
+def daemons() -> dict[str, bool]:
+    """Return the rigs that a daemon owns, and whether it was asked for a live view."""
+    told = (_status(path) for path in running())
+    return {
+        status["daemon"]["profile"]: status["daemon"]["live"]
+        for status in told
+        if status is not None
+    }
+
+
+def _of_daemon(path: Path) -> LiveAddress | None:
+    status = _status(path)
+    view = None if status is None or status["rig"] is None else status["rig"]["live_view"]
+    if view is None:
+        return None
+    return LiveAddress(**{field.name: view[field.name] for field in fields(LiveAddress)})
+
+
+def _status(path: Path) -> dict[str, Any] | None:
+    try:
+        with Client(path) as client:
+            return client.ask("status")
+    except (DaemonGoneError, RefusedByDaemonError):
+        return None

@@ -1,0 +1,640 @@
+"""What the daemon does: it owns a rig, obeys requests, and says what happens. No sockets here.
+
+Everything runs in one thread but the calls of the rig that take their time, which run one after the
+other in a second one. A stop does not wait for that one.
+"""
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from rigd.beam import RealisationError
+from rigd.control import ControlDesignError
+from rigd.daemon import _protocol as protocol
+from rigd.daemon._log import NAME
+from rigd.daemon._states import (
+    Document,
+    Peer,
+    State,
+    StateMachine,
+    Transition,
+    daemon_document,
+    histories,
+    peer_document,
+    plan_document,
+    progress_document,
+    rig_document,
+    transition_document,
+)
+from rigd.devices import Reality, what_moves
+from rigd.engine import Event
+from rigd.excitation import Excitation, ExcitationError
+from rigd.profile import Profile
+from rigd.runner import (
+    NoRoomError,
+    Order,
+    Plan,
+    RefusedError,
+    RigError,
+    RigStatus,
+    SessionFailedError,
+    SessionProgress,
+    SessionResult,
+    Watcher,
+    always,
+    choose_path,
+    excitation_for,
+    make_room,
+    plan_session,
+    what_is_kept,
+)
+from rigd.runtime import StopRequest
+
+LOOK_S = 0.2
+"""From one look at the rig to the next."""
+_DEAF_S = 1.5
+"""Without a look for so long the event loop is stuck, and hears no stop."""
+_RATE_LOOKS = 10
+"""Over as many of them a rate is measured."""
+_LOGGED = {
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+    "fatal": logging.CRITICAL,
+}
+"""Levels of events that are told, and as what they are logged."""
+
+_SHUTTING_DOWN = "The daemon is being shut down."
+
+Publish = Callable[[Document], None]
+T = TypeVar("T")
+
+_log = logging.getLogger(NAME)
+
+
+class RigControl(Protocol):
+    """What the daemon needs of :class:`rigd.runner._rig.Rig`."""
+
+    connected: bool
+    zero_lost: bool
+
+    def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
+        """Connect the devices."""
+
+    def run(
+        self,
+        order: Order,
+        stop: StopRequest,
+        watcher: Watcher,
+        listens: Callable[[], bool] = always,
+    ) -> SessionResult:
+        """Run one session."""
+
+    def show(self, order: Order, stop: StopRequest) -> str:
+        """Start its live view."""
+
+    def tare(self) -> dict[str, Any]:
+        """Average the sensor at rest."""
+
+    def zero(self) -> dict[str, Any]:
+        """Make the present angle the zero."""
+
+    def watch(self) -> None:
+        """See whether all is well between sessions."""
+
+    def status(self) -> RigStatus | None:
+        """Look at the board, from any thread."""
+
+    def disconnect(self) -> None:
+        """Close everything."""
+
+
+class CommandError(Exception):
+    """A request is refused, or failed; the message is for the operator."""
+
+    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
+        """The request itself has to be another."""
+
+
+@dataclass(slots=True)
+class Series:
+    """Sessions that one request asked for."""
+
+    number: int
+    request: protocol.Start
+    stop: StopRequest = field(default_factory=StopRequest)
+    ticks: int = 0
+    session: int = 0
+    """The one that is run, from 1 on."""
+    path: Path | None = None
+    results: list[SessionResult] = field(default_factory=list)
+    reason: str = ""
+    """Why it ended before its time."""
+    running: bool = False
+    failed: bool = False
+    """Something went wrong: the sessions are fewer, or not what was asked for."""
+
+    def as_document(self) -> Document:
+        """Tell what it is and how far it came."""
+        return {
+            "series": self.number,
+            "excitation": self.request.excitation,
+            "session": self.session,
+            "repeat": self.request.repeat,
+            "path": None if self.path is None else str(self.path),
+            "running": self.running,
+            "stopped": self.stop.requested,
+            "failed": self.failed,
+            "reason": self.reason,
+            "sessions": [result.as_dict() for result in self.results],
+        }
+
+
+class Service:
+    """A rig under command; all methods are called from the event loop's thread.
+
+    Parameters
+    ----------
+    rig
+        To own; not connected yet.
+    profile
+        Of the rig.
+    folder
+        Where session files go.
+    worker
+        Runs the calls of the rig, one at a time.
+    publish
+        Takes the events that are for whoever watches.
+    moving
+        Says what would move if the rig were connected now.
+    fast, live
+        As the rig was made.
+
+    Attributes
+    ----------
+    controller
+        The client that holds control.
+    """
+
+    def __init__(
+        self,
+        rig: RigControl,
+        profile: Profile,
+        folder: Path,
+        worker: Executor,
+        publish: Publish,
+        moving: Callable[[], Reality],
+        *,
+        fast: bool = False,
+        live: bool = False,
+    ) -> None:
+        self._rig = rig
+        self._profile = profile
+        self._folder = folder
+        self._worker = worker
+        self._publish = publish
+        self._moving = moving
+        self._began_moving = moving()
+        self._fast = fast
+        self._live = live
+        self._states = StateMachine(self._tell_transition)
+        self._began_utc_ns = time.time_ns()
+        self._fault = ""
+        """Why it went into fault last, but for what failed in resetting it."""
+        self._doing = ""
+        self._closing = False
+        self._series: Series | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._count = 0
+        self._listened_s = inf
+        self._look: RigStatus | None = None
+        self._written: deque[tuple[float, dict[str, int]]] = deque(maxlen=_RATE_LOOKS + 1)
+        self.controller: Peer | None = None
+
+    @property
+    def state(self) -> State:
+        """Where the daemon is."""
+        return self._states.state
+
+    async def open(self) -> None:
+        """Connect the rig; a failure leaves a fault, which an operator may reset."""
+        self._doing = "connecting"
+        try:
+            await self._connect(reset_fault=False)
+        except CommandError:
+            pass  # the fault says it
+        finally:
+            self._doing = ""
+
+    async def attend(self) -> None:
+        """Watch over the rig, until cancelled."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            self._listened_s = time.monotonic()
+            self.look()
+            # Not waited for: another look is due while the second thread is busy.
+            await self.watch()
+
+    async def close(self, reason: str) -> None:
+        """End a running session safely and let the rig go."""
+        self._closing = True
+        self.stop(reason)
+        if self._task is not None:
+            await asyncio.wait([self._task])
+        await self._call(self._rig.disconnect)
+        if self.state is State.READY:
+            self._states.move(State.IDLE, reason)
+
+    def release(self, peer: Peer) -> None:
+        """Take control from a client that is gone; what it started goes on."""
+        if self.controller == peer:
+            self.controller = None
+            _log.info("control: released by %s", peer)
+
+    async def handle(self, request: protocol.AnyRequest, peer: Peer) -> Document:
+        """Obey a request.
+
+        Raises
+        ------
+        CommandError
+            If it is refused, or fails.
+        """
+        if not (request.controlling or isinstance(request, protocol.Stop)):
+            return self.status() if isinstance(request, protocol.Status) else {}
+        _log.info("%s: asked by %s", request.command, peer)
+        try:
+            return await self._obey(request, peer)
+        except CommandError as error:
+            _log.warning("%s: refused: %s", request.command, error)
+            raise
+
+    async def _obey(self, request: protocol.AnyRequest, peer: Peer) -> Document:
+        """Obey a request that may change something."""
+        if request.controlling:
+            self._take_control(peer)
+        if isinstance(request, protocol.Start):
+            return await self._start(request)
+        if isinstance(request, protocol.Stop):
+            return self.stop(f"stop asked for by {peer}")
+        if isinstance(request, protocol.Tare):
+            return await self._measure("tare", self._rig.tare)
+        if isinstance(request, protocol.Zero):
+            return await self._measure("zero", self._rig.zero)
+        return await self._reset()
+
+    def status(self) -> Document:
+        """Tell everything there is to tell."""
+        series = self._series
+        look = self._look if self._rig.connected else None
+        return {
+            "daemon": daemon_document(
+                self._profile.name,
+                str(self._folder),
+                moving=self._began_moving.value,
+                hardware=self._began_moving is Reality.HARDWARE,
+                told=what_moves(self._profile.rig, self._began_moving),
+                fast=self._fast,
+                live=self._live,
+                began_utc_ns=self._began_utc_ns,
+            ),
+            "state": self.state.value,
+            "since_utc_ns": self._states.since_utc_ns,
+            "reason": self._states.reason,
+            "doing": self._doing,
+            "zero_lost": self._rig.zero_lost,
+            "controller": peer_document(self.controller),
+            "series": None if series is None else series.as_document(),
+            "progress": self._progress(),
+            "rig": None if look is None else rig_document(look, self._rates()),
+            "history": histories(self._states.history),
+        }
+
+    def stop(self, reason: str) -> Document:
+        """Ask for the end of what runs; the answer says whether there was anything."""
+        series = self._series
+        if series is None or not series.running:
+            return {"stopping": False}
+        if not series.stop.requested:
+            series.stop.request()
+            if self.state is State.RUNNING:
+                self._states.move(State.STOPPING, reason)
+        return {"stopping": True}
+
+    def look(self) -> None:
+        """Take a look at the board, and tell of the progress."""
+        self._look = look = self._rig.status()
+        if look is None:
+            self._written.clear()
+            return
+        self._written.append((time.monotonic(), {t.name: t.written for t in look.topics}))
+        progress = self._progress()
+        if progress is not None:
+            self._publish({"event": "progress", **progress})
+
+    async def watch(self) -> None:
+        """See whether the rig is well between sessions."""
+        if self._doing or not self._rig.connected or self.state not in (State.READY, State.FAULT):
+            return
+        try:
+            await self._call(self._rig.watch)
+        except RigError as error:
+            if not self._closing and self.state is State.READY:
+                self._states.move(State.FAULT, str(error))
+
+    # Commands
+
+    def _take_control(self, peer: Peer) -> None:
+        if self.controller is not None and self.controller != peer:
+            raise CommandError(
+                f"The rig is controlled by {self.controller}, until it is done; watch with rigd "
+                "status, and stop with rigd stop."
+            )
+        if self.controller is None:
+            self.controller = peer
+            _log.info("control: taken by %s", peer)
+
+    def _check(self, command: str) -> None:
+        if self._closing:
+            raise CommandError(_SHUTTING_DOWN)
+        refusal = self._states.refusal(command)
+        if refusal:
+            raise CommandError(refusal)
+        if self._doing:
+            raise CommandError(f"The rig is busy ({self._doing}); try again in a moment.")
+
+    async def _start(self, request: protocol.Start) -> Document:
+        self._check("start")
+        if self._rig.zero_lost:
+            raise CommandError(
+                "The zero of the angle was lost with the connection, and the limits with it; move "
+                "the motor to its middle and run rigd zero."
+            )
+        self._count += 1
+        last = self._series
+        series = self._series = Series(self._count, request, running=True)
+        self._doing = "planning"
+        try:
+            excitation, plan = await self._call(partial(self._plan, request))
+            if series.stop.requested or self._closing:
+                raise CommandError("It was stopped before it began.")
+            refusal = self._states.refusal("start")
+            if refusal:
+                raise CommandError(refusal)
+        except Exception:
+            self._series = last
+            raise
+        finally:
+            self._doing = ""
+        for warning in plan.warnings:
+            _log.warning("series %d: %s", series.number, warning)
+        series.ticks = excitation.reference_rad.size
+        times = f", {request.repeat} sessions" if request.repeat > 1 else ""
+        self._states.move(State.RUNNING, f"{request.excitation} was started{times}")
+        self._task = asyncio.create_task(self._follow(series, excitation))
+        plan_told = plan_document(plan, series.ticks / self._profile.rig.rate_hz)
+        return {"series": series.number, "plan": plan_told}
+
+    async def _measure(self, name: str, measure: Callable[[], Document]) -> Document:
+        self._check(name)
+        self._doing = name
+        try:
+            return await self._call(measure)
+        except RigError as error:
+            if not self._rig.connected and self.state is State.READY:
+                self._states.move(State.FAULT, str(error))
+            raise CommandError(str(error)) from None
+        finally:
+            self._doing = ""
+
+    async def _reset(self) -> Document:
+        self._check("reset")
+        self._doing = "reset"
+        try:
+            if self._rig.connected:
+                try:
+                    await self._call(self._rig.watch)
+                except RigError:
+                    pass  # it is connected anew
+                else:
+                    self._states.move(State.READY, "reset by the operator")
+                    return {"zero_lost": self._rig.zero_lost}
+            if self._closing:
+                raise CommandError(_SHUTTING_DOWN)
+            fault = self._fault
+            self._states.move(State.IDLE, "reset by the operator")
+            await self._connect(reset_fault=True, fault=fault)
+        finally:
+            self._doing = ""
+        return {"zero_lost": self._rig.zero_lost}
+
+    async def _connect(self, *, reset_fault: bool, fault: str = "") -> None:
+        """Connect the rig; if that fails, the `fault` that was to be reset is told still."""
+        try:
+            moving = self._moving()
+            if moving is not self._began_moving:
+                raise RigError(
+                    f"What would move now is {moving.value}, and it was {self._began_moving.value} "
+                    "when the daemon was started; stop the daemon and start it anew if that is "
+                    "meant."
+                )
+            await self._call(partial(self._rig.connect, moving, reset_fault=reset_fault))
+        except RigError as error:
+            self._fail_again(str(error), fault)
+            raise CommandError(str(error)) from None
+        except Exception as error:
+            _log.exception("the rig could not be connected, in a way that was not foreseen")
+            await self._let_go()
+            reason = f"The rig could not be connected, in an unforeseen way ({error!r})."
+            self._fail_again(reason, fault)
+            raise CommandError(reason) from None
+        if self._closing:
+            await self._call(self._rig.disconnect)
+            raise CommandError(_SHUTTING_DOWN)
+        self._states.move(State.READY, f"{moving.value} is connected")
+
+    def _fail_again(self, reason: str, fault: str) -> None:
+        """Go into fault, with what came before it if that could not be reset."""
+        same = not fault or fault == reason
+        self._states.move(State.FAULT, reason if same else f"{reason} Not reset: {fault}")
+        self._fault = fault or reason
+
+    # Series
+
+    def _plan(self, request: protocol.Start) -> tuple[Excitation, Plan]:
+        """Make the excitation and see that it may be run; in the second thread."""
+        profile = self._profile
+        try:
+            excitation = excitation_for(profile, request.excitation, request.parameters)
+            plan = plan_session(profile, excitation, force=request.force)
+            make_room(self._folder, excitation, profile.limits)
+        except NoRoomError as error:
+            raise CommandError(str(error)) from error
+        except (ExcitationError, RefusedError, ControlDesignError, RealisationError) as error:
+            raise CommandError(str(error), wrong_use=True) from error
+        except MemoryError:
+            raise CommandError("There is not enough memory to plan such a session.") from None
+        return excitation, plan
+
+    async def _follow(self, series: Series, excitation: Excitation) -> None:
+        """Run a series to its end, whatever that is."""
+        fault = ""
+        loop = asyncio.get_running_loop()
+        try:
+            await self._call(partial(self._run_series, series, excitation, loop))
+        except (RefusedError, RigError, SessionFailedError) as error:
+            series.reason = str(error)
+            if not isinstance(error, RefusedError):
+                path = error.path if isinstance(error, SessionFailedError) else None
+                fault = series.reason = f"{error} {what_is_kept(path)}"
+        except Exception as error:
+            # Nobody may be left to switch off: what cannot be explained ends with everything off.
+            _log.exception("a session ended in a way that was not foreseen")
+            fault = series.reason = f"The session failed in an unforeseen way ({error!r})."
+            await self._let_go()
+        else:
+            last = series.results[-1] if series.results else None
+            if last is not None and not last.went_well:
+                series.reason = last.reason
+                if last.fault:
+                    fault = last.reason
+        if not self._rig.connected:
+            fault = fault or series.reason or "The connection to the devices is lost."
+        series.running = False
+        series.failed = bool(fault or (series.reason and not series.stop.requested))
+        self._states.move(*_after(series, fault))
+        self._publish({"event": "series", **series.as_document()})
+
+    async def _let_go(self) -> None:
+        """Disconnect the rig, and go on whatever that leads to."""
+        try:
+            await self._call(self._rig.disconnect)
+        except Exception:
+            _log.exception("the rig could not be let go")
+
+    def _run_series(
+        self, series: Series, excitation: Excitation, loop: asyncio.AbstractEventLoop
+    ) -> None:
+        """Run the sessions one after the other; in the second thread."""
+
+        def publish(event: Document) -> None:
+            loop.call_soon_threadsafe(self._publish, event)
+
+        def tell(level: str, text: str) -> None:
+            _log.log(_LOGGED[level], "series %d: %s", series.number, text)
+            publish({"event": "message", "level": level, "text": text})
+
+        def watcher(_: SessionProgress, events: list[Event]) -> None:
+            for event in events:
+                if event.level in _LOGGED:
+                    tell(event.level, event.message)
+
+        request = series.request
+        for number in range(1, request.repeat + 1):
+            if series.stop.requested:
+                return
+            if not self._listens():
+                raise RigError("The daemon hears nobody: no further session is begun.")
+            make_room(self._folder, excitation, self._profile.limits)
+            numbered = number if request.repeat > 1 else None
+            path = choose_path(self._folder, excitation.kind, numbered)
+            notes = {str(name): text for name, text in request.notes.items() if text}
+            if request.repeat > 1:
+                notes["series"] = f"{number} of {request.repeat}"
+            series.session, series.path = number, path
+            order = Order(self._profile, excitation, path, tuple(notes.items()))
+            if self._live:
+                tell("info", self._rig.show(order, series.stop))
+            try:
+                result = self._rig.run(order, series.stop, watcher, self._listens)
+            except SessionFailedError as error:
+                _note_end(series, error.result(), publish)
+                raise
+            _note_end(series, result, publish)
+            if not result.went_well:
+                return
+
+    def _listens(self) -> bool:
+        """Whether somebody who asks for a stop is heard; asked from the second thread.
+
+        A session whose operator cannot be heard gets no sign of life any more, and ends.
+        """
+        return time.monotonic() - self._listened_s < _DEAF_S
+
+    # Telling
+
+    def _progress(self) -> Document | None:
+        series, look = self._series, self._look
+        if series is None or not series.running or not series.ticks or look is None:
+            return None
+        rate_hz = None if self._fast else self._profile.rig.rate_hz
+        document = progress_document(look, series.ticks, rate_hz)
+        return {"session": series.session, "repeat": series.request.repeat, **document}
+
+    def _rates(self) -> dict[str, float | None]:
+        """Return the measured rates of all topics."""
+        if len(self._written) < 2:
+            return {}
+        (first_s, first), (last_s, last) = self._written[0], self._written[-1]
+        return {
+            name: max(0, written - first.get(name, 0)) / (last_s - first_s)
+            for name, written in last.items()
+        }
+
+    def _tell_transition(self, transition: Transition) -> None:
+        if transition.after is State.FAULT:
+            self._fault = transition.reason
+        level = logging.ERROR if transition.after is State.FAULT else logging.INFO
+        _log.log(
+            level, "state: %s -> %s: %s", transition.before, transition.after, transition.reason
+        )
+        self._publish({"event": "state", **transition_document(transition)})
+
+    async def _call(self, function: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._worker, function)
+
+
+def _note_end(series: Series, result: SessionResult, publish: Publish) -> None:
+    """Keep, log and tell how a session ended."""
+    series.results.append(result)
+    counts = {
+        "ticks scheduled": result.scheduled,
+        "recorded": result.recorded,
+        "missed": result.missed,
+        "late": result.late,
+        "lost": result.lost,
+        "stale angles": result.stale_angles,
+        "stale wrenches": result.stale_wrenches,
+        "not shown live": result.live_dropped,
+    }
+    _log.log(
+        logging.INFO if result.went_well else logging.WARNING,
+        "series %d: session %d of %d: %s, %s: %s%s",
+        series.number,
+        series.session,
+        series.request.repeat,
+        result.path or result.part or "no file",
+        result.outcome,
+        ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
+        f": {result.reason}" if result.reason else "",
+    )
+    publish({"event": "session", "number": series.session, **result.as_dict()})
+
+
+def _after(series: Series, fault: str) -> tuple[State, str]:
+    if fault:
+        return State.FAULT, fault
+    if series.stop.requested:
+        return State.READY, f"{series.request.excitation} was stopped"
+    if series.reason:
+        return State.READY, series.reason
+    return State.READY, f"{series.request.excitation} is complete"

@@ -1,0 +1,145 @@
+"""The drivers a profile can name, found without importing those it does not name."""
+
+import importlib
+from collections.abc import Callable
+from enum import Enum
+from pathlib import Path
+from types import ModuleType
+from typing import cast
+
+from rigd.devices._simulator import differences, find_simulator
+from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.parameters import RigParameters, Selection
+
+# Drive and sensor share a plant or a bus, so drivers are opened by the pair.
+_OPENERS = {
+    Selection(drive="sim", sensor="sim"): ("rigd.sim._devices", "open_simulated_rig"),
+    Selection(drive="cia402", sensor="ati_can"): ("rigd.devices._wired_rig", "open_wired_rig"),
+    Selection(drive="cia402", sensor="ati_serial"): ("rigd.devices._wired_rig", "open_wired_rig"),
+}
+
+
+class UnknownDeviceError(ValueError):
+    """A profile names drivers that do not exist or do not belong together."""
+
+
+class Reality(Enum):
+    """What moves when a rig is opened now."""
+
+    HARDWARE = "the hardware"
+    SIMULATED = "the simulated rig"
+    """In the process that opens it, under whatever clock."""
+    SIMULATOR = "rigd simulate, by the clock"
+    LOCK_STEP = "rigd simulate, in lock-step"
+
+    @property
+    def any_clock(self) -> bool:
+        """Whether time may be skipped."""
+        return self in (Reality.SIMULATED, Reality.LOCK_STEP)
+
+
+def check_selection(selection: Selection, source: Path | None = None) -> None:
+    """Refuse a selection of drivers that cannot be opened.
+
+    Parameters
+    ----------
+    selection
+        As a profile has it.
+    source
+        The profile's file, for the message.
+
+    Raises
+    ------
+    UnknownDeviceError
+        Naming what there is to choose from.
+    """
+    if selection not in _OPENERS:
+        known = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
+        where = "" if source is None else f"{source}: "
+        raise UnknownDeviceError(
+            f'{where}devices: drive = "{selection.drive}" with sensor = "{selection.sensor}" is no '
+            f"known combination; choose {known}."
+        )
+
+
+def reality(rig: RigParameters) -> Reality:
+    """Tell what would move if the devices of a rig were opened now."""
+    if rig.devices.drive == "sim":
+        return Reality.SIMULATED
+    simulator = find_simulator(rig.name)
+    if simulator is None:
+        return Reality.HARDWARE
+    return Reality.LOCK_STEP if simulator.lock_step else Reality.SIMULATOR
+
+
+def what_moves(rig: RigParameters, moving: Reality) -> str:
+    """Say what will move, hardware as loudly as what stands in for it."""
+    if moving is not Reality.HARDWARE:
+        how = "in this process" if moving is Reality.SIMULATED else moving.value
+        return f"No hardware: {rig.name} is simulated ({how})."
+    assert rig.can is not None
+    assert rig.cia402 is not None
+    return (
+        f"HARDWARE: {rig.name} moves the drive on {rig.can.interface} {rig.can.channel}, node "
+        f"{rig.cia402.node_id}."
+    )
+
+
+def simulated_differently(rig: RigParameters) -> list[str]:
+    """Say in what the running simulated rig, if any stands in, differs from the profile's."""
+    simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
+    return [] if simulator is None else differences(rig, simulator)
+
+
+def objections(rig: RigParameters) -> list[str]:
+    """Say why the devices of a rig cannot share their bus, before anything is sent."""
+    if rig.can is None:
+        return []
+    from rigd.devices.canbus import MAX_LOAD, bus_load, check_identifiers
+
+    found = check_identifiers(rig)
+    load = bus_load(rig).worst
+    if load > MAX_LOAD:
+        found.append(
+            f"The frames of a tick take up to {100 * load:.0f} % of the CAN bus at "
+            f"{rig.can.bitrate_bit_s} bit/s, more than {100 * MAX_LOAD:.0f} %; choose a higher "
+            "can.bitrate_bit_s or a lower rig.rate_hz."
+        )
+    return found
+
+
+def simulator() -> ModuleType:
+    """Return the module that puts a simulated rig on the wire."""
+    return importlib.import_module("rigd.sim.wire._simulator")
+
+
+def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:
+    """Make the drivers that a profile names; nothing is connected yet.
+
+    Parameters
+    ----------
+    rig
+        As a profile has it.
+    moving
+        What the operator was told would move, if that was told before.
+
+    Raises
+    ------
+    UnknownDeviceError
+        If the profile names drivers that do not exist.
+    DeviceError
+        If the profile contradicts what these drivers can do, or something else would move now.
+    """
+    check_selection(rig.devices)
+    module, name = _OPENERS[rig.devices]
+    opener = cast(
+        "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
+    )
+    devices = opener(rig)
+    if moving is not None and devices.simulated is (moving is Reality.HARDWARE):
+        found = "a simulated rig" if devices.simulated else Reality.HARDWARE.value
+        raise DeviceError(
+            f"{moving.value.capitalize()} was to move, and now it would be {found}: rigd simulate "
+            "was started or ended in between. Nothing was sent; start again."
+        )
+    return devices

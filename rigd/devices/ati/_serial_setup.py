@@ -1,0 +1,323 @@
+"""The serial port of a Digital F/T sensor, and its set-up over Modbus while it does not stream.
+
+A serial port as the loop uses it: opened and configured by pyserial, then read without blocking.
+
+Configuration is pyserial's work; its own reading costs several system calls for what is one here.
+"""
+
+import os
+import select
+import termios
+import time
+from contextlib import suppress
+from itertools import chain
+
+import serial
+
+from rigd.devices import AtiSerial, DeviceError
+from rigd.devices.ati import _serial_protocol as modbus
+from rigd.devices.ati._calibration import (
+    BLOCK_REGISTERS,
+    CalibrationBlock,
+    first_register,
+    parse_block,
+    same_serial_number,
+)
+
+_READ_SIZE = 65_536
+
+
+class SerialLine:
+    """An open port: 8 data bits, even parity, one stop bit; nobody else may open it meanwhile.
+
+    Parameters
+    ----------
+    port
+        Its file name.
+    baud
+        Bits a second; any that the adapter can make.
+    device
+        At its other end, for messages.
+
+    Attributes
+    ----------
+    low_latency : bool
+        The adapter's driver passes on at once what has arrived. A USB adapter without it may
+        hold records for 16 ms.
+
+    Raises
+    ------
+    DeviceError
+        If it cannot be opened; the message says what to do.
+    """
+
+    def __init__(self, port: str, baud: int, device: str) -> None:
+        self._device = device
+        try:
+            # vmin = 1 (by inter_byte_timeout): an empty line is then told from a dead one.
+            self._serial = serial.Serial(
+                port,
+                baud,
+                bytesize=serial.EIGHTBITS,
+                parity=_parity(port),
+                stopbits=serial.STOPBITS_ONE,
+                timeout=0,
+                inter_byte_timeout=0.0,
+                exclusive=True,
+            )
+        except (serial.SerialException, termios.error, OSError, ValueError) as error:
+            raise DeviceError(
+                f"{device}: the serial port {port} cannot be opened at {baud} baud "
+                f"({_reason(error)}); {_remedy(error)}."
+            ) from None
+        self._fd = self._serial.fileno()
+        self._selectable = [self._fd]
+        self.low_latency = False
+        # Not every driver offers it; pyserial then reports a value it could not set.
+        with suppress(ValueError, OSError, termios.error):
+            self._serial.set_low_latency_mode(True)
+            self.low_latency = True
+
+    def read(self) -> bytes:
+        """Return all that has arrived; nothing if nothing has.
+
+        Raises
+        ------
+        DeviceError
+            If the line is gone.
+        """
+        data = b""
+        while True:  # a short piece need not be the last: the kernel moves bytes on as it is asked
+            try:
+                piece = os.read(self._fd, _READ_SIZE)
+            except BlockingIOError:
+                return data
+            except OSError as error:
+                raise self._gone(error.strerror) from None
+            if not piece:
+                raise self._gone("hung up")
+            data = data + piece if data else piece
+
+    def write(self, data: bytes) -> None:
+        """Send some bytes; so few that they always fit into the kernel's buffer.
+
+        Raises
+        ------
+        DeviceError
+            If the line is gone or does not take them.
+        """
+        try:
+            os.write(self._fd, data)
+        except OSError as error:
+            raise self._gone(error.strerror) from None
+
+    def wait(self, timeout_s: float) -> None:
+        """Return as soon as something may have arrived, or after the timeout.
+
+        Raises
+        ------
+        DeviceError
+            If the line is gone.
+        """
+        try:
+            select.select(self._selectable, (), (), timeout_s)
+        except OSError as error:
+            raise self._gone(error.strerror) from None
+        except ValueError as error:  # a descriptor beyond what select knows
+            raise self._gone(str(error)) from None
+
+    def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:
+        """Send a request and return what comes: `length` bytes or more, or fewer if no more come.
+
+        What arrived before it is dropped.
+        """
+        self.read()
+        self.write(request)
+        reply = b""
+        end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
+        while len(reply) < length and (left_ns := end_ns - time.monotonic_ns()) > 0:
+            self.wait(left_ns * 1e-9)
+            reply += self.read()
+        return reply
+
+    def drain(self, quiet_s: float, limit_s: float) -> bool:
+        """Drop what comes until nothing has come for a while.
+
+        Returns
+        -------
+        bool
+            Whether it fell silent within the limit.
+        """
+        now = time.monotonic()
+        heard, end = now, now + limit_s
+        while now < end:
+            if self.read():
+                heard = now
+            elif now - heard >= quiet_s:
+                return True
+            self.wait(quiet_s)
+            now = time.monotonic()
+        return False
+
+    def close(self) -> None:
+        """Release the port; harmless when repeated."""
+        with suppress(OSError, termios.error):
+            self._serial.close()
+
+    def _gone(self, why: str | None) -> DeviceError:
+        return DeviceError(
+            f"{self._device}: the serial port {self._serial.port} has failed ({why}); look at "
+            "adapter and cable, then connect again."
+        )
+
+
+def _parity(port: str) -> str:
+    """Return even parity; but none for a pseudo-terminal, which refuses to be set to it twice."""
+    is_pseudo = os.path.realpath(port).startswith("/dev/pts/")
+    return str(serial.PARITY_NONE if is_pseudo else serial.PARITY_EVEN)
+
+
+def _reason(error: Exception) -> str:
+    number = error.args[0] if error.args else None
+    return os.strerror(number) if isinstance(number, int) else str(error)
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
+        return "another program has it open: end that first"
+    if isinstance(error, ValueError):
+        return "check ati_serial.baud, and whether the adapter can make it"
+    return (
+        "check ati_serial.port, whether the adapter is plugged in and whether you may use it "
+        "(group dialout), or start the simulated rig: rigd simulate --profile PROFILE"
+    )
+
+
+SILENCE_S = 0.002
+"""Modbus: a frame is over when the line has been silent for this long."""
+
+# Anything sent while the sensor streams stops it; other drivers send 14 bytes.
+_JAM = bytes(range(1, 15))
+_JAM_TRIES = 3
+_QUIET_S = 0.05
+_DRAIN_LIMIT_S = 0.5
+_REPLY_TIMEOUT_S = 0.3
+_TRIES = 3
+# What was asked for again may be answered twice, and no reply says which registers it holds.
+_LATE_REPLY_S = 0.5
+
+
+class SerialSetup:
+    """The sensor, as it is spoken to before and after the stream.
+
+    Every method raises `DeviceError` if the line is gone, or if the sensor does not answer, or not
+    as it should.
+
+    Parameters
+    ----------
+    line
+        Open.
+    settings
+        Of the sensor.
+    name
+        Of the sensor, for messages.
+    """
+
+    def __init__(self, line: SerialLine, settings: AtiSerial, name: str) -> None:
+        self._line = line
+        self._settings = settings
+        self._name = name
+
+    def stop_streaming(self) -> None:
+        """Silence the sensor, whatever it was doing."""
+        for _ in range(_JAM_TRIES):
+            self._line.write(_JAM)
+            if self._line.drain(_QUIET_S, _DRAIN_LIMIT_S):
+                return
+        raise DeviceError(
+            f"{self._name}: it goes on sending although it was told to stop; switch it off and on, "
+            "and check that no other device is on this line."
+        )
+
+    def read_status(self) -> int:
+        """Return its status word."""
+        return self._read(modbus.STATUS_WORD, 1, "tell its status")[0]
+
+    def read_block(self) -> CalibrationBlock:
+        """Return the calibration that the profile chooses, of the sensor that it names."""
+        number, wanted = self._settings.calibration, self._settings.serial_number
+        what = f"read out calibration {number}"
+        registers = self._read(first_register(number), BLOCK_REGISTERS, what)
+        try:
+            block = parse_block(registers)
+        except ValueError as error:
+            raise DeviceError(f"{self._name}, ati_serial.calibration {number}: {error}") from None
+        found = block.calibration.serial_number
+        if not same_serial_number(wanted, found):
+            raise DeviceError(
+                f"{self._name}: its serial number is {found or 'empty'}, where the profile asks "
+                f"for {wanted} (ati_serial.serial_number). Check which sensor is on the rig."
+            )
+        return block
+
+    def load_amplifiers(self, block: CalibrationBlock) -> None:
+        """Make the amplifiers' settings those that the calibration was done with."""
+        self._ask(modbus.UNLOCK, "unlock its memory")
+        try:
+            for first, values in (
+                (modbus.ACTIVE_GAINS, block.gains),
+                (modbus.ACTIVE_OFFSETS, block.offsets),
+            ):
+                self._ask(modbus.write_registers(first, values), "load gains and offsets")
+        finally:
+            self._ask(modbus.LOCK, "lock its memory")
+        written = tuple(chain(block.gains, block.offsets))
+        active = self._read(modbus.ACTIVE_GAINS, len(written), "tell its gains and offsets")
+        if active != written:
+            raise DeviceError(
+                f"{self._name}: gains and offsets read back as {active}, where {written} were "
+                "written. Switch it off and on; without them its calibration does not hold."
+            )
+
+    def start_streaming(self) -> bytes:
+        """Have it stream; return what has come behind its reply already."""
+        request = modbus.START_STREAMING
+        time.sleep(SILENCE_S)
+        length = modbus.reply_length(request)
+        reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
+        try:
+            modbus.content_of(request, reply[:length])
+        except ValueError as error:
+            raise DeviceError(f"{self._name}: it does not start streaming: {error}.") from None
+        return reply[length:]
+
+    def _ask(self, request: bytes, what: str) -> bytes:
+        """Return what the reply to a request holds; disturbed ones are asked for again."""
+        problem = ""
+        for tries in range(_TRIES):
+            time.sleep(SILENCE_S)
+            length = modbus.reply_length(request)
+            reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
+            if tries:
+                self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
+            try:
+                return modbus.content_of(request, reply)
+            except modbus.Refused as error:
+                raise DeviceError(
+                    f"{self._name}: asked to {what}, it refused: {error}. Check that it is a "
+                    "Digital F/T sensor, and ati_serial.calibration."
+                ) from None
+            except modbus.BadReply as error:
+                problem = str(error)
+        raise DeviceError(
+            f"{self._name}: asked to {what}, it gave no usable reply in {_TRIES} tries: {problem}. "
+            "Check power, cable (A and B swapped?), ati_serial.port and ati_serial.baud."
+        )
+
+    def _read(self, first: int, count: int, what: str) -> tuple[int, ...]:
+        registers: tuple[int, ...] = ()
+        while len(registers) < count:
+            piece = min(modbus.MAX_REGISTERS, count - len(registers))
+            request = modbus.read_registers(first + len(registers), piece)
+            registers += modbus.registers_of(self._ask(request, what))
+        return registers

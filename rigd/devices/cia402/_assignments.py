@@ -1,0 +1,88 @@
+"""Objects of a maker's own that a profile has set: ``cia402.set_objects``.
+
+Each is one text, ``"3001:2 u32 2500"``: index and sub-index in hexadecimal as manuals print them,
+the type, and the value in decimal or as 0x…. They are written in pre-operational and read back.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from rigd.devices.cia402._requirements import REQUIREMENTS, Access
+
+KINDS: Final = {
+    "u8": (0, 0xFF),
+    "u16": (0, 0xFFFF),
+    "u32": (0, 0xFFFF_FFFF),
+    "i8": (-0x80, 0x7F),
+    "i16": (-0x8000, 0x7FFF),
+    "i32": (-0x8000_0000, 0x7FFF_FFFF),
+}
+"""Types, and the values that they hold."""
+
+_TEXT: Final = re.compile(
+    r"(?:0[xX])?([0-9a-fA-F]{4})(?::(?:0[xX])?([0-9a-fA-F]{1,2}))?\s+(\w+)\s+([+-]?\w+)"
+)
+_PDOS: Final = range(0x1400, 0x1C00)
+_STORED: Final = (0x1010, 0x1011, *range(0x1F50, 0x1F58))
+"""Storing and restoring of parameters, and of firmware."""
+_SET_BY_RIGD: Final = {
+    (each.index, each.sub)
+    for each in REQUIREMENTS
+    if each.access & (Access.WRITE | Access.RECEIVED)
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """One object and the value that it is to hold."""
+
+    index: int
+    sub: int
+    kind: str
+    """Of :data:`KINDS`."""
+    value: int
+
+    @property
+    def place(self) -> str:
+        """Index and sub-index as messages show them."""
+        return f"{self.index:04X}:{self.sub:X}"
+
+
+def parse_assignment(text: str) -> Assignment:
+    """Return what a text of ``cia402.set_objects`` says.
+
+    Raises
+    ------
+    ValueError
+        With what is wrong and the remedy, as the end of a sentence.
+
+    Examples
+    --------
+    >>> parse_assignment("3001:2 u32 2500")
+    Assignment(index=12289, sub=2, kind='u32', value=2500)
+    """
+    match = _TEXT.fullmatch(text.strip())
+    if match is None:
+        raise ValueError('must be index:sub, type and value, such as "3001:2 u32 2500"')
+    index, sub = int(match[1], 16), int(match[2] or "0", 16)
+    kind = match[3]
+    if kind not in KINDS:
+        raise ValueError(f"has the unknown type {kind!r}; choose {', '.join(KINDS)}")
+    try:
+        value = int(match[4], 0)
+    except ValueError:
+        raise ValueError(
+            f"has a value that is no whole number ({match[4]}); write 2500, -3 or 0x9C4"
+        ) from None
+    low, high = KINDS[kind]
+    if not low <= value <= high:
+        raise ValueError(f"has a value that {kind} does not hold ({low} to {high})")
+    if (index, sub) in _SET_BY_RIGD or index in _PDOS:
+        raise ValueError("is an object that rigd sets itself; remove it")
+    if index in _STORED:
+        raise ValueError(
+            "would have the drive store or restore its memory at every start; do that once with "
+            "the drive's own tool"
+        )
+    return Assignment(index, sub, kind, value)

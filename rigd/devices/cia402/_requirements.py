@@ -1,0 +1,597 @@
+"""What rigd asks of a drive's object dictionary: one table for set-up, for EDS files and for docs.
+
+An object is *core* where no session is possible without it, and *optional* where something else
+stands in. An optional object that is read-only is fine as long as it holds what is needed
+(:class:`Fit`). Where nothing stands in by itself, the profile has to accept that by name
+(``cia402.accept_without``), or the drive is refused.
+
+Imports nothing but the indices, so that a program which only reads an EDS file can use it.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from enum import Enum, Flag, auto
+from math import ceil, tau
+from typing import TYPE_CHECKING, Final
+
+from rigd.devices import DeviceError
+from rigd.devices.cia402 import _protocol as protocol
+
+if TYPE_CHECKING:
+    from rigd.devices import RigParameters, ServoDrive
+
+WATCHDOG: Final = "watchdog"
+TORQUE_LIMIT: Final = "torque_limit"
+ABORT_OPTION: Final = "abort_option"
+TORQUE_FEEDBACK: Final = "torque_feedback"
+ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
+"""What a profile may accept by name that its drive has not."""
+
+
+class Access(Flag):
+    """What rigd does with an object."""
+
+    READ = auto()
+    """By SDO."""
+    WRITE = auto()
+    """By SDO, in pre-operational, unless the object already holds what is needed."""
+    SENT = auto()
+    """Mapped into the drive's TPDO (an EDS has PDOMapping = 1, access ro, rw or rwr)."""
+    RECEIVED = auto()
+    """Mapped into the drive's RPDO (PDOMapping = 1, access rw, rww or wo)."""
+
+
+class Watchdog(Enum):
+    """What in the drive takes the torque off when this computer falls silent."""
+
+    HEARTBEAT = "heartbeat consumer (1016:1)"
+    RPDO_DEADLINE = "deadline of the RPDO (1400:5)"
+    OWN = "maker's own watchdog (cia402.own_watchdog_s)"
+    NONE = "none"
+
+
+def watchdog(*, heartbeat: bool, rpdo_deadline: bool, own: bool) -> Watchdog:
+    """Return which watchdog stands, the best first.
+
+    Parameters
+    ----------
+    heartbeat, rpdo_deadline
+        Whether the drive has 1016:1, and 1400:5.
+    own
+        Whether the profile states the time of one that the maker gives it.
+    """
+    if heartbeat:
+        return Watchdog.HEARTBEAT
+    if rpdo_deadline:
+        return Watchdog.RPDO_DEADLINE
+    return Watchdog.OWN if own else Watchdog.NONE
+
+
+class Fit(Enum):
+    """Which values an object may hold that cannot be written."""
+
+    EQUAL = "exactly"
+    """The one that is needed."""
+    AT_LEAST = "at least"
+    """A limit that does not cut what is needed."""
+    EQUAL_OR_UNUSED = "exactly, or 0"
+    """0 says that it is not used."""
+    ANY = "any"
+    """It is only read."""
+
+    def allows(self, found: int, wanted: int) -> bool:
+        """Whether a value does where another one is wanted."""
+        if self in (Fit.EQUAL, Fit.EQUAL_OR_UNUSED):
+            return found == wanted or (self is Fit.EQUAL_OR_UNUSED and found == 0)
+        return self is Fit.ANY or found >= wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """One object, or one sub-index of it.
+
+    Attributes
+    ----------
+    index, sub
+        Of the object.
+    name
+        As CiA 301 and 402 call it.
+    core
+        No session without it.
+    access
+        What is done with it.
+    stand_in
+        What does its work where it is absent; empty where nothing does.
+    sentence
+        For the operator, where it is absent or cannot be used: what follows, and the remedy.
+    fit
+        Which values it may hold where it cannot be written.
+    accept
+        Name under which ``cia402.accept_without`` has to accept its absence; empty where it does
+        not have to. (For 1016:1 only where no other :class:`Watchdog` stands.)
+    zero
+        Has to read 0 where it is there: something that a drive may hold from before.
+    """
+
+    index: int
+    sub: int
+    name: str
+    core: bool
+    access: Access
+    stand_in: str = ""
+    sentence: str = ""
+    fit: Fit = Fit.EQUAL
+    accept: str = ""
+    zero: bool = False
+
+    @property
+    def place(self) -> str:
+        """Index and sub-index as messages show them: ``6072`` or ``1016:1``."""
+        return f"{self.index:04X}:{self.sub}" if self.sub else f"{self.index:04X}"
+
+    def missing(self, accepted: Collection[str] = ()) -> str:
+        """Return why a drive without it is refused, as a sentence; empty if it is not.
+
+        Parameters
+        ----------
+        accepted
+            ``cia402.accept_without`` of the profile.
+        """
+        if not self.core and (not self.accept or self.accept in accepted):
+            return ""
+        remedy = (
+            f' To run without it all the same: cia402.accept_without = ["{self.accept}"].'
+            if self.accept
+            else ""
+        )
+        return f"it has no object {self.place} ({self.name}). {self.sentence}{remedy}"
+
+
+_R, _W = Access.READ, Access.WRITE
+_NOT_USABLE: Final = "Without it the drive cannot be used: see whether its firmware offers it."
+_DYNAMIC: Final = (
+    "Its PDOs have to be mapped as rigd needs them, or be mapped so already: RPDO1 with "
+    "controlword and target torque, TPDO1 with statusword, position and actual torque."
+)
+_FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
+
+CORE: Final = (
+    Requirement(
+        protocol.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
+    ),
+    Requirement(protocol.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
+    Requirement(
+        protocol.MODE,
+        0,
+        "Modes of operation",
+        True,
+        _R | _W,
+        sentence="It has to take 10, cyclic synchronous torque mode.",
+    ),
+    Requirement(
+        protocol.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
+    ),
+    Requirement(
+        protocol.POSITION,
+        0,
+        "Position actual value",
+        True,
+        _R | Access.SENT,
+        sentence="The loop runs on it.",
+    ),
+    Requirement(
+        protocol.TARGET_TORQUE,
+        0,
+        "Target torque",
+        True,
+        Access.RECEIVED,
+        sentence="Without it the drive has no torque mode that rigd could use.",
+    ),
+    Requirement(
+        protocol.SUPPORTED_MODES,
+        0,
+        "Supported drive modes",
+        True,
+        _R,
+        sentence="Its bit 9 has to say that the drive has cyclic synchronous torque mode.",
+    ),
+    Requirement(
+        protocol.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC
+    ),
+    Requirement(
+        protocol.RPDO_COMMUNICATION,
+        2,
+        "Transmission type of RPDO1",
+        True,
+        _R | _W,
+        sentence="It has to be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
+    ),
+    Requirement(protocol.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(
+        protocol.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC
+    ),
+    Requirement(
+        protocol.TPDO_COMMUNICATION,
+        2,
+        "Transmission type of TPDO1",
+        True,
+        _R | _W,
+        sentence="It has to be 1: an angle at every SYNC.",
+    ),
+    Requirement(protocol.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
+)
+"""No session without one of these. Mapping entries 1600 and 1A00 sub 1 and on go with sub 0."""
+
+OPTIONAL: Final = (
+    # Identity and texts: told in reports, compared only where the profile names them.
+    Requirement(
+        protocol.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
+    ),
+    Requirement(
+        protocol.IDENTITY,
+        2,
+        "Product code",
+        False,
+        _R,
+        "nothing: cia402.product_code = 0",
+        fit=Fit.ANY,
+    ),
+    Requirement(protocol.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
+    Requirement(
+        protocol.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
+    ),
+    # SYNC.
+    Requirement(
+        protocol.SYNC_COB_ID,
+        0,
+        "COB-ID SYNC",
+        False,
+        _R | _W,
+        "0x080, which CiA 301 sets beforehand",
+    ),
+    Requirement(
+        protocol.SYNC_PERIOD_US,
+        0,
+        "Communication cycle period",
+        False,
+        _R | _W,
+        "transmission type 1: the drive goes by the SYNCs that come",
+        "It has to be the period of rig.rate_hz in microseconds, or 0.",
+        Fit.EQUAL_OR_UNUSED,
+    ),
+    Requirement(
+        protocol.SYNC_WINDOW_US,
+        0,
+        "Synchronous window length",
+        False,
+        _R | _W,
+        "no window",
+        f"A torque that comes later than it is dropped. {_FROM_BEFORE}",
+        zero=True,
+    ),
+    Requirement(
+        protocol.SYNC_OVERFLOW,
+        0,
+        "Synchronous counter overflow value",
+        False,
+        _R | _W,
+        "a SYNC without counter",
+        f"rigd sends SYNC without a counter. {_FROM_BEFORE}",
+        zero=True,
+    ),
+    Requirement(
+        protocol.INTERPOLATION_TIME,
+        1,
+        "Interpolation time period value",
+        False,
+        _R | _W,
+        "the SYNC: each torque holds until the next",
+        "With 60C2:2 it has to be the period of rig.rate_hz.",
+    ),
+    Requirement(
+        protocol.INTERPOLATION_TIME,
+        2,
+        "Interpolation time index",
+        False,
+        _R | _W,
+        "the SYNC: each torque holds until the next",
+        "With 60C2:1 it has to be the period of rig.rate_hz.",
+    ),
+    # Who watches over whom.
+    Requirement(
+        protocol.HEARTBEAT_CONSUMER,
+        1,
+        "Consumer heartbeat time",
+        False,
+        _R | _W,
+        "the deadline of the RPDO (1400:5), or the drive's own watchdog (cia402.own_watchdog_s)",
+        "Nothing in the drive would take the torque off when this computer falls silent. If the "
+        "drive has a watchdog of its own, set that up and state its time: cia402.own_watchdog_s.",
+        accept=WATCHDOG,
+    ),
+    Requirement(
+        protocol.RPDO_COMMUNICATION,
+        protocol.EVENT_TIMER,
+        "Event timer of RPDO1",
+        False,
+        _R | _W,
+        "the heartbeat consumer (1016:1), which comes first",
+    ),
+    Requirement(
+        protocol.ABORT_OPTION,
+        0,
+        "Abort connection option code",
+        False,
+        _R | _W,
+        "",
+        "What the drive does when it misses this computer is then its maker's choice: read it up, "
+        "and try it at a low torque by pulling the cable. If it has a value that does, take that "
+        "for cia402.abort_option.",
+        accept=ABORT_OPTION,
+    ),
+    Requirement(
+        protocol.COMMUNICATION_ERROR,
+        1,
+        "Error behaviour on communication error",
+        False,
+        _R | _W,
+        "what CiA 301 sets beforehand: to pre-operational",
+        "It has to be cia402.communication_error_option.",
+    ),
+    Requirement(
+        protocol.HEARTBEAT_PRODUCER_MS,
+        0,
+        "Producer heartbeat time",
+        False,
+        _R | _W,
+        "the TPDO of every SYNC, and limits.stale_ticks_in_a_row",
+        "It has to be cia402.drive_heartbeat_period_s in milliseconds.",
+    ),
+    Requirement(
+        protocol.EMERGENCY_COB_ID,
+        0,
+        "COB-ID EMCY",
+        False,
+        _R | _W,
+        "0x080 + node id, which CiA 301 sets beforehand",
+        "Its emergency messages would not be heard.",
+    ),
+    # Torque and speed.
+    Requirement(
+        protocol.MAX_TORQUE,
+        0,
+        "Max torque",
+        False,
+        _R | _W,
+        "a limit of the maker's own, set by cia402.set_objects (maxon EPOS4: 3001:2), the speed "
+        "limit 6080, and the cut to motor.peak_torque_nm in this program",
+        "The drive then has no limit of its own for the torque that rigd could set. Set the one "
+        "that its maker gives it by cia402.set_objects.",
+        accept=TORQUE_LIMIT,
+    ),
+    *(
+        Requirement(
+            index,
+            0,
+            name,
+            False,
+            _R | _W,
+            "Max torque (6072)",
+            "It cuts torques that the profile allows: raise it with the drive's own tool, or lower "
+            "motor.peak_torque_nm.",
+            Fit.AT_LEAST,
+        )
+        for index, name in zip(
+            protocol.TORQUE_LIMITS,
+            ("Positive torque limit value", "Negative torque limit value"),
+            strict=True,
+        )
+    ),
+    Requirement(
+        protocol.TORQUE_OFFSET,
+        0,
+        "Torque offset",
+        False,
+        _R | _W,
+        "none is added",
+        f"The drive adds it to every torque. {_FROM_BEFORE}",
+        zero=True,
+    ),
+    Requirement(
+        protocol.RATED_TORQUE,
+        0,
+        "Motor rated torque",
+        False,
+        _R,
+        "motor.rated_torque_nm alone: cia402.rated_torque_unit_nm = 0",
+        "What 1000 thousandths of torque are cannot be compared with the profile: set "
+        "cia402.rated_torque_unit_nm = 0, and measure it (rigd identify motor).",
+        fit=Fit.ANY,
+    ),
+    Requirement(
+        protocol.ACTUAL_TORQUE,
+        0,
+        "Torque actual value",
+        False,
+        _R | Access.SENT,
+        "",
+        "Torque commands that are lost, or cut by the drive, would not be noticed.",
+        fit=Fit.ANY,
+        accept=TORQUE_FEEDBACK,
+    ),
+    Requirement(
+        protocol.MAX_SPEED_RPM,
+        0,
+        "Max motor speed",
+        False,
+        _R | _W,
+        "nothing: cia402.max_speed_rad_s = 0, and a longer worst travel in rigd check",
+        "The drive has no limit of its own for the speed: set cia402.max_speed_rad_s = 0, and see "
+        "what rigd check then says of the worst travel.",
+    ),
+    # What a drive may hold from before.
+    Requirement(
+        protocol.TPDO_COMMUNICATION,
+        protocol.INHIBIT_TIME,
+        "Inhibit time of TPDO1",
+        False,
+        _R | _W,
+        "no inhibit time",
+        f"It keeps back angles that SYNC asks for. {_FROM_BEFORE}",
+        zero=True,
+    ),
+    Requirement(
+        protocol.POLARITY,
+        0,
+        "Polarity",
+        False,
+        _R,
+        "no polarity",
+        "It turns the position, the speed or the torque round: turned alone, one of them makes the "
+        f"loop run away. {_FROM_BEFORE} The direction of the axis is cia402.direction.",
+        zero=True,
+    ),
+    Requirement(
+        protocol.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
+    ),
+    Requirement(
+        protocol.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
+    ),
+)
+"""Objects that something else stands in for."""
+
+REQUIREMENTS: Final = CORE + OPTIONAL
+
+MAY_BE_WRITE_ONLY: Final = (
+    protocol.MODE,
+    protocol.INTERPOLATION_TIME,
+    protocol.ABORT_OPTION,
+    protocol.COMMUNICATION_ERROR,
+    protocol.HEARTBEAT_PRODUCER_MS,
+    protocol.MAX_TORQUE,
+    protocol.MAX_SPEED_RPM,
+)
+"""Objects that are set whatever they held before, so that one that cannot be read is written and
+taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
+
+_BY_PLACE: Final = {(each.index, each.sub): each for each in REQUIREMENTS}
+
+
+def requirement(index: int, sub: int = 0) -> Requirement:
+    """Return the row of an object.
+
+    Raises
+    ------
+    KeyError
+        If rigd asks nothing of it.
+    """
+    return _BY_PLACE[index, sub]
+
+
+_ROUNDING = 1e-9
+
+
+def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
+    """Return what objects are to hold whatever the profile says, by index and sub-index.
+
+    Parameters
+    ----------
+    node_id
+        Of the drive. CiA 301 sets its identifiers beforehand: it is added to all but that of SYNC.
+    """
+    return {
+        **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},
+        (protocol.MODE, 0): protocol.CYCLIC_TORQUE,
+        (protocol.SYNC_COB_ID, 0): protocol.SYNC_ID,
+        (protocol.EMERGENCY_COB_ID, 0): 0x080 + node_id,
+        (protocol.TPDO_COMMUNICATION, 1): 0x180 + node_id,
+        (protocol.TPDO_COMMUNICATION, 2): protocol.AT_EVERY_SYNC,
+        (protocol.RPDO_COMMUNICATION, 1): 0x200 + node_id,
+    }
+
+
+def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
+    """Return what the set-up has the drive's objects hold, by index and sub-index.
+
+    Only what the set-up asks the drive about, such as which watchdog it has, is not among it.
+
+    Parameters
+    ----------
+    rig
+        With a section ``cia402``.
+
+    Raises
+    ------
+    DeviceError
+        If the period cannot be told to a drive.
+    """
+    settings = rig.cia402
+    assert settings is not None
+    at_sync = settings.torque_delivery == "at_sync"
+    period_us = sync_period_us(rig.rate_hz)
+    value, exponent = interpolation_time(rig.rate_hz)
+    limit = torque_limit_per_mille(rig)
+    wanted = fixed_values(settings.node_id) | {
+        (protocol.RPDO_COMMUNICATION, 2): protocol.AT_EVERY_SYNC
+        if at_sync
+        else protocol.ON_ARRIVAL,
+        (protocol.SYNC_PERIOD_US, 0): period_us,
+        (protocol.INTERPOLATION_TIME, 1): value,
+        (protocol.INTERPOLATION_TIME, 2): exponent,
+        (protocol.ABORT_OPTION, 0): settings.abort_option,
+        (protocol.COMMUNICATION_ERROR, 1): settings.communication_error_option,
+        (protocol.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
+        (protocol.MAX_TORQUE, 0): limit,
+        **{(index, 0): limit for index in protocol.TORQUE_LIMITS},
+    }
+    if settings.max_speed_rad_s > 0:
+        wanted[protocol.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
+    return wanted
+
+
+def sync_period_us(rate_hz: float) -> int:
+    """Return the period in whole microseconds, for object 1006.
+
+    Raises
+    ------
+    DeviceError
+        If it is none.
+    """
+    period_us = 1e6 / rate_hz
+    if abs(period_us - round(period_us)) > _ROUNDING * period_us:
+        raise DeviceError(
+            f"rig.rate_hz = {rate_hz:g} Hz: its period is no whole number of microseconds, which "
+            "a CANopen drive needs; choose another rate, such as 1000 Hz."
+        )
+    return round(period_us)
+
+
+def interpolation_time(rate_hz: float) -> tuple[int, int]:
+    """Return value (1 to 255) and power of ten in s of the period, for object 60C2.
+
+    Milliseconds come first: some drives take nothing else.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such pair.
+    """
+    for exponent in (-3, -4, -5, -6, -2, -1, 0):
+        value = 10.0**-exponent / rate_hz
+        if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING * value:
+            return round(value), exponent
+    raise DeviceError(
+        f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "
+        "1 to 255 times a power of ten of a second); choose another rate, such as 1000 Hz."
+    )
+
+
+def torque_limit_per_mille(rig: "RigParameters") -> int:
+    """Return the peak torque in 1/1000 of the rated torque, rounded down, within 16 bits."""
+    motor = rig.motor
+    return min(int(1000 * motor.peak_torque_nm / motor.rated_torque_nm + _ROUNDING), 32767)
+
+
+def max_speed_rpm(settings: "ServoDrive") -> int:
+    """Return the speed limit in turns of the motor a minute, rounded up, for object 6080."""
+    return ceil(settings.max_speed_rad_s * settings.gear_ratio * 60 / tau - _ROUNDING)

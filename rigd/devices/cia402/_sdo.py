@@ -1,0 +1,381 @@
+"""Reading and writing of the drive's objects by SDO, while no cycle runs.
+
+The canopen library does it, with a thread that receives; both are gone when the access is left.
+An object's type is taken from the drive's EDS file where the profile names one, else from
+``drive.eds`` beside this module.
+"""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+
+import can
+import canopen
+from canopen.network import MessageListener
+from canopen.objectdictionary import (
+    ObjectDictionary,
+    ObjectDictionaryError,
+    ODRecord,
+    ODVariable,
+    datatypes,
+)
+from canopen.sdo.base import SdoVariable
+
+from rigd.devices import DeviceError, EdsError, read_eds
+from rigd.devices.canbus import CanPort
+from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402._assignments import Assignment
+from rigd.devices.cia402._protocol import NMT_PRE_OPERATIONAL
+
+EVERY_BIT = 0xFFFF_FFFF
+"""Mask of an object all of whose bits count."""
+
+_EDS = Path(__file__).with_name("drive.eds")
+_SDO_TIMEOUT_S = 0.5
+_SDO_TRIES = 2
+_HURRIED_TIMEOUT_S = 0.05
+_LATE_REPLIES = 3
+"""How many replies to earlier requests, given up since, may come in place of the one awaited."""
+_TIMED_OUT = "No SDO response"
+"""How canopen begins to tell that nothing came at all; what else it tells came, and was not it."""
+_RECEIVER_POLL_S = 0.02
+_ABSENT = {
+    0x0602_0000: "no such object",
+    0x0609_0011: "no such sub-index",
+    0x060A_0023: "nothing behind it",
+    0x0800_0024: "it has no value",
+    # What firmware says that knows no better of an object which it has not.
+    0x0800_0000: "general error",
+    0x0504_0001: "unknown command",
+    0x0601_0000: "unsupported access",
+}
+"""SDO abort codes by which an object that is read, or written after that, counts as absent. A state
+in which it cannot be accessed (0x08000022) and an access in the wrong direction do not."""
+_WRITE_ONLY = 0x0601_0001
+_WRONG_LENGTHS = (0x0607_0010, 0x0607_0012, 0x0607_0013)
+_KINDS = {
+    "u8": datatypes.UNSIGNED8,
+    "u16": datatypes.UNSIGNED16,
+    "u32": datatypes.UNSIGNED32,
+    "i8": datatypes.INTEGER8,
+    "i16": datatypes.INTEGER16,
+    "i32": datatypes.INTEGER32,
+}
+
+
+class SdoRefusal(DeviceError):
+    """The drive refused to read or write an object; carries the abort code."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether the drive has no such object, as far as its code tells."""
+        return self.code in _ABSENT
+
+    @property
+    def is_write_only(self) -> bool:
+        """Whether the drive has the object and never shows what it holds."""
+        return self.code == _WRITE_ONLY
+
+
+class NotKept(DeviceError):
+    """The drive took a value and reads back another one, which this carries."""
+
+    def __init__(self, message: str, got: int) -> None:
+        super().__init__(message)
+        self.got = got
+
+
+class _Receiver(MessageListener):
+    """Canopen's receiver; it keeps its thread quiet when the bus is cut.
+
+    The next request reports the failure.
+    """
+
+    def on_error(self, exc: Exception) -> None:  # noqa: ARG002
+        """Let the thread go on until the network ends it; it would ask again at once."""
+        time.sleep(_RECEIVER_POLL_S)
+
+
+class SdoAccess:
+    """Reading and writing of one drive's objects, as a context.
+
+    Parameters
+    ----------
+    port
+        Open; nobody else receives from it meanwhile.
+    node_id
+        Of the drive.
+    name
+        Of the drive, for messages.
+    """
+
+    def __init__(self, port: CanPort, node_id: int, name: str) -> None:
+        for library in ("can", "canopen"):
+            # What goes wrong is raised; without a handler they would also print it.
+            logging.getLogger(library).addHandler(logging.NullHandler())
+        self._name = name
+        self._bus_name = port.name
+        self._node_id = node_id
+        self._node = canopen.RemoteNode(node_id, canopen.import_od(str(_EDS), node_id))
+        self._node.sdo.RESPONSE_TIMEOUT = _SDO_TIMEOUT_S
+        self._node.sdo.MAX_RETRIES = _SDO_TRIES
+        port.accept(None)  # a sensor on the same bus may have narrowed it to its own frames
+        self._network = canopen.Network(port.open_bus())
+        self._network.NOTIFIER_CYCLE = _RECEIVER_POLL_S
+        self._network.listeners = [_Receiver(self._network)]
+
+    def __enter__(self) -> "SdoAccess":
+        self._network.add_node(self._node)
+        self._network.connect()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        # It reports a cut bus once more, when everything has ended.
+        with suppress(Exception):
+            self._network.disconnect()
+
+    def to_pre_operational(self) -> None:
+        """Have the drive leave operational, and make sure that it answers.
+
+        Raises
+        ------
+        DeviceError
+            If it does not.
+        """
+        self.tell_pre_operational()
+        try:
+            self.read(protocol.IDENTITY, 1)
+        except SdoRefusal:
+            return
+        except DeviceError as error:
+            others = sorted(set(self._network.scanner.nodes) - {self._node.id})
+            heard = f"; heard of node {', '.join(map(str, others))}" if others else ""
+            raise DeviceError(
+                f"{error} Look at its supply, its node id (cia402.node_id) and bit rate{heard}."
+            ) from None
+
+    def use_eds(self, path: str) -> tuple[int, int]:
+        """Take objects' types from the drive's EDS file from now on.
+
+        Returns
+        -------
+        tuple of int
+            Vendor and product number in it; 0 where it states none.
+
+        Raises
+        ------
+        DeviceError
+            If it cannot be read.
+        """
+        return _take_types(self._node.object_dictionary, path, self._node_id)
+
+    def tell_pre_operational(self) -> None:
+        """Tell the drive to leave operational, which it may ignore; nobody waits for it.
+
+        Raises
+        ------
+        DeviceError
+            If the bus does not take the command.
+        """
+        try:
+            self._node.nmt.send_command(NMT_PRE_OPERATIONAL)
+        except (can.CanError, OSError) as error:
+            raise DeviceError(
+                f"{self._name}: CAN bus {self._bus_name} takes no commands ({error})."
+            ) from None
+
+    @contextmanager
+    def hurried(self) -> Iterator[None]:
+        """Wait for each answer for 50 ms only, and ask once, as where torque is to be taken off."""
+        client = self._node.sdo
+        before = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
+        client.RESPONSE_TIMEOUT, client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
+        try:
+            yield
+        finally:
+            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = before
+
+    def read(self, index: int, sub: int = 0) -> int:
+        """Return the value of an object.
+
+        Raises
+        ------
+        DeviceError
+            If the drive does not answer, or refuses (:class:`SdoRefusal`).
+        """
+        value = self._transfer(index, sub, None)
+        if not isinstance(value, int):
+            raise DeviceError(f"{self._name}: {self._title(index, sub)} is not a number.")
+        return value
+
+    def read_if_there(self, index: int, sub: int = 0) -> int | None:
+        """Return the value of an object, or None where the drive has no such object.
+
+        Raises
+        ------
+        DeviceError
+            If the drive does not answer, or refuses for another reason.
+        """
+        try:
+            return self.read(index, sub)
+        except SdoRefusal as refusal:
+            if refusal.is_absent:
+                return None
+            raise
+
+    def read_text(self, index: int) -> str:
+        """Return a text, empty if the drive has none; as :meth:`read` otherwise."""
+        try:
+            return str(self._transfer(index, 0, None)).strip("\0 ")
+        except SdoRefusal:
+            return ""
+
+    def write(self, index: int, sub: int, value: int) -> None:
+        """Write an object without reading it back.
+
+        Raises
+        ------
+        DeviceError
+            If the drive does not answer, or refuses.
+        """
+        self._transfer(index, sub, value)
+
+    def configure(self, index: int, sub: int, value: int, mask: int = EVERY_BIT) -> None:
+        """Write an object and read it back.
+
+        Raises
+        ------
+        DeviceError
+            If the drive does not answer, refuses (:class:`SdoRefusal`), or keeps another value in
+            the bits of `mask` (:class:`NotKept`).
+        """
+        self.write(index, sub, value)
+        got = self.read(index, sub)
+        if (got ^ value) & mask:
+            raise NotKept(
+                f"{self._name}: {self._title(index, sub)} was set to {show_value(value)} and reads "
+                f"{show_value(got)}; check with the drive's own tool why it does not keep it.",
+                got,
+            )
+
+    def assign(self, assignment: Assignment) -> None:
+        """Write an object of the maker's own and read it back; raises as :meth:`configure` does."""
+        index, sub = assignment.index, assignment.sub
+        variable = self._variable(index, sub)
+        variable.data_type = _KINDS[assignment.kind]
+        self.configure(index, sub, assignment.value)
+
+    def last_emergency(self) -> int:
+        """Return the code of the last emergency message heard, or 0."""
+        log = self._node.emcy.log
+        return log[-1].code if log else 0
+
+    def _transfer(self, index: int, sub: int, value: int | None) -> object:
+        """Write a value, or read one."""
+        variable = SdoVariable(self._node.sdo, self._variable(index, sub))
+        what = "reading" if value is None else f"writing {show_value(value)} to"
+        try:
+            return _ask(variable, value)
+        except canopen.SdoAbortedError as error:
+            remedy = (
+                " Name the drive's EDS file in the profile (cia402.eds), which has its types."
+                if error.code in _WRONG_LENGTHS
+                else ""
+            )
+            raise SdoRefusal(
+                f"{self._name}: it refuses {what} {self._title(index, sub)}: {error}.{remedy}",
+                error.code,
+            ) from None
+        except (canopen.SdoCommunicationError, can.CanError, OSError):
+            raise DeviceError(
+                f"{self._name}: no answer on CAN bus {self._bus_name} to {what} "
+                f"{self._title(index, sub)}."
+            ) from None
+        except (ObjectDictionaryError, ValueError) as error:
+            raise DeviceError(
+                f"{self._name}: unusable answer to {what} {self._title(index, sub)} ({error})."
+            ) from None
+
+    def _variable(self, index: int, sub: int) -> ODVariable:
+        """Return the entry of an object in the dictionary, made where it has none."""
+        dictionary = self._node.object_dictionary
+        known = dictionary.get_variable(index, sub)
+        if known is not None:
+            return known
+        variable = ODVariable("", index, sub)
+        variable.data_type = _KINDS[_kind_of_parameter(index, sub)]
+        if index not in dictionary:
+            dictionary.add_object(ODRecord(f"{index:04X}", index))
+        record = dictionary[index]
+        if isinstance(record, ODVariable):
+            dictionary.add_object(record := ODRecord(f"{index:04X}", index))
+        record.add_member(variable)
+        return variable
+
+    def _title(self, index: int, sub: int) -> str:
+        name = self._variable(index, sub).name
+        place = f"{index:04X}:{sub}" if sub else f"{index:04X}"
+        return f"object {place}" + (f" ({name})" if name else "")
+
+
+def _ask(variable: SdoVariable, value: int | None) -> object:
+    """Write a value or read one, past replies to requests that were given up before."""
+    for left in reversed(range(_LATE_REPLIES + 1)):
+        try:
+            if value is None:
+                return variable.raw
+            variable.raw = value
+            return value
+        except canopen.SdoCommunicationError as error:
+            if not left or str(error).startswith(_TIMED_OUT):
+                raise
+    raise AssertionError
+
+
+def _take_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
+    """Take the types of whole numbers from a drive's EDS file; return its identity."""
+    try:
+        theirs = read_eds(Path(eds), node_id)
+    except EdsError as error:
+        raise DeviceError(
+            f"{error} Get it anew from the maker, or remove cia402.eds from the profile."
+        ) from None
+    for place in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
+        entry, mine = theirs.get(*place), own.get_variable(*place)
+        if (
+            entry is not None
+            and mine is not None
+            and {entry.data_type, mine.data_type} <= set(datatypes.INTEGER_TYPES)
+        ):
+            mine.data_type = entry.data_type
+    return theirs.vendor_id, theirs.product_code
+
+
+def _variables(entry: object) -> list[ODVariable]:
+    return [entry] if isinstance(entry, ODVariable) else list(entry.values())  # type: ignore[attr-defined]
+
+
+def _kind_of_parameter(index: int, sub: int) -> str:
+    """Return the type of a PDO's parameter or of a heartbeat consumer, by CiA 301."""
+    if 0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00:
+        return {0: "u8", 1: "u32", 2: "u8"}.get(sub, "u16")
+    return "u32" if sub else "u8"
+
+
+def show_value(value: object) -> str:
+    """Return a value as messages show it: large numbers in hexadecimal."""
+    if isinstance(value, int) and not -65536 < value < 65536:
+        return f"0x{value:08X}"
+    return str(value)

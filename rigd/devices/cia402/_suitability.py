@@ -1,0 +1,342 @@
+"""Can rigd drive this with torque? The answer of an EDS file, before anything is connected.
+
+The file is held against the table that the set-up goes by (:mod:`requirements`). What it does not
+tell is left to the drive, which is asked when it is connected.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Final
+
+from rigd.devices import Eds, EdsEntry
+from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402._requirements import (
+    MAY_BE_WRITE_ONLY,
+    REQUIREMENTS,
+    WATCHDOG,
+    Access,
+    Fit,
+    Requirement,
+    Watchdog,
+    fixed_values,
+    requirement,
+    wanted_values,
+    watchdog,
+)
+
+if TYPE_CHECKING:
+    from rigd.devices import RigParameters, ServoDrive
+
+
+class Grade(Enum):
+    """Of what a file tells of one object."""
+
+    FITS = "as needed"
+    STANDS_IN = "something else does its work"
+    ASK = "the drive will be asked"
+    ACCEPTED = "the profile accepts that it is missing"
+    DOUBT = "a session can be run; somebody should look"
+    REFUSED = "no session with this drive"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What the file tells of one object, or of the drive as a whole."""
+
+    what: str
+    """``6072 Max torque``, or in words."""
+    found: str
+    wanted: str
+    grade: Grade
+    sentence: str = ""
+    """Of what is refused or doubtful, for the operator: what follows, and the remedy."""
+    accept: str = ""
+    """Name by which the profile may accept it (``cia402.accept_without``)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """All findings on one file."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """Sentences, one for each reason against this drive."""
+        return tuple(f.sentence for f in self.findings if f.grade is Grade.REFUSED)
+
+
+_PDO_ENTRIES: Final = {
+    protocol.RPDO_MAPPING: protocol.RPDO_ENTRIES,
+    protocol.TPDO_MAPPING: protocol.TPDO_ENTRIES,
+}
+_LENGTHS: Final = {
+    entry >> 16: entry & 0xFF for entries in _PDO_ENTRIES.values() for entry in entries
+}
+"""Bits that each mapped object has in its PDO."""
+_COB_IDS: Final = (
+    (protocol.SYNC_COB_ID, 0),
+    (protocol.EMERGENCY_COB_ID, 0),
+    (protocol.TPDO_COMMUNICATION, 1),
+    (protocol.RPDO_COMMUNICATION, 1),
+)
+_NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
+_TOLD_BEFORE: Final = (protocol.SUPPORTED_MODES, protocol.IDENTITY)
+
+
+def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
+    """Hold a drive's EDS against what rigd asks of a drive.
+
+    Parameters
+    ----------
+    eds
+        Read for the node id of the profile.
+    rig
+        Of a profile with a section ``cia402``, whose values are then compared as well; None: the
+        drive alone is judged, and what a profile may accept counts as accepted.
+    """
+    return Judgement(tuple(_Judge(eds, rig).findings()))
+
+
+class _Judge:
+    def __init__(self, eds: Eds, rig: "RigParameters | None") -> None:
+        self._eds = eds
+        self._rig = rig if rig is not None and rig.cia402 is not None else None
+        self._settings: ServoDrive | None = self._rig.cia402 if self._rig else None
+        self._wanted = wanted_values(self._rig) if self._rig else fixed_values(eds.node_id)
+
+    def findings(self) -> Iterator[Finding]:
+        yield from self._identity()
+        yield from self._bit_rates()
+        yield self._torque_mode()
+        yield self._watchdog()
+        for needed in REQUIREMENTS:
+            if needed.index in _TOLD_BEFORE or needed.accept == WATCHDOG:
+                continue
+            entry = self._eds.get(needed.index, needed.sub)
+            yield self._absent(needed) if entry is None else self._present(needed, entry)
+
+    def _identity(self) -> Iterator[Finding]:
+        for key, told, name in (
+            ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
+            ("product_code", self._eds.product_code, self._eds.product_name),
+        ):
+            what = key.replace("_", " ")
+            wanted = getattr(self._settings, key) if self._settings else 0
+            shown = f"0x{told:08X}" if told else "not told"
+            found = f"{shown} ({name})" if name else shown
+            if not (told and wanted and told != wanted):
+                yield Finding(what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS)
+                continue
+            sentence = (
+                f"The file is of another drive than the profile's: cia402.{key} is 0x{wanted:08X}, "
+                f"the file says {shown}."
+            )
+            yield Finding(what, found, f"0x{wanted:08X}", Grade.REFUSED, sentence)
+
+    def _bit_rates(self) -> Iterator[Finding]:
+        rates = self._eds.bit_rates_bit_s
+        found = ", ".join(f"{rate // 1000}" for rate in rates)
+        found = f"{found} kbit/s" if rates else "not told"
+        if self._rig is None or self._rig.can is None:
+            yield Finding("bit rates", found, "", Grade.FITS)
+            return
+        rate = self._rig.can.bitrate_bit_s
+        wanted = f"{rate / 1000:g} kbit/s"
+        if not rates or rate in rates:
+            yield Finding("bit rates", found, wanted, Grade.FITS)
+            return
+        sentence = (
+            f"The drive has no bit rate of {wanted} (can.bitrate_bit_s); choose one of {found}."
+        )
+        yield Finding("bit rates", found, wanted, Grade.REFUSED, sentence)
+
+    def _torque_mode(self) -> Finding:
+        what, wanted = (
+            f"{protocol.SUPPORTED_MODES:04X} Supported drive modes",
+            "bit 9 (cyclic torque)",
+        )
+        modes = self._eds.get(protocol.SUPPORTED_MODES)
+        place = f"object {protocol.SUPPORTED_MODES:04X}"
+        if modes is None:
+            sentence = f"No cyclic synchronous torque mode: {place} is missing."
+            return Finding(what, "absent", wanted, Grade.REFUSED, sentence)
+        if modes.default:
+            shown = f"0x{modes.default:X}"
+            if modes.default & protocol.SUPPORTS_CYCLIC_TORQUE:
+                return Finding(what, shown, wanted, Grade.FITS)
+            sentence = (
+                f"No cyclic synchronous torque mode: {place} = {shown} lacks bit 9; this drive or "
+                "its firmware cannot be used."
+            )
+            return Finding(what, shown, wanted, Grade.REFUSED, sentence)
+        return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
+
+    def _watchdog(self) -> Finding:
+        """Tell what in the drive takes the torque off when this computer falls silent."""
+        found = self._stands()
+        what, wanted = "watchdog", "one of three"
+        if found is Watchdog.HEARTBEAT:
+            return Finding(what, found.value, wanted, Grade.FITS)
+        if found is not Watchdog.NONE:
+            return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.STANDS_IN)
+        return self._to_accept(requirement(protocol.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
+
+    def _stands(self) -> Watchdog:
+        heartbeat = self._eds.get(protocol.HEARTBEAT_CONSUMER, 1)
+        deadline = self._eds.get(protocol.RPDO_COMMUNICATION, protocol.EVENT_TIMER)
+        return watchdog(
+            heartbeat=heartbeat is not None and heartbeat.writable,
+            rpdo_deadline=deadline is not None and deadline.writable,
+            own=self._settings is not None and self._settings.own_watchdog_s > 0,
+        )
+
+    def _absent(self, needed: Requirement) -> Finding:
+        what = f"{needed.place} {needed.name}"
+        if needed.core:
+            return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
+        if needed.index == protocol.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
+            found = "absent; in its place: what the maker's own watchdog does"
+            return Finding(what, found, "", Grade.STANDS_IN)
+        if needed.accept:
+            return self._to_accept(needed, what, "absent", "")
+        if self._is_set_by_profile(needed):
+            sentence = f"it has no object {needed.place} ({needed.name}). {needed.sentence}"
+            return Finding(what, "absent", "", Grade.REFUSED, _sentence(sentence))
+        stand_in = f"; in its place: {needed.stand_in}" if needed.stand_in.strip("–") else ""
+        return Finding(what, f"absent{stand_in}", "", Grade.STANDS_IN)
+
+    def _to_accept(self, needed: Requirement, what: str, found: str, wanted: str) -> Finding:
+        """Judge what is missing unless the profile accepts that by name."""
+        stand_in = f" In its place: {needed.stand_in}." if needed.stand_in else ""
+        if self._settings is not None and needed.accept in self._settings.accept_without:
+            found = f"{found}, accepted by the profile"
+            sentence = f"{what}: {found}.{stand_in}"
+            return Finding(what, found, wanted, Grade.ACCEPTED, sentence, needed.accept)
+        sentence = _sentence(needed.missing()) + stand_in
+        # Without a profile nobody has had the chance to accept it.
+        grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
+        return Finding(what, found, wanted, grade, sentence, needed.accept)
+
+    def _is_set_by_profile(self, needed: Requirement) -> bool:
+        """Whether the profile asks for what only this object can do."""
+        settings = self._settings
+        if settings is None:
+            return False
+        return {
+            (protocol.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
+            (protocol.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
+            (protocol.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
+        }.get((needed.index, needed.sub), False)
+
+    def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
+        what = f"{needed.place} {needed.name}"
+        wanted = self._wanted.get((needed.index, needed.sub))
+        asked = "" if wanted is None else _shown(needed, wanted)
+        told = "" if entry.default is None else f", {_shown(needed, entry.default)}"
+        found = f"{entry.access}{told}"
+
+        def objection(text: str, *, doubt: bool = False) -> Finding:
+            sentence = _sentence(f"its object {needed.place} ({needed.name}) {text}")
+            grade = Grade.DOUBT if doubt else Grade.REFUSED
+            return Finding(what, found, asked, grade, sentence)
+
+        if needed.access & (Access.SENT | Access.RECEIVED):
+            trouble = self._unmappable(entry)
+            if trouble and needed.accept:
+                return self._to_accept(needed, what, f"{found}, {trouble}", asked)
+            if trouble:
+                return objection(f"{trouble}. {needed.sentence}")
+        if Access.WRITE in needed.access and not entry.writable:
+            return self._read_only(needed, entry, found, wanted)
+        if Access.READ in needed.access and entry.access == "wo":
+            return objection(
+                f"is write-only: what it holds cannot be checked. {needed.sentence}".rstrip(),
+                doubt=needed.index in MAY_BE_WRITE_ONLY,
+            )
+        if wanted is not None and not _takes(entry, wanted):
+            limits = f"{_limit(needed, entry.low)} to {_limit(needed, entry.high)}"
+            return objection(
+                f"takes {limits}, not {asked}. {needed.sentence}", doubt=not needed.core
+            )
+        return Finding(what, found, asked, Grade.FITS)
+
+    def _read_only(
+        self, needed: Requirement, entry: EdsEntry, found: str, wanted: int | None
+    ) -> Finding:
+        """Judge an object that would be written and cannot be: what it holds may do."""
+        what = f"{needed.place} {needed.name}"
+        if needed.fit is Fit.AT_LEAST:
+            asked = f"at least {wanted or 'motor.peak_torque_nm'}"
+        else:
+            asked = "" if wanted is None else _shown(needed, wanted)
+        if needed.index in _PDO_ENTRIES:
+            held = self._mapped(needed.index)
+            does = None if None in held else held == _PDO_ENTRIES[needed.index]
+        elif wanted is None or entry.default is None:
+            does = None
+        elif (needed.index, needed.sub) in _COB_IDS:
+            # Drives are free to set the bit that forbids remote requests.
+            does = (entry.default ^ wanted) & ~protocol.NO_REMOTE_REQUEST == 0
+            mapping = needed.index + 0x200
+            if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
+                sentence = (
+                    f"its object {needed.place} ({needed.name}) is read-only, so that the PDO "
+                    f"cannot be switched off to be mapped anew. {needed.sentence}"
+                )
+                return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
+        else:
+            does = needed.fit.allows(entry.default, wanted)
+        if does:
+            return Finding(what, f"{found}: it does", asked, Grade.FITS)
+        if does is None and needed.index != protocol.CONTROLWORD:
+            return Finding(what, f"{found}: the drive will be asked", asked, Grade.ASK)
+        sentence = (
+            f"its object {needed.place} ({needed.name}) is read-only and does not hold what is "
+            f"needed{f' ({asked})' if asked else ''}. {needed.sentence}"
+        )
+        return Finding(what, found, asked, Grade.REFUSED, _sentence(sentence))
+
+    def _unmappable(self, entry: EdsEntry) -> str:
+        """Say why an object cannot be in its PDO; empty if it can."""
+        bits = _LENGTHS[entry.index]
+        if entry.bits not in (None, bits):
+            return f"has {entry.bits} bits, not {bits}"
+        mapped = {held >> 16 for index in _PDO_ENTRIES for held in self._mapped(index) if held}
+        if not entry.mappable and entry.index not in mapped:
+            return "cannot be mapped into a PDO"
+        return ""
+
+    def _mapped(self, mapping: int) -> tuple[int | None, ...]:
+        """Return the entries of a mapping as the file has them."""
+        count = self._eds.get(mapping, 0)
+        held = [self._eds.get(mapping, sub) for sub in range(1, 1 + min(_default(count) or 0, 64))]
+        return tuple(map(_default, held)) if _default(count) is not None else (None,)
+
+
+def _default(entry: EdsEntry | None) -> int | None:
+    return None if entry is None else entry.default
+
+
+def _takes(entry: EdsEntry, value: int) -> bool:
+    """Whether a value is within the limits of an object, where it has any that make sense."""
+    low, high = entry.low, entry.high
+    if low is not None and high is not None and low > high:
+        return True
+    return (low is None or low <= value) and (high is None or value <= high)
+
+
+def _shown(needed: Requirement, value: int) -> str:
+    """Return a value as messages show it: identifiers and codes in hexadecimal."""
+    in_hex = value > 0xFFFF or (needed.index, needed.sub) in _COB_IDS
+    return f"0x{value:X}" if in_hex and value >= 0 else str(value)
+
+
+def _limit(needed: Requirement, value: int | None) -> str:
+    return "anything" if value is None else _shown(needed, value)
+
+
+def _sentence(text: str) -> str:
+    """Make a sentence of one that goes on after the name of a drive."""
+    return text[0].upper() + text[1:]

@@ -1,0 +1,494 @@
+"""One tick: read the devices, check the limits, control, command; and what is watched at rest.
+
+The encoder while the torque is off: a hand may turn the motor, but nothing makes it jump.
+
+The zero, and the limits with it, stand on the encoder's count. In a session the watch over the
+limits sees every reading; this sees those before, between and after.
+"""
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from math import exp, inf, isfinite
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.control import PidController
+from rigd.devices import DeviceError, Devices, Wrench
+from rigd.engine._timing import Metronome
+from rigd.profile import Profile
+from rigd.runtime import runtime_folder
+from rigd.safety import LimitWatch, Violation
+from rigd.session import Status
+
+
+def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
+    """Return the watch for the rig of a profile; it stays for as long as the rig is connected.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    heat_nm2
+        How warm the motor is: mean square of its torque over its thermal time constant, (N·m)².
+    """
+    rig = profile.rig
+    watch = LimitWatch(
+        profile.limits,
+        rig.sensor.range,
+        rig.rate_hz,
+        resolution_rad=rig.encoder.resolution_rad,
+        peak_torque_nm=rig.motor.peak_torque_nm,
+        continuous_torque_nm=rig.motor.continuous_torque_nm,
+        thermal_time_constant_s=rig.motor.thermal_time_constant_s,
+        tare_warning_nm=profile.session.tare_drift_nm,
+    )
+    watch.heat_nm2 = heat_nm2
+    return watch
+
+
+def remember_heat(profile: Profile, heat_nm2: float) -> None:
+    """Write down how warm the motor is now, for the next connection of this user.
+
+    Without a place for it, the next one takes the motor for cold.
+    """
+    path = _heat_file(profile)
+    document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
+    with suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        fresh = path.with_suffix(".new")
+        fresh.write_text(json.dumps(document), encoding="utf-8")
+        fresh.replace(path)
+
+
+def recalled_heat_nm2(profile: Profile) -> float:
+    """Return how warm the motor is still after the last connection, in (N·m)²; 0.0: not known.
+
+    It has cooled down since by its thermal time constant.
+    """
+    try:
+        document = json.loads(_heat_file(profile).read_text("utf-8"))
+        heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return 0.0
+    passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
+    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # of before the computer was started anew
+        return 0.0
+    motor = profile.rig.motor
+    warmest_nm2 = motor.peak_torque_nm**2
+    return min(max(0.0, heat_nm2), warmest_nm2) * exp(-passed_s / motor.thermal_time_constant_s)
+
+
+def _heat_file(profile: Profile) -> Path:
+    plain = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
+    return runtime_folder() / f"heat-{plain}.json"
+
+
+REMEDY = (
+    "The zero of the angle is void, and the limits with it: look at encoder, its cable and shield, "
+    "then reset the rig and set the zero again."
+)
+
+
+class Standstill:
+    """Compares each angle that is read without torque with those before it.
+
+    From one tick to the next the speed may change by what ``limits.acceleration_rad_s2`` allows,
+    as in the loop; over ticks that were missed the motor may move as fast as
+    ``limits.velocity_rad_s``.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    """
+
+    def __init__(self, profile: Profile) -> None:
+        rate_hz, limits = profile.rig.rate_hz, profile.limits
+        self._period_ns = 1e9 / rate_hz
+        # A difference of two movements has four readings in it, each half a step wrong.
+        self._steps_rad = 2.0 * profile.rig.encoder.resolution_rad
+        self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
+        self._per_tick_rad = limits.velocity_rad_s / rate_hz
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew with the next angle: the drive has been, or is being, controlled."""
+        self._angle_rad: float | None = None
+        self._due_ns = 0
+        self._moved: tuple[float, float] | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether place and movement are known, with which the next angle is compared."""
+        return self._moved is not None
+
+    def check(self, angle_rad: float, due_ns: int) -> None:
+        """Check an angle that is not stale.
+
+        Parameters
+        ----------
+        angle_rad
+            From any zero that stays where it is.
+        due_ns
+            When its tick was due.
+
+        Raises
+        ------
+        DeviceError
+            If nothing turns a motor like that.
+        """
+        before_rad, ticks = self._angle_rad, round((due_ns - self._due_ns) / self._period_ns)
+        self._angle_rad, self._due_ns = angle_rad, due_ns
+        if before_rad is None:
+            return
+        moved_rad = angle_rad - before_rad
+        moved, self._moved = self._moved, None
+        if ticks > 1:
+            possible_rad = self._per_tick_rad * ticks + self._steps_rad
+            jump_rad, key = moved_rad, "limits.velocity_rad_s"
+        else:
+            # Of the first movement nobody knows the one before it.
+            last_rad, before_that_rad = moved or (0.0, self._per_tick_rad)
+            # A latch may be late by most of a period, and the next one is not.
+            possible_rad = (
+                self._per_tick2_rad + self._steps_rad + abs(last_rad) + abs(before_that_rad)
+            )
+            jump_rad, key = moved_rad - last_rad, "limits.acceleration_rad_s2"
+            self._moved = moved_rad, last_rad
+        if not abs(jump_rad) <= possible_rad:
+            ticks_taken = f"{ticks} ticks" if ticks > 1 else "one tick"
+            raise DeviceError(
+                f"The encoder jumped by {jump_rad:.4g} rad within {ticks_taken} while the torque "
+                f"was off, and no more than {possible_rad:.2g} rad are possible ({key}). {REMEDY}"
+            )
+
+
+_ANGLE_STALE = int(Status.ANGLE_STALE)
+_WRENCH_STALE = int(Status.WRENCH_STALE)
+_WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
+_UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
+_TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
+_LIMIT_WARNING = int(Status.LIMIT_WARNING)
+_TORQUE_OFF = int(Status.TORQUE_OFF)
+
+_RECENT_TICKS = 32
+_SPEED_TICKS = 4
+"""Of the recent ticks, at either end, over which the speed is taken."""
+_SURE_STEPS = 10
+"""Encoder steps within `_SPEED_TICKS` above which a speed is one, and not the encoder's noise."""
+_GAIN = 0.2
+"""Part of the speed that has to be of these ticks: less says nothing about the torque in them."""
+_AGAINST = 1 / 3, 3.0
+"""Acceleration against the torque, over the one that the torque should give: friction and a motor
+whose inertia is only assumed stay within."""
+
+
+class Cycle:
+    """The work of a tick, and what it left behind.
+
+    Parameters
+    ----------
+    devices
+        Connected drive and sensor.
+    projection
+        Coupling torque about the motor's axis = projection · wrench.
+    controller, watch
+        Ready to step; the watch sees every reading before the controller does.
+
+    Attributes
+    ----------
+    devices
+        As given.
+    zero_rad
+        The drive's own angle at the rig's zero.
+    angle_rad, raw_wrench, wrench, coupling_torque_nm
+        The last readings, the angle from the rig's zero; wrench and torque are tared, the raw
+        wrench is not.
+    torque_command_nm
+        The torque that stands, after the limits.
+    flags
+        Status bits of the last tick.
+    """
+
+    def __init__(
+        self,
+        devices: Devices,
+        projection: Wrench,
+        controller: PidController,
+        watch: LimitWatch,
+    ) -> None:
+        self.devices = devices
+        self._drive = devices.drive
+        self._sensor = devices.sensor
+        self._projection = projection
+        self.controller = controller
+        self.watch = watch
+        self.tare: Wrench = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.zero_rad = 0.0
+        self.angle_rad = 0.0
+        self.raw_wrench: Wrench = self.tare
+        self.wrench: Wrench = self.tare
+        self.coupling_torque_nm = 0.0
+        self.torque_command_nm = 0.0
+        self.flags = _TORQUE_OFF
+        self._were_unusable = False
+        self._commanding = False
+        self._torque_squares_nm2 = 0.0
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_RECENT_TICKS)
+
+    def observe(self, due_ns: int) -> None:
+        """Read angle and wrench; the torque stays as it is (zero, before the drive is enabled)."""
+        drive, sensor = self._drive, self._sensor
+        drive.latch(due_ns)
+        sensor.request(due_ns)
+        self.angle_rad = drive.read_angle() - self.zero_rad
+        self.raw_wrench = fx, fy, fz, tx, ty, tz = sensor.read_wrench()
+        bx, by, bz, ox, oy, oz = self.tare
+        px, py, pz, qx, qy, qz = self._projection
+        self.wrench = (fx := fx - bx, fy := fy - by, fz := fz - bz,
+                       tx := tx - ox, ty := ty - oy, tz := tz - oz)  # fmt: skip
+        self.coupling_torque_nm = px * fx + py * fy + pz * fz + qx * tx + qy * ty + qz * tz
+        flags = 0
+        if drive.angle_stale:
+            flags |= _ANGLE_STALE
+        if sensor.wrench_stale:
+            flags |= _WRENCH_STALE
+        if sensor.wrench_saturated:
+            flags |= _WRENCH_SATURATED
+        if self.torque_command_nm == 0.0:
+            flags |= _TORQUE_OFF
+        self.flags = flags
+
+    def step(self, due_ns: int, reference_rad: float) -> Violation | None:
+        """Do a whole tick; where a limit is violated the torque is off when this returns."""
+        self.observe(due_ns)
+        flags = self.flags & ~_TORQUE_OFF
+        watch = self.watch
+        violation = watch.check(
+            reference_rad,
+            self.angle_rad,
+            self.raw_wrench,
+            angle_stale=bool(flags & _ANGLE_STALE),
+        )
+        violation = violation or self.check_stale()
+        if violation is not None:
+            self._recent.append((self.angle_rad, 0.0, 0.0))
+            self.torque_off()
+            self.flags |= _LIMIT_WARNING
+            return violation
+        if watch.warning:
+            flags |= _LIMIT_WARNING
+        controller = self.controller
+        torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
+        if controller.saturated:  # which a torque that is not a number is as well
+            violation = watch.check_torque(controller.unlimited_torque_nm)
+            if violation is not None:
+                self.torque_off()
+                self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
+                return violation
+            flags |= _TORQUE_SATURATED | _LIMIT_WARNING
+        self._commanding = True
+        sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
+        self._torque_squares_nm2 += sent_nm * sent_nm
+        self._recent.append((self.angle_rad, self.coupling_torque_nm, sent_nm))
+        self.flags = flags
+        return None
+
+    def forget_recent(self) -> None:
+        """Begin anew with what `turns_against_torque` goes by."""
+        self._recent.clear()
+
+    def turns_against_torque(
+        self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
+    ) -> bool:
+        """Whether the shaft has just got faster and faster against the torque on it.
+
+        The torque on the motor is the commanded one less the coupling torque, which the sensor
+        measures: whatever is done to the beam is in it. A motor that answers by about as much as
+        its inertia lets it, but the other way round, has the sign of its angle or torque wrong, or
+        is turned by somebody at the shaft itself. Called after a tick whose check found a limit
+        violated.
+        """
+        recent = self._recent
+        if len(recent) < _RECENT_TICKS:
+            return False
+        angles_rad = [angle_rad for angle_rad, _, _ in recent]
+        before_rad = angles_rad[_SPEED_TICKS] - angles_rad[0]
+        now_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_TICKS]
+        faster_rad = now_rad - before_rad
+        if abs(now_rad) < _SURE_STEPS * resolution_rad or abs(faster_rad) < _GAIN * abs(now_rad):
+            return False
+        half = _SPEED_TICKS // 2
+        torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent]
+        impulse_nm_s = sum(torques_nm[half : -1 - half]) / rate_hz
+        expected_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
+        least, most = _AGAINST
+        against = -faster_rad * expected_rad
+        return least * expected_rad**2 <= against <= most * expected_rad**2 and against > 0.0
+
+    @property
+    def stale(self) -> bool:
+        """Whether a reading of the last tick did not come."""
+        return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
+
+    @property
+    def what_is_stale(self) -> str:
+        """Name what did not come in the last tick."""
+        names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
+        return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
+
+    def check_encoder(self, standstill: Standstill, due_ns: int) -> None:
+        """Compare the angle just read with those before it, the torque being off.
+
+        Raises
+        ------
+        DeviceError
+            If the encoder jumped.
+        """
+        if not self.flags & _ANGLE_STALE:
+            standstill.check(self.angle_rad + self.zero_rad, due_ns)
+
+    def check_stale(self) -> Violation | None:
+        """Say whether a device has given nothing usable for too long, after a tick's reading."""
+        flags = self.flags
+        if not (flags & _UNUSABLE or self._were_unusable):
+            return None
+        self._were_unusable = bool(flags & _UNUSABLE)
+        return self.watch.check_stale(
+            bool(flags & _ANGLE_STALE),
+            bool(flags & _WRENCH_STALE),
+            bool(flags & _WRENCH_SATURATED),
+        )
+
+    def look(
+        self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
+    ) -> Violation | None:
+        """Check what changes slowly, every `LOOK_EVERY` ticks.
+
+        Parameters
+        ----------
+        due_ns
+            When the present tick was due.
+        recorder_lag_s
+            By how much the recorder is behind the loop.
+        disk_free_mb
+            Of the disk that the session goes to.
+
+        Returns
+        -------
+        Violation or None
+            Where a limit is violated, the torque is off.
+        """
+        squares_nm2, self._torque_squares_nm2 = self._torque_squares_nm2, 0.0
+        violation = self.watch.look(due_ns, squares_nm2, recorder_lag_s, disk_free_mb)
+        if violation is not None:
+            self.torque_off()
+        return violation
+
+    def torque_off(self) -> None:
+        """Zero the torque and disable the drive, once: a real one takes its time."""
+        if self._commanding:
+            self._commanding = False
+            self._drive.disable()
+        self.torque_command_nm = 0.0
+        self.flags |= _TORQUE_OFF
+
+    def lose_readings(self) -> None:
+        """Switch off because a device failed: what was read last stands, and is marked so."""
+        self.torque_off()
+        self.flags |= _ANGLE_STALE | _WRENCH_STALE
+
+
+AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """Readings without torque.
+
+    Attributes
+    ----------
+    duration_s
+        For how long.
+    wrenches
+        Raw: not tared; N and N·m, shape (n, 6).
+    angles_rad
+        From the rig's zero; shape (n,).
+    torques_nm
+        Coupling torque of the raw wrenches; shape (n,).
+    """
+
+    duration_s: float
+    wrenches: NDArray[np.float64]
+    angles_rad: NDArray[np.float64]
+    torques_nm: NDArray[np.float64]
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Mean speed of the motor, from the angles' range."""
+        return float(np.ptp(self.angles_rad)) / self.duration_s
+
+    @property
+    def torque_spread_nm(self) -> float:
+        """Standard deviation of the coupling torque: noise, and a beam that swings."""
+        return float(self.torques_nm.std())
+
+    @property
+    def mean(self) -> Wrench:
+        """Mean of each axis, N and N·m."""
+        fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.mean(axis=0))
+        return fx, fy, fz, tx, ty, tz
+
+    @property
+    def spread(self) -> Wrench:
+        """Standard deviation of each axis, N and N·m."""
+        fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.std(axis=0, ddof=1))
+        return fx, fy, fz, tx, ty, tz
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return the tare as a session file states it."""
+        return {"tare_s": repr(self.duration_s)} | {
+            f"tare_{what}_{axis}": repr(value)
+            for what, values in (("mean", self.mean), ("std", self.spread))
+            for axis, value in zip(AXES, values, strict=True)
+        }
+
+
+def observe_rest(
+    cycle: Cycle,
+    metronome: Metronome,
+    *,
+    rate_hz: float,
+    duration_s: float,
+    projection: Wrench,
+    check: Callable[[], None],
+) -> Rest:
+    """Read angle and wrench for some time without touching the torque.
+
+    Parameters
+    ----------
+    cycle, metronome
+        Which devices, and when.
+    rate_hz, duration_s
+        How often and for how long.
+    projection
+        Coupling torque = projection · wrench.
+    check
+        Called after each reading; raises to end it.
+    """
+    wrenches: list[Wrench] = []
+    angles: list[float] = []
+    for _ in range(round(duration_s * rate_hz)):
+        metronome.wait()
+        cycle.observe(metronome.due_ns)
+        check()
+        wrenches.append(cycle.raw_wrench)
+        angles.append(cycle.angle_rad)
+    readings = np.array(wrenches)
+    return Rest(duration_s, readings, np.array(angles), readings @ np.array(projection))

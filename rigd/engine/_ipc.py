@@ -1,0 +1,383 @@
+"""The processes of a rig: their table, how they are started, and the messages to and from them.
+
+How a supervisor talks to the processes it starts: a few JSON lines each way.
+
+A child is ``python -m MODULE``. Its standard input brings its job and then messages, a JSON line
+each; a line that announces a pickled object is followed by its bytes. The end of standard input
+means that the supervisor is gone. Its standard output brings JSON lines, few and short, so that
+they fit into a pipe's buffer and no child ever waits for its supervisor.
+
+The processes of a rig: one table, by which they are started, watched, and ended.
+
+Every process beats: it counts up a word of the board several times a second. A dead process is
+noticed at once, a hung one by its beats; what then happens stands here.
+"""
+
+import contextlib
+import ctypes
+import json
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rigd.engine._shared_state import Word
+from rigd.runtime import held_back
+
+SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,
+and would disturb the loop."""
+_WRITE_PATIENCE_S = 5.0
+_SILENT_GRACE_S = 1.0
+_KILLED_GRACE_S = 2.0
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+Message = dict[str, Any]
+
+
+class ChildError(Exception):
+    """A child process ended, or answered something else than it was asked."""
+
+
+class Child:
+    """A process started by the supervisor.
+
+    Parameters
+    ----------
+    name
+        What messages to the operator call it.
+    module
+        Run as ``python -m module``; it starts importing at once and waits for its job.
+    fds
+        Descriptors it inherits.
+    cores
+        Those that it may use, where they are others than this process's own.
+
+    Raises
+    ------
+    ChildError
+        If the system does not start it.
+    """
+
+    def __init__(
+        self, name: str, module: str, fds: Sequence[int], cores: Collection[int] = ()
+    ) -> None:
+        self.name = name
+        try:
+            with held_back():
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", module, str(os.getpid())],
+                    bufsize=0,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    pass_fds=fds,
+                    env=os.environ | SINGLE_THREADED,
+                )
+        except OSError as error:
+            raise ChildError(
+                f"The {name} process cannot be started ({error.strerror}); see what else this "
+                "computer runs, and its limits (ulimit -a)."
+            ) from None
+        if cores:
+            with contextlib.suppress(OSError):  # it has ended already: poll() tells
+                os.sched_setaffinity(self._process.pid, cores)
+        os.set_blocking(self._stdin_fd, False)
+        self._lines = LineReader(self._stdout_fd)
+
+    def start(self, job: object) -> None:
+        """Hand over its job.
+
+        Raises
+        ------
+        ChildError
+            If it does not take it.
+        """
+        self.send_object("job", job)
+
+    def send(self, **message: object) -> None:
+        """Send one message; a child that is gone is noticed when it is next listened to."""
+        self._write(json.dumps(message).encode() + b"\n")
+
+    def send_object(self, name: str, value: object) -> None:
+        """Send a message ``{name: value}`` whose value is no JSON."""
+        self._write(packed_object(name, value))
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    def poll(self, timeout_s: float) -> Message | None:
+        """Return its next message, or None if none comes in time.
+
+        Raises
+        ------
+        ChildError
+            If the child has ended.
+        """
+        try:
+            return self._lines.next(timeout_s)
+        except EOFError:
+            code = self._process.wait()
+            how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+            raise ChildError(f"The {self.name} process was {how}.") from None
+
+    def wake(self) -> None:
+        """Have it go on if somebody suspended it: it may have something to bring to an end."""
+        self._process.send_signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        """End it at once; the next :meth:`poll` tells."""
+        self._process.kill()
+
+    def stop(self, grace_s: float) -> None:
+        """End it: close its input and wait; then terminate; then kill. Harmless when repeated."""
+        if self._process.stdout is None or self._process.stdout.closed:
+            return
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            with contextlib.suppress(BrokenPipeError):  # it was gone already
+                self._process.stdin.close()
+        self.wake()
+        for end in (self._process.terminate, self._process.kill):
+            try:
+                self._process.wait(_SILENT_GRACE_S if self._falls_silent(grace_s) else 0.0)
+                break
+            except subprocess.TimeoutExpired:
+                end()
+        with contextlib.suppress(
+            subprocess.TimeoutExpired
+        ):  # stuck in a call, on a disk that hangs
+            self._process.wait(_KILLED_GRACE_S)
+        self._process.stdout.close()
+
+    def _falls_silent(self, patience_s: float) -> bool:
+        """Wait until its output ends, which is noticed at once; waiting for a process polls."""
+        deadline = time.monotonic() + patience_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            if select.select([self._stdout_fd], [], [], left_s)[0] and not os.read(
+                self._stdout_fd, 65536
+            ):
+                return True
+        return False
+
+    @property
+    def _stdout_fd(self) -> int:
+        assert self._process.stdout is not None
+        return self._process.stdout.fileno()
+
+    @property
+    def _stdin_fd(self) -> int:
+        assert self._process.stdin is not None
+        return self._process.stdin.fileno()
+
+    def _write(self, data: bytes) -> None:
+        rest = memoryview(data)
+        deadline = time.monotonic() + _WRITE_PATIENCE_S
+        while rest:
+            patience_s = max(0.0, deadline - time.monotonic())
+            if not select.select([], [self._stdin_fd], [], patience_s)[1]:
+                raise ChildError(f"The {self.name} process does not listen.")
+            try:
+                rest = rest[os.write(self._stdin_fd, rest) :]
+            except BrokenPipeError:
+                return  # poll() tells how it ended
+
+
+def packed_object(name: str, value: object) -> bytes:
+    """Return the bytes of a message ``{name: value}`` whose value is no JSON."""
+    data = pickle.dumps(value)
+    return json.dumps({"pickled": name, "size": len(data)}).encode() + b"\n" + data
+
+
+class LineReader:
+    """JSON lines from a descriptor, without ever blocking longer than asked."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._pending = b""
+
+    def next(self, timeout_s: float | None) -> Message | None:
+        """Return the next message, or None if none is complete in time (None: wait for ever).
+
+        Raises
+        ------
+        EOFError
+            If the other end is gone and nothing is left to read.
+        """
+        while b"\n" not in self._pending:
+            if not select.select([self._fd], [], [], timeout_s)[0]:
+                return None
+            data = os.read(self._fd, 65536)
+            if not data:
+                raise EOFError
+            self._pending += data
+        line, self._pending = self._pending.split(b"\n", 1)
+        message: Message = json.loads(line)
+        return message
+
+    def exactly(self, size: int) -> bytes:
+        """Wait for the bytes that a message announced.
+
+        Raises
+        ------
+        EOFError
+            If the other end is gone before they are there.
+        """
+        pieces, left = [self._pending[:size]], size - len(self._pending)
+        self._pending = self._pending[size:]
+        while left > 0:
+            data = os.read(self._fd, left)
+            if not data:
+                raise EOFError
+            pieces.append(data)
+            left -= len(data)
+        return b"".join(pieces)
+
+
+class Parent:
+    """The supervisor, as a child sees it; its process id is the child's only argument.
+
+    (Asking for the parent at the start would be too late for one that has died already.)
+    """
+
+    def __init__(self) -> None:
+        # Read without a buffer: what follows the job must stay in the pipe for select to see it.
+        self._fd = sys.stdin.fileno()
+        self._lines = LineReader(self._fd)
+        self._pid = int(sys.argv[1])
+        _go_on_when_orphaned()
+
+    def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
+        """Wait for the job; ends the process quietly if the supervisor ends without one."""
+        try:
+            message = self.poll(None)
+        except EOFError:
+            sys.exit(0)
+        assert message is not None
+        return message["job"]
+
+    def poll(self, timeout_s: float | None) -> Message | None:
+        """Return the next message, or None if none begins in time (None: wait for ever).
+
+        Raises
+        ------
+        EOFError
+            If the supervisor is gone.
+        """
+        message = self._lines.next(timeout_s)
+        if message is not None and "pickled" in message:
+            return {message["pickled"]: pickle.loads(self._lines.exactly(message["size"]))}
+        return message
+
+    def send(self, **message: object) -> None:
+        """Send one short message; nobody may be left to hear it."""
+        with contextlib.suppress(BrokenPipeError):
+            os.write(sys.stdout.fileno(), json.dumps(message).encode() + b"\n")
+
+    def alive(self) -> bool:
+        """Whether the supervisor still runs; cheap enough for the loop."""
+        return os.getppid() == self._pid
+
+
+def _go_on_when_orphaned() -> None:
+    """Have the system end a suspension when the supervisor ends, for nobody else would then.
+
+    A recorder has samples to write down; a control process has devices to let go of.
+    """
+    with contextlib.suppress(AttributeError):  # Linux has it, others do without
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """One kind of process."""
+
+    name: str
+    """What messages to the operator call it."""
+    module: str
+    """Run as ``python -m module``; empty: it is the one that starts the others."""
+    beat: Word
+    """Its word on the board."""
+    hung_after_s: float | None
+    """Without a beat; None: judged by what it leaves undone instead."""
+    grace_s: float
+    """In which it has to end when it is asked to; then it is terminated, then killed."""
+    for_one_session: bool
+    """A new one is started for each session."""
+    loss: str
+    """What follows if it dies or hangs."""
+
+
+CONTROL = Process(
+    "control",
+    "rigd.engine.control_process",
+    Word.CONTROL_BEAT,
+    hung_after_s=3.0,
+    grace_s=5.0,
+    for_one_session=False,
+    loss="the drive goes off by its own watch, the session ends as a fault",
+)
+RECORDER = Process(
+    "recorder",
+    "rigd.engine.recorder",
+    Word.RECORDER_BEAT,
+    # A disk may stall for seconds; the samples that wait for it are what counts.
+    hung_after_s=None,
+    grace_s=5.0,
+    for_one_session=True,
+    loss="the session ends as a fault",
+)
+LIVE = Process(
+    "live",
+    "rigd.live.publisher",
+    Word.LIVE_BEAT,
+    hung_after_s=5.0,
+    grace_s=2.0,
+    for_one_session=False,
+    loss="it is started again, the session goes on",
+)
+SUPERVISOR = Process(
+    "supervisor",
+    "",
+    Word.SUPERVISOR_BEAT,
+    hung_after_s=2.0,
+    grace_s=0.0,
+    for_one_session=False,
+    loss="the control process ends the session as a fault",
+)
+
+PROCESSES = (CONTROL, RECORDER, LIVE, SUPERVISOR)
+"""In the order in which they are ended: the one with the torque first."""
+
+
+class Pulse:
+    """How long a process has not beaten, as seen by one that looks every so often.
+
+    Only time in which the looking process itself ran is counted: a computer that stands still for a
+    second has made nobody hang.
+    """
+
+    _MOST_PER_LOOK_S = 0.2
+
+    def __init__(self) -> None:
+        self._beat = -1
+        self._looked_s = 0.0
+        self.still_s = 0.0
+
+    def look(self, beat: int, now_s: float) -> float:
+        """Take a look at its beat and return for how long it has not changed, in s."""
+        passed_s = min(now_s - self._looked_s, self._MOST_PER_LOOK_S)
+        self.still_s = self.still_s + passed_s if beat == self._beat else 0.0
+        self._beat, self._looked_s = beat, now_s
+        return self.still_s

@@ -1,0 +1,305 @@
+"""What the processes of a rig share: words, topics, events, and the memory of them all.
+
+The board: a few shared words by which processes tell each other where they are.
+
+Every word has one writer. Reading or writing one takes a fraction of a microsecond and never
+blocks, which is why the control loop may do so.
+
+What the control process has to say, as fixed-size records in a ring of their own.
+
+The loop must not wait for anybody who listens, so it writes to shared memory instead of a pipe;
+the recorder puts every event into the file, the supervisor shows it to the operator.
+
+What the control process publishes: one table, from which everything that carries it works.
+
+The shared memory is laid out from it, the recorder logs by it, and ``rigd status`` compares what
+comes with what is expected.
+"""
+
+import contextlib
+import mmap
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from math import ceil
+from typing import Literal, Self
+
+from rigd.engine._ring import Ring, RingSpec, reserve
+from rigd.safety import BUFFERED_S
+from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
+
+
+class Phase(IntEnum):
+    """Where the control process is."""
+
+    PREPARING = 0
+    """Connecting the devices."""
+    SETTLING = 1
+    """Drive enabled, the motor held where it stands."""
+    TARING = 2
+    READY = 3
+    """Waiting for the recorder before tick 0."""
+    RUNNING = 4
+    RETURNING = 5
+    OFF = 6
+    """Torque is zero and the drive is disabled: between sessions, and at the end."""
+    WAITING = 7
+    """Until the beam is at rest, before the tare."""
+
+    @property
+    def words(self) -> str:
+        """What the operator reads."""
+        return _WORDS.get(self, self.name.lower())
+
+
+_WORDS = {
+    Phase.RUNNING: "recording",
+    Phase.OFF: "drive off",
+    Phase.WAITING: "waiting for the beam to rest",
+}
+
+
+class Stop(IntEnum):
+    """Why the supervisor asks for a stop: the values of :attr:`Word.STOP`."""
+
+    NO = 0
+    OPERATOR = 1
+    NO_RECORDER = 2
+
+
+class Word(IntEnum):
+    """The words of the board."""
+
+    # Written by the supervisor
+    STOP = 0
+    GO = 1
+    SUPERVISOR_BEAT = 2
+    """Beats count up several times a second: whoever does not beat hangs."""
+    # Written by the control process
+    PHASE = 3
+    START_UTC_NS = 4
+    SCHEDULED = 5
+    MISSED = 6
+    LATE = 7
+    LOST = 8
+    ANGLE_NRAD = 9
+    """The last readings, and the torque that stands, in 1e-9 rad and 1e-9 N·m."""
+    COUPLING_TORQUE_NNM = 10
+    TORQUE_COMMAND_NNM = 11
+    CONTROL_BEAT = 12
+    BUS_LOAD_PPM = 17
+    """Of the busiest line, as measured, or UNKNOWN. Likewise:"""
+    BUS_ERRORS = 18
+    """On all lines, since the devices were connected."""
+    SENSOR_STATUS = 19
+    """Status word; 0: all is well."""
+    # Written by the recorder
+    RECORDER_BEAT = 13
+    DISK_FREE_MB = 14
+    """Of the disk that the session goes to, in 10⁶ bytes, at least 1; 0: not known yet."""
+    # Written by the live publisher
+    LIVE_DROPPED = 15
+    LIVE_BEAT = 16
+    LIVE_SEEN = 20
+    """Samples up to this one of the ring have been shown, or counted as dropped."""
+    # Written by the control process
+    STALE_ANGLES = 21
+    """Recorded ticks whose angle is an old one; likewise:"""
+    STALE_WRENCHES = 22
+
+
+UNKNOWN = -1
+"""Of a line that there is not, or that does not tell."""
+
+
+class Board:
+    """Array of signed 64-bit words, indexed by :class:`Word`."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+        self._memory = mmap.mmap(fd, 8 * len(Word))
+        self._words = memoryview(self._memory).cast("q")
+
+    @classmethod
+    def create(cls, fd: int) -> Self:
+        """Lay out a board of zeros in shared memory."""
+        reserve(fd, 8 * len(Word))
+        return cls(fd)
+
+    def __getitem__(self, word: Word) -> int:
+        return self._words[word]
+
+    def __setitem__(self, word: Word, value: int) -> None:
+        self._words[word] = value
+
+    def known(self, word: Word) -> int | None:
+        """Return a word, or None if it says that this is not known."""
+        return None if (value := self._words[word]) == UNKNOWN else value
+
+    def word(self, word: Word) -> "memoryview[int]":
+        """Return a view of one word, the quickest way to it: ``view[0]``."""
+        return self._words[word : word + 1]
+
+    def beat(self, word: Word) -> None:
+        """Show that the process that this word belongs to is at work."""
+        self._words[word] += 1
+
+    def close(self) -> None:
+        """Unmap the memory; the descriptor stays open for whoever else inherited it."""
+        with contextlib.suppress(BufferError):  # a view of a word is still held
+            self._words.release()
+            self._memory.close()
+
+
+Level = Literal["debug", "info", "warning", "error", "fatal"]
+LEVELS: tuple[Level, ...] = ("debug", "info", "warning", "error", "fatal")
+
+EVENT_SIZE = 512
+_HEADER = struct.Struct("<qBH")
+_TEXT_SIZE = EVENT_SIZE - _HEADER.size
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One line of the session's log."""
+
+    t_ns: int
+    level: Level
+    message: str
+
+
+def write_event(ring: Ring, event: Event) -> None:
+    """Append an event; where the ring is full it is dropped rather than waited for."""
+    offset = ring.slot()
+    if offset < 0:
+        return
+    text = event.message.encode()[:_TEXT_SIZE]
+    _HEADER.pack_into(ring.buffer, offset, event.t_ns, LEVELS.index(event.level), len(text))
+    start = offset + _HEADER.size
+    ring.buffer[start : start + len(text)] = text
+    ring.publish()
+
+
+def read_events(block: bytes) -> list[Event]:
+    """Decode what :meth:`Ring.take` returned."""
+    events = []
+    for offset in range(0, len(block), EVENT_SIZE):
+        t_ns, level, size = _HEADER.unpack_from(block, offset)
+        start = offset + _HEADER.size
+        text = block[start : start + size].decode(errors="replace")
+        events.append(Event(t_ns, LEVELS[level], text))
+    return events
+
+
+HURRIED_BUFFERED_S = 160.0
+"""What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
+second, and the live view lags."""
+_EVENTS = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One kind of record, and its way."""
+
+    name: str
+    """Its channel in the file."""
+    record_size: int
+    """Bytes."""
+    every: int
+    """Ticks of the record from one to the next; 0: whenever there is something to say."""
+    logged: bool
+    """The recorder writes each of them into the file."""
+    live: bool
+    """The live publisher looks at them, as far as it can keep up."""
+    ages_only: bool = False
+    """Not under the virtual clock, where no reading has an age."""
+
+    def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
+        """Return how many records its ring holds."""
+        return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
+
+    def expected_hz(self, rate_hz: float) -> float | None:
+        """Return the records a second of a recorded session; None where there is no saying."""
+        return rate_hz / self.every if self.every else None
+
+
+EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
+CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
+TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True, ages_only=True)
+SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
+
+TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
+"""The samples last: what explains a sample is in the file no later than the sample."""
+
+
+DESCRIPTORS = len(TOPICS) + 2
+"""Of shared memory, for :func:`create_channels`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSpecs:
+    """What a child process needs to attach."""
+
+    rings: tuple[RingSpec, ...]
+    """In the order of :data:`rigd.engine._shared_state.TOPICS`."""
+    board_fd: int
+
+
+@dataclass(frozen=True, slots=True)
+class Channels:
+    """The rings, in the order of :data:`rigd.engine._shared_state.TOPICS`, and the board."""
+
+    events: Ring
+    controls: Ring
+    timings: Ring
+    samples: Ring
+    board: Board
+    reference_fd: int = -1
+    """Where the supervisor places the reference of a session."""
+
+    @property
+    def rings(self) -> tuple[Ring, ...]:
+        """All rings, in the order of the table."""
+        return (self.events, self.controls, self.timings, self.samples)
+
+    @property
+    def specs(self) -> ChannelSpecs:
+        """What to hand to a child process."""
+        return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
+
+    def ask_to_stop(self) -> None:
+        """Ask the control process to stop, unless that was done before."""
+        if self.board[Word.STOP] == Stop.NO:
+            self.board[Word.STOP] = Stop.OPERATOR
+
+    def clear(self) -> None:
+        """Forget what the last session left; only while no recorder is at work."""
+        for ring in self.rings:
+            ring.discard()
+
+    def close(self) -> None:
+        """Unmap the memory; the descriptors stay open."""
+        for ring in self.rings:
+            ring.close()
+        self.board.close()
+
+
+def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:
+    """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory."""
+    *for_rings, for_board, for_reference = fds
+    rings = [
+        Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
+        for topic, fd in zip(TOPICS, for_rings, strict=True)
+    ]
+    return _together(rings, Board.create(for_board), for_reference)
+
+
+def attach_channels(specs: ChannelSpecs) -> Channels:
+    """Attach in a child process to what the supervisor made."""
+    return _together([Ring(spec) for spec in specs.rings], Board(specs.board_fd))
+
+
+def _together(rings: Sequence[Ring], board: Board, reference_fd: int = -1) -> Channels:
+    events, controls, timings, samples = rings
+    return Channels(events, controls, timings, samples, board, reference_fd)

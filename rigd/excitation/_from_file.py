@@ -1,0 +1,154 @@
+"""Reference signals from files."""
+
+import csv
+import os
+import stat
+from math import isfinite
+from pathlib import Path
+from typing import Final, TextIO
+
+import numpy as np
+
+from rigd.excitation._signals import (
+    Excitation,
+    ExcitationError,
+    assemble,
+    check_ticks,
+    lay_out_segments,
+    within_a_turn,
+)
+
+
+def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
+    """Open a text file of limited size; a pipe that nobody writes to is not waited for.
+
+    Parameters
+    ----------
+    path
+        Its name.
+    most_bytes
+        The limit.
+    newline
+        As `open` has it.
+
+    Raises
+    ------
+    ExcitationError
+        If it is no such file.
+    OSError
+        If it cannot be opened.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
+        os.close(fd)
+        raise ExcitationError(f"{path}: is not a file of at most {most_bytes / 1e6:g} MB.")
+    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
+
+
+MOST_BYTES: Final = 256_000_000
+
+
+def from_csv(
+    path: str | Path, *, rate_hz: float, rest_s: float = 1.0, ring_down_s: float = 15.0
+) -> Excitation:
+    """Read a reference from a CSV file.
+
+    Parameters
+    ----------
+    path
+        Either columns ``time_s`` and ``angle_rad`` (named in the first line, more columns are
+        ignored; angles are interpolated linearly to the ticks, times counted from the first), or
+        a single column of angles in rad, one a tick, with or without the heading ``angle_rad``.
+    rate_hz
+        Ticks a second.
+    rest_s, ring_down_s
+        Time before and after the trajectory.
+
+    Raises
+    ------
+    ExcitationError
+        If the file cannot be read, or a line of it is not what it should be.
+    """
+    path = Path(path)
+    times, angles = _read_csv(path)
+    if times is None:
+        ticks = len(angles)
+        sweep = np.asarray(angles)
+    else:
+        check_ticks("The file", (times[-1] - times[0]) * rate_hz, rate_hz)
+        time_s = np.asarray(times) - times[0]
+        # The last row is reached exactly; rounding must not lose its tick.
+        ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
+        sweep = np.interp(np.arange(ticks) / rate_hz, time_s, angles)
+    within_a_turn(f"{path}: the largest angle_rad", float(np.max(np.abs(sweep))))
+    duration_s = ticks / rate_hz
+    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    parameters: dict[str, float | int | str] = {
+        "file": path.name,
+        "amplitude_rad": float(np.max(np.abs(sweep))),
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+    }
+    return assemble("file", parameters, rate_hz, segments, sweep)
+
+
+def _read_csv(path: Path) -> tuple[list[float] | None, list[float]]:
+    try:
+        with open_plain_file(path, MOST_BYTES, newline="") as file:
+            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(row)]
+    except OSError as error:
+        raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
+    except UnicodeDecodeError as error:
+        raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error.reason}).") from error
+    except csv.Error as error:
+        raise ExcitationError(f"{path}: is not a CSV file in UTF-8 ({error}).") from error
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    if "angle_rad" in header:
+        angle_column = header.index("angle_rad")
+        time_column = header.index("time_s") if "time_s" in header else None
+        if time_column is None and len(header) > 1:
+            raise ExcitationError(
+                f"{path}: line 1 has {len(header)} columns, angle_rad among them, but no time_s; "
+                "name the column of times in seconds so, or leave angle_rad alone."
+            )
+        rows = rows[1:]
+    elif len(header) == 1 and ";" in header[0]:
+        raise ExcitationError(f"{path}: separates its columns by semicolons; use commas.")
+    elif len(header) == 1:
+        angle_column, time_column = 0, None
+    else:
+        raise ExcitationError(
+            f"{path}: line 1 must name the columns time_s (s) and angle_rad (rad), or the file "
+            "must be one column of angles in rad."
+        )
+    angles: list[float] = []
+    times: list[float] = []
+    for number, row in rows:
+        angles.append(_cell(path, number, row, angle_column, "angle_rad"))
+        if time_column is not None:
+            times.append(_cell(path, number, row, time_column, "time_s"))
+            if len(times) > 1 and times[-1] <= times[-2]:
+                raise ExcitationError(
+                    f"{path}: line {number}: time_s does not come after the one before it; times "
+                    "must increase."
+                )
+    if len(angles) < 2:
+        raise ExcitationError(f"{path}: has {len(angles)} angles; a reference needs at least two.")
+    return (times if time_column is not None else None), angles
+
+
+def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> float:
+    if column >= len(row):
+        raise ExcitationError(f"{path}: line {line} has no value in the column {name}.")
+    try:
+        value = float(row[column])
+    except ValueError:
+        value = float("nan")
+    if not isfinite(value):
+        raise ExcitationError(
+            # Not quoted: the daemon reads files that whoever commands it may not be allowed to.
+            f"{path}: line {line}: {name} is not a finite number."
+        )
+    return value

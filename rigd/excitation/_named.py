@@ -1,0 +1,51 @@
+"""An excitation by its name and its parameters, as a request or a command line gives them."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from rigd.excitation._from_file import from_csv
+from rigd.excitation._narrow_sweeps import Foresight, modes
+from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
+
+Value = float | int | str | Path
+
+KINDS: Mapping[str, Callable[..., Excitation]] = {
+    "chirp": chirp,
+    "hold": hold,
+    "step": step,
+    "multisine": multisine,
+    "file": from_csv,
+    "modes": modes,
+}
+"""By the names that the command line and session files have for them."""
+
+FROM_THE_RIG = frozenset({"rate_hz", "rig"})
+"""Arguments that are no options: the rig's own data."""
+
+
+def make_excitation(
+    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: Foresight | None = None
+) -> Excitation:
+    """Make one for a rig's rate.
+
+    Parameters
+    ----------
+    kind
+        A name of `KINDS`.
+    parameters
+        Keyword arguments of its function; what is left out has its default.
+    rate_hz
+        Ticks a second.
+    rig
+        For an excitation that is made for one rig.
+
+    Raises
+    ------
+    ExcitationError
+        If a value is absurd.
+    """
+    make = KINDS[kind]
+    if "rig" in inspect.signature(make).parameters:
+        return make(rate_hz=rate_hz, rig=rig, **parameters)
+    return make(rate_hz=rate_hz, **parameters)

@@ -1,0 +1,473 @@
+"""Narrow sweeps over the modes of a beam.
+
+Narrow bands round modes: where they lie, how far the reference goes in each, and for how long.
+
+What a sweep tells of the damping is measured by the Fisher information of the exact model
+(`rigd.beam`): of the torque, white noise of any size on it, for the damping's parameters beside
+density, stiffness, delay and tool inertia. Of a band swept slowly it is proportional to the time
+spent there, so that the times follow from the information of each band in a second.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
+from rigd.excitation._from_file import open_plain_file
+from rigd.excitation._signals import (
+    Excitation,
+    ExcitationError,
+    assemble,
+    frequency,
+    lay_out_segments,
+    positive,
+    within_a_turn,
+)
+
+MOST_BYTES: Final = 64_000_000
+SAME_MODE: Final = 1.1
+"""Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
+slender beam differ by more."""
+
+_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+_NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class _Entry(BaseModel):
+    """A mode as one fit found it; null where the fit has none, 0 Hz where it does not oscillate."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    frequency_hz: _NotNegative | None
+    damping_ratio: _Positive | None
+    frequency_std_hz: _NotNegative | None = None
+    estimator: str | None = None
+
+    @property
+    def oscillates(self) -> bool:
+        return bool(self.frequency_hz) and self.damping_ratio is not None
+
+
+class _Document(BaseModel):
+    """What is needed of the analyser's document."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    modes: list[_Entry]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundMode:
+    """A mode, from one fit or from several."""
+
+    frequency_hz: float
+    damping_ratio: float
+    uncertainty_hz: float
+    """Of the frequency: two standard deviations, as stated or as the fits differ."""
+
+
+def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
+    """Read the modes, lowest frequency first.
+
+    Parameters
+    ----------
+    path
+        JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
+        and ``damping_ratio``, and perhaps ``frequency_std_hz``. More keys are ignored. Where
+        several fits found a mode, their medians are taken; where some of them are of the
+        estimator ``record``, only these.
+
+    Raises
+    ------
+    ExcitationError
+        If the file cannot be read, or is not what it should be.
+    """
+    path = Path(path)
+    try:
+        document = _Document.model_validate(_read_json(path))
+    except ValidationError as error:
+        complaint = _complaint(error.errors(include_url=False, include_context=False)[0])
+        raise ExcitationError(f"{path}: {complaint}") from None
+    entries = [entry for entry in document.modes if entry.oscillates]
+    of_records = [entry for entry in entries if entry.estimator == "record"]
+    modes = tuple(_merged(group) for group in _groups(of_records or entries))
+    if not modes:
+        raise ExcitationError(
+            f"{path}: modes has no mode that oscillates; take the document of an analysis that "
+            "found one (analyze session.mcap --json fits.json)."
+        )
+    return modes
+
+
+def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
+    try:
+        with open_plain_file(path, MOST_BYTES) as file:
+            return json.load(file)
+    except OSError as error:
+        raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
+    except RecursionError:
+        raise ExcitationError(f"{path}: is nested too deeply.") from None
+    except ValueError as error:
+        raise ExcitationError(
+            f"{path}: is not a JSON document ({error}); write one with analyze session.mcap "
+            "--json fits.json."
+        ) from error
+
+
+def _complaint(detail: ErrorDetails) -> str:
+    """Say what is wrong with one value, in one sentence with a remedy."""
+    where = ""
+    for part in detail["loc"]:
+        where += f"[{part}]" if isinstance(part, int) else f".{part}" if where else part
+    if not where:
+        return 'is no JSON object; it must have the key "modes".'
+    if detail["type"] == "missing":
+        return f"{where} is missing; give it as analyze --json writes it."
+    unit = " Hz" if where.endswith("_hz") else ""
+    given = json.dumps(detail["input"], default=str)
+    given = given if len(given) <= 60 else f"{given[:60]}..."
+    remedy = {
+        "greater_than": f"must be more than 0{unit}",
+        "greater_than_equal": f"must not be negative: give it in{unit}",
+        "finite_number": "is not a finite number",
+        "list_type": "must be a list of modes",
+        "model_type": "must be an object with frequency_hz and damping_ratio",
+        "string_type": "must be a text",
+    }.get(detail["type"], f"must be a number{' in Hz' if unit else ''}")
+    return f"{where} = {given}{unit} {remedy}."
+
+
+def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
+    """Put together what is one mode, seen by several fits."""
+    group: list[_Entry] = []
+    for entry in sorted(entries, key=_frequency_hz):
+        if group and _frequency_hz(entry) > SAME_MODE * _frequency_hz(group[0]):
+            yield group
+            group = []
+        group.append(entry)
+    if group:
+        yield group
+
+
+def _merged(group: Sequence[_Entry]) -> FoundMode:
+    middle_hz = median(_frequency_hz(entry) for entry in group)
+    stated_hz = median(entry.frequency_std_hz or 0.0 for entry in group)
+    # Fits of structures that do not suit lie far off: the median of the distances bears them.
+    between_hz = 1.4826 * median(abs(_frequency_hz(entry) - middle_hz) for entry in group)
+    return FoundMode(
+        frequency_hz=middle_hz,
+        damping_ratio=median(entry.damping_ratio or 0.0 for entry in group),
+        uncertainty_hz=2.0 * max(stated_hz, between_hz),
+    )
+
+
+def _frequency_hz(entry: _Entry) -> float:
+    return entry.frequency_hz or 0.0
+
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_POINTS: Final = 64
+"""Frequencies in a band at which the information is computed."""
+
+_ROUNDS: Final = 500
+_RIDGE: Final = 1e-12
+"""Of the information, relatively: few bands leave some combinations of parameters untold."""
+
+
+class Foresight(Protocol):
+    """What is known of the rig before it moves."""
+
+    @property
+    def beam(self) -> Beam:
+        """The specimen as the profile has it."""
+
+    def tracking(self, frequency_hz: Real) -> Complex:
+        """Angle over reference, of the shape given."""
+
+    def share_of_limits(self, reference_rad: Real) -> float:
+        """Largest share of a limit that a reference (n,) is predicted to take."""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A narrow band that is swept linearly from its lower to its upper end."""
+
+    mode: FoundMode
+    start_hz: float
+    stop_hz: float
+
+    @classmethod
+    def of_mode(cls, mode: FoundMode, widths: float) -> "Band":
+        """Lay one round a mode, so many half-power widths to either side of where it may lie."""
+        half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
+        # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
+        return cls(
+            mode, max(mode.frequency_hz - half_hz, 0.2 * mode.frequency_hz),
+            mode.frequency_hz + half_hz,
+        )  # fmt: skip
+
+    @property
+    def decay_s(self) -> float:
+        """Time constant with which the mode rings up and down."""
+        return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
+
+
+def shares_of_time(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: Foresight) -> Real:
+    """Split the time over bands so that the damping comes out most precisely.
+
+    The geometric mean of the standard deviations of the damping's parameters is minimised, with all
+    other parameters free, by multiplicative steps (D. M. Titterington, 1976; for other criteria
+    than the determinant S. D. Silvey, D. M. Titterington and B. Torsney, 1978).
+
+    Parameters
+    ----------
+    bands, amplitudes_rad
+        Bands and what the reference's amplitude is in each.
+    rig
+        Tells how much of it becomes angle.
+
+    Returns
+    -------
+    ndarray, shape (len(bands),)
+        Shares, together 1.
+    """
+    damping = damping_of([band.mode for band in bands], rig.beam)
+    rates, wanted = _information_rates(bands, amplitudes_rad, rig, damping)
+    scale = np.sqrt(np.einsum("bii->i", rates))
+    rates = rates / np.outer(scale, scale)
+    shares = np.full(len(bands), 1.0 / len(bands))
+    for _ in range(_ROUNDS):
+        information = np.tensordot(shares, rates, axes=1)
+        covariance = np.linalg.inv(information + _RIDGE * np.eye(len(scale)))
+        lines = covariance[:wanted]
+        of_bands = np.einsum("pi,bij,pj->bp", lines, rates, lines) / np.diag(covariance)[:wanted]
+        shares = shares * np.sqrt(of_bands.sum(axis=1))
+        shares /= shares.sum()
+    return shares
+
+
+def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
+    """Damping of first order, internal and external, that gives modes their damping ratios.
+
+    By relative least squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)``, neither
+    coefficient negative.
+    """
+    omega = np.array([2.0 * pi * mode.frequency_hz for mode in modes])
+    ratio = np.array([mode.damping_ratio for mode in modes])
+    columns = np.stack([omega, 1.0 / (beam.density_over_stiffness * omega)]) / (2.0 * ratio)
+    both = np.linalg.lstsq(columns.T, np.ones(len(modes)), rcond=None)[0]
+    if (both < 0.0).any():
+        alone = columns.sum(axis=1) / (columns**2).sum(axis=1)
+        left = ((alone[:, None] * columns - 1.0) ** 2).sum(axis=1)
+        both = np.where(np.arange(2) == np.argmin(left), alone, 0.0)
+    return Damping(zeta=float(both[0]), alpha=1.0, gamma=float(both[1]), lambda_=1.0)
+
+
+def _information_rates(
+    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: Foresight, damping: Damping
+) -> tuple[Real, int]:
+    """Information in a second of each band, (bands, k, k); the damping's parameters come first.
+
+    A coefficient counts relatively. The order of a damping that is absent cannot be told.
+    """
+    factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
+    orders = {"alpha": damping.zeta, "lambda": damping.gamma}
+    names = [n for n, factor in factors.items() if factor > 0.0 and orders.get(n, 1.0) > 0.0]
+    rates = []
+    for band, amplitude_rad in zip(bands, amplitudes_rad, strict=True):
+        frequency_hz = np.linspace(band.start_hz, band.stop_hz, _POINTS)
+        s = 2j * pi * frequency_hz
+        beam = _tuned(rig.beam, band.mode.frequency_hz)
+        g, gradient = transfer_and_gradient(s, beam, damping, (*names, *PARAMETERS[4:]))
+        gradient[: len(names)] *= np.array([factors[name] for name in names])[:, None]
+        rows = np.concatenate([gradient, [-s * g, s * s]])
+        rows *= amplitude_rad * rig.tracking(frequency_hz)
+        rates.append((rows.conj() @ rows.T).real / _POINTS)
+    return np.array(rates), len(names)
+
+
+def _tuned(beam: Beam, frequency_hz: float) -> Beam:
+    """Change the density so that the nearest undamped mode lies at a frequency.
+
+    A profile's beam is off by more than the width of such a band.
+    """
+    omega = 2.0 * pi * frequency_hz
+    modes_rad_s = undamped_frequencies_rad_s(beam, 12)
+    nearest = modes_rad_s[np.argmin(np.abs(np.log(modes_rad_s / omega)))]
+    return Beam(
+        length_m=beam.length_m,
+        density_kg_per_m=beam.density_kg_per_m * float(nearest / omega) ** 2,
+        bending_stiffness_n_m2=beam.bending_stiffness_n_m2,
+    )
+
+
+FloatArray = NDArray[np.float64]
+
+SHARE_OF_LIMITS: Final = 0.9
+"""That the sweeps may be predicted to take: the rest is for a beam other than the profile's."""
+
+_EASINGS: Final = 8
+_CLOSE_ENOUGH: Final = 1.005
+
+LEAST_SHARE: Final = 0.5
+"""Of an equal part of the time, for every band: a mode is never left out."""
+
+
+def modes(
+    *,
+    rate_hz: float,
+    path: str | Path,
+    amplitude_rad: float = 0.025,
+    stop_hz: float = 50.0,
+    widths: float = 1.0,
+    duration_s: float = 120.0,
+    rest_s: float = 1.0,
+    ring_down_s: float = 15.0,
+    taper_s: float = 1.0,
+    rig: Foresight | None = None,
+) -> Excitation:
+    """Linear sweeps through narrow bands round modes, one after the other.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    path
+        JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`.
+    amplitude_rad
+        Amplitude in each band; lower where the rig's limits ask for it.
+    stop_hz
+        Modes above are left out.
+    widths
+        Half-power widths swept to either side of a mode, beside its frequency's uncertainty.
+    duration_s
+        Of all sweeps together.
+    rest_s, ring_down_s
+        Time before and after them.
+    taper_s
+        Raised-cosine fade at both ends of every sweep: angle and speed are zero at the joints.
+    rig
+        Limits the amplitudes and splits the time by what each band tells of the damping. Without
+        it neither happens.
+
+    Raises
+    ------
+    ExcitationError
+        If an option or the file is not what it should be.
+    """
+    positive("amplitude_rad", amplitude_rad, "rad")
+    within_a_turn("amplitude_rad", amplitude_rad)
+    frequency("stop_hz", stop_hz, rate_hz)
+    positive("widths", widths, "half-power widths")
+    positive("taper_s", taper_s, "s")
+    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    first, end = segments["sweep"]
+    bands = _bands(Path(path), stop_hz, widths, rate_hz)
+    fades = 2 * round(taper_s * rate_hz)
+    if fades < 2 or LEAST_SHARE * (end - first) / len(bands) < fades:
+        raise ExcitationError(
+            f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
+            f"both ends of {len(bands)} sweeps; choose at least "
+            f"{2.0 * taper_s * len(bands) / LEAST_SHARE:g} s, or a taper_s from {2 / rate_hz:g} s."
+        )
+    lengths = _lengths(np.full(len(bands), 1.0 / len(bands)), end - first)
+    amplitudes_rad = [amplitude_rad] * len(bands)
+    sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
+    if rig is not None:
+        eased_rad = _within_limits(sweeps, amplitude_rad, rig)
+        lengths = _lengths(_at_least(shares_of_time(bands, eased_rad, rig)), end - first)
+        sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
+        amplitudes_rad = _within_limits(sweeps, amplitude_rad, rig)
+    reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
+    parameters: dict[str, float | int | str] = {
+        "file": Path(path).name,
+        "amplitude_rad": max(amplitudes_rad),
+        "start_hz": min(band.start_hz for band in bands),
+        "stop_hz": max(band.stop_hz for band in bands),
+        "widths": widths,
+        "duration_s": duration_s,
+        "rest_s": rest_s,
+        "ring_down_s": ring_down_s,
+        "taper_s": taper_s,
+        "bands": "; ".join(
+            f"{band.start_hz:.6g}-{band.stop_hz:.6g} Hz, {amplitude:.4g} rad, "
+            f"{ticks / rate_hz:.6g} s"
+            for band, amplitude, ticks in zip(bands, amplitudes_rad, lengths, strict=True)
+        ),
+    }
+    return assemble("modes", parameters, rate_hz, segments, reference_rad)
+
+
+def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
+    """Bands in the order of their sweeps: what rings longest comes first and rings on."""
+    found = read_modes(path)
+    inside = [mode for mode in found if mode.frequency_hz <= stop_hz]
+    if not inside:
+        raise ExcitationError(
+            f"{path}: the lowest mode, frequency_hz = {found[0].frequency_hz:g} Hz, lies above "
+            f"stop_hz = {stop_hz:g} Hz; raise stop_hz."
+        )
+    bands = sorted((Band.of_mode(mode, widths) for mode in inside), key=lambda band: -band.decay_s)
+    for band in bands:
+        frequency(f"The upper end of a band of {widths:g} widths", band.stop_hz, rate_hz)
+    return bands
+
+
+def _within_limits(
+    sweeps: Sequence[FloatArray], amplitude_rad: float, rig: Foresight
+) -> list[float]:
+    """Return for each sweep the amplitude, or the largest that leaves the rig within its limits.
+
+    One after the other, since a mode still rings while the next is swept.
+    """
+    amplitudes_rad = []
+    before_rad = np.empty(0)
+    for sweep in sweeps:
+        eased_rad = amplitude_rad
+        for _ in range(_EASINGS):
+            share = rig.share_of_limits(np.concatenate([before_rad, eased_rad * sweep]))
+            if share <= SHARE_OF_LIMITS * _CLOSE_ENOUGH:
+                break
+            eased_rad *= SHARE_OF_LIMITS / share
+        amplitudes_rad.append(eased_rad)
+        before_rad = np.concatenate([before_rad, eased_rad * sweep])
+    return amplitudes_rad
+
+
+def _lengths(shares: FloatArray, ticks: int) -> list[int]:
+    """Split ticks by shares, without losing one to rounding."""
+    ends = np.round(np.cumsum(shares) * ticks).astype(int)
+    return [int(length) for length in np.diff(ends, prepend=0)]
+
+
+def _at_least(shares: FloatArray) -> FloatArray:
+    """Raise shares to the least one, at the cost of the others in proportion."""
+    least = LEAST_SHARE / len(shares)
+    low = shares < least
+    for _ in shares:
+        rest = (1.0 - least * np.count_nonzero(low)) / shares[~low].sum()
+        raised = np.where(low, least, shares * rest)
+        low = raised <= least
+    return raised
+
+
+def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> FloatArray:
+    """Sweep of amplitude 1, (ticks,), with raised-cosine ends of ``fades / 2`` ticks each."""
+    duration_s = ticks / rate_hz
+    t = np.arange(ticks) / rate_hz
+    phase = (
+        2.0 * pi * (band.start_hz * t + (band.stop_hz - band.start_hz) * t**2 / (2 * duration_s))
+    )
+    edge = np.minimum(np.arange(ticks), ticks - np.arange(ticks)) / (fades / 2)
+    return (0.5 - 0.5 * np.cos(pi * np.minimum(edge, 1.0))) * np.sin(phase)

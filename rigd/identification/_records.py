@@ -1,0 +1,111 @@
+"""From recorded sessions to the windows that are fitted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rigd.identification._estimate import EstimateError, Timing, Window
+from rigd.identification._experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
+from rigd.session import Session, Status, read_session
+
+_USELESS = int(
+    Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF
+)
+"""A held or clipped reading does not belong to the torque of its tick."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What some sessions of one rig hold for the estimate."""
+
+    windows: list[Window]
+    timing: Timing
+    tool_inertia_kg_m2: float
+    unusable: int
+    """Passes with gaps, or with readings that were held or clipped."""
+
+
+def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording:
+    """Read the passes of sessions that `rigd identify motor` ran.
+
+    Parameters
+    ----------
+    paths
+        Session files of one rig, in any order.
+    actuation_delay_s
+        Where the search for the command's delay begins.
+
+    Raises
+    ------
+    SessionError
+        If a file cannot be read.
+    EstimateError
+        If a file is of another excitation, or its rate or delays are not those of the first.
+    """
+    windows: list[Window] = []
+    unusable = 0
+    first: tuple[Timing, float] | None = None
+    for number, path in enumerate(paths):
+        session = read_session(path)
+        found = (
+            Timing(
+                session.number("rate_hz"),
+                session.number("angle_delay_s", 0.0),
+                session.number("torque_delay_s", 0.0),
+                actuation_delay_s,
+            ),
+            session.number("tool_inertia_kg_m2", 0.0),
+        )
+        if first is None:
+            first = found
+        if found != first:
+            raise EstimateError(
+                f"{path}: its rate, delays or tool inertia are not those of {paths[0]}; give "
+                "sessions of one rig."
+            )
+        usable, expected = _passes(session, number, found[0].rate_hz)
+        windows += usable
+        unusable += expected - len(usable)
+    if first is None:
+        raise EstimateError("No session file is given.")
+    if all(window.top_hz == TOP_HZ[SPEEDS] for window in windows):
+        raise EstimateError(
+            "Constant speeds alone do not tell inertia, delay and the torque's scale; give the "
+            f"session {MULTISINE} of the same rig, too."
+        )
+    return Recording(windows, *first, unusable)
+
+
+def _passes(session: Session, number: int, rate_hz: float) -> tuple[list[Window], int]:
+    """Return the usable windows of a session, and how many there should be."""
+    layout = read_layout(session.metadata)
+    if layout is None:
+        raise EstimateError(
+            f"{session.path}: was not recorded by rigd identify motor, so its passes are not "
+            "known; give the files that it named."
+        )
+    kind = session.metadata["excitation"]
+    samples = session.samples
+    ticks = samples["tick"].astype(np.int64)
+    useless = (samples["status"] & _USELESS) != 0
+    passes = lay_out_passes(layout, rate_hz)
+    windows = []
+    for run in passes:
+        first, end = np.searchsorted(ticks, (run.first, run.end)).tolist()
+        if end - first < run.end - run.first or useless[first:end].any():
+            continue
+        part = samples[first:end]
+        windows.append(
+            Window(
+                angle_rad=part["angle_rad"],
+                torque_command_nm=part["torque_command_nm"],
+                coupling_torque_nm=part["coupling_torque_nm"],
+                speed_rad_s=run.speed_rad_s,
+                top_hz=TOP_HZ[kind],
+                session=number,
+                key=(number, run.speed_rad_s),
+            )
+        )
+    return windows, len(passes)

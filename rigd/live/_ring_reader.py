@@ -1,0 +1,216 @@
+"""What the processes of a rig publish of one session, on its way into the picture."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+from rigd.engine import (
+    EVENT,
+    SAMPLE,
+    TIMING,
+    TOPICS,
+    Channels,
+    ChannelSpecs,
+    Observer,
+    Ring,
+    read_events,
+)
+from rigd.session import decode_samples, decode_timings
+from rigd.view import Note, Picture, Subject
+
+if TYPE_CHECKING:
+    from rigd.view import Drawing
+
+
+@dataclass(frozen=True, slots=True)
+class LiveJob:
+    """The rig whose sessions are shown.
+
+    Attributes
+    ----------
+    rig
+        The profile's name, by which the view is found.
+    channels
+        The shared memory of the rig's processes.
+    linger_s
+        How long the view stays open after the last session.
+    """
+
+    rig: str
+    channels: ChannelSpecs
+    linger_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSession:
+    """A session to show.
+
+    Attributes
+    ----------
+    subject
+        What its picture is of.
+    recording_id
+        By which viewers tell it from others; the same for a publisher that takes it over.
+    begins
+        How many records had been written to each ring before it, in the order of
+        :data:`rigd.engine._shared_state.TOPICS`.
+    """
+
+    subject: Subject
+    recording_id: str
+    begins: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LiveEnd:
+    """The end of a session that is shown.
+
+    Attributes
+    ----------
+    ends
+        How many records each ring had then, as :attr:`LiveSession.begins`.
+    outcome, reason
+        How the session ended, if that is known.
+    """
+
+    ends: tuple[int, ...]
+    outcome: str = ""
+    reason: str = ""
+
+
+Records = TypeVar("Records")
+
+
+@dataclass(frozen=True, slots=True)
+class Harvest:
+    """What came since the last time.
+
+    Attributes
+    ----------
+    notes
+        Draw what happened, which is not to be left out.
+    drawings
+        Draw everything else.
+    samples
+        How many samples those show that nobody has shown before.
+    """
+
+    notes: "list[Drawing]"
+    drawings: "list[Drawing]"
+    samples: int
+
+
+class Intake:
+    """Reads the rings of one session, from its first record to its last.
+
+    What cannot be read in time is overwritten, which is counted; nobody waits.
+
+    Parameters
+    ----------
+    session
+        To show.
+    channels
+        The memory of the rig's processes.
+    seen
+        Samples that another publisher showed before this one took over, counted as `begins` is:
+        what of them is there still is read again, for the picture is made of it.
+
+    Attributes
+    ----------
+    picture
+        Of the session.
+    t_ns
+        Time of the newest sample, since the start of the session.
+    took_s
+        For how much of the session were the samples that were read last.
+    """
+
+    def __init__(self, session: LiveSession, channels: Channels, seen: int = 0) -> None:
+        self.picture = Picture(session.subject)
+        self.t_ns = 0
+        self.took_s = 0.0
+        self._rate_hz = session.subject.rate_hz
+        self._seen = seen
+        self._readers = {
+            topic: _Reader(ring, first, seen if topic is SAMPLE else 0)
+            for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
+            if topic.live
+        }
+
+    @property
+    def dropped(self) -> int:
+        """Samples that were overwritten before they were read."""
+        return self._readers[SAMPLE].dropped
+
+    @property
+    def next(self) -> int:
+        """Number of the next sample, counted as `begins` is."""
+        return self._readers[SAMPLE].next
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the session is over, and all of it has been read."""
+        return all(reader.exhausted for reader in self._readers.values())
+
+    def end(self, ends: Sequence[int]) -> None:
+        """Take note of how many records each ring had when the session ended."""
+        for topic, end in zip(TOPICS, ends, strict=True):
+            if topic in self._readers:
+                self._readers[topic].end = end
+
+    def take(self) -> Harvest:
+        """Read what has come, and put it into the picture."""
+        picture, readers = self.picture, self._readers
+        notes: list[Drawing] = []
+        drawings: list[Drawing] = []
+        count = fresh = 0
+        for events in readers[EVENT].records(read_events):
+            notes += picture.events([Note(e.t_ns, e.level, e.message) for e in events])
+        for timings in readers[TIMING].records(decode_timings):
+            drawings += picture.timings(timings)
+        for samples in readers[SAMPLE].records(decode_samples):
+            drawings += picture.samples(samples)
+            self.t_ns = int(samples["t_ns"][-1])
+            count += len(samples)
+            fresh += min(len(samples), max(0, self.next - self._seen))
+        self.took_s = count / self._rate_hz
+        return Harvest(notes, drawings, fresh)
+
+
+class _Reader:
+    """The part of one ring that a session wrote."""
+
+    def __init__(self, ring: Ring, first: int, seen: int) -> None:
+        self._ring = ring
+        # What was seen and has been overwritten since is not dropped.
+        self._observer = Observer(ring, max(first, min(seen, ring.oldest)))
+        self._damaged = 0
+        self.end: int | None = None
+
+    @property
+    def dropped(self) -> int:
+        return self._observer.dropped + self._damaged
+
+    @property
+    def next(self) -> int:
+        return self._observer.next
+
+    @property
+    def exhausted(self) -> bool:
+        return self.end is not None and self._observer.next >= self.end
+
+    def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:
+        """Yield what has come up to now, in pieces."""
+        observer, written = self._observer, self._ring.written
+        last = written if self.end is None else min(self.end, written)
+        while True:
+            observer.take(0)  # past what has been overwritten
+            if observer.next >= last:
+                return
+            block = observer.take(last - observer.next)
+            if not block:
+                continue
+            try:
+                yield decode(block)
+            except ValueError:  # overwritten while it was copied
+                self._damaged += len(block) // self._ring.record_size

@@ -1,0 +1,423 @@
+"""Checks of a profile, and what is said of its mistakes."""
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping
+from math import pi, sqrt
+from typing import Any
+
+from pydantic_core import ErrorDetails
+
+from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.control import ControlDesignError, design_pid
+from rigd.devices import AtiSerial
+from rigd.devices.ati import RECORD_BITS
+from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
+from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
+from rigd.safety import BUFFERED_S
+
+# Longest endings first: the first that fits is the key's unit.
+_UNITS = {
+    "_nm_s_per_rad": "N·m·s/rad",
+    "_kg_per_m": "kg/m",
+    "_kg_m2": "kg·m²",
+    "_n_m2": "N·m²",
+    "_percent": "%",
+    "_counts": "counts",
+    "_bit_s": "bit/s",
+    "_rad_s2": "rad/s²",
+    "_rad_s": "rad/s",
+    "_rad": "rad",
+    "_nm": "N·m",
+    "_mb": "MB",
+    "_hz": "Hz",
+    "_us": "µs",
+    "_m": "m",
+    "_n": "N",
+    "_s": "s",
+}
+_UNITS_OF_SIX = {
+    "sensor.resolution": "N, N, N, N·m, N·m, N·m",
+    "sensor.range": "N, N, N, N·m, N·m, N·m",
+    "sensor.projection": "m, m, m, 1, 1, 1",
+    "simulation.offset": "N, N, N, N·m, N·m, N·m",
+}
+
+_JUMP_FACTOR = 100.0
+"""Of the motor's own acceleration: a jump of the encoder up to that passes for motion."""
+
+_NAME = re.compile(r"[^\W_][\w .-]{0,63}")
+
+_FIRST_MODE_HZ = 0.1, 100.0
+"""Of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
+
+
+def no_source(key: str, source: object) -> str:
+    """Complain about a number whose source is absent or made up."""
+    if source is None:
+        return f"{key} has no source; add source = {_choice(SOURCES)}."
+    return f"{key} has source = {_show(source)}; choose {_choice(SOURCES)}."
+
+
+def bare_number(key: str, value: object) -> str:
+    """Complain about a number that stands without a source."""
+    return (
+        f"{key} = {_show(value)}{_unit(key)} does not say where it comes from; write "
+        f'{{ value = {_show(value)}, source = "…" }} with {_choice(SOURCES)}.'
+    )
+
+
+def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong between values that are each in range."""
+    if not _NAME.fullmatch(values["name"]):
+        yield (
+            f"name = {_show(values['name'])} is not fit for file names; take letters, digits, "
+            "spaces and . _ - only, at most 64, and begin with a letter or digit."
+        )
+    rated, peak = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
+    if peak < rated:
+        yield (
+            f"motor.peak_torque_nm = {peak:g} N·m is below motor.rated_torque_nm = {rated:g} N·m; "
+            "the peak is at least the rated torque."
+        )
+    continuous = values["motor.continuous_torque_nm"]
+    if peak >= rated and continuous > peak:
+        yield (
+            f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
+            f"{peak:g} N·m; what a motor bears for ever is at most its peak."
+        )
+    asked = values["limits.torque_command_nm"]
+    if asked < peak:
+        yield (
+            f"limits.torque_command_nm = {asked:g} N·m is below motor.peak_torque_nm = {peak:g} "
+            "N·m, where commands are cut; what the controller may ask for has to be more."
+        )
+    angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
+    if stop <= angle:
+        yield (
+            f"limits.stop_angle_rad = {stop:g} rad is not above limits.angle_rad = {angle:g} rad; "
+            "the shaft could not come to rest before it is stopped by force."
+        )
+    yield from _out_of_reach(values)
+    yield from _not_beside_air(values)
+    warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
+    if drift < warning:
+        yield (
+            f"limits.tare_drift_nm = {drift:g} N·m, which ends a session, is below "
+            f"session.tare_drift_nm = {warning:g} N·m, which warns; it has to be the greater one."
+        )
+    first_mode_hz = float(
+        undamped_frequencies_rad_s(
+            Beam(
+                values["beam.length_m"],
+                values["beam.density_kg_per_m"],
+                values["beam.bending_stiffness_n_m2"],
+            ),
+            1,
+        )[0]
+    ) / (2 * pi)
+    low_hz, high_hz = _FIRST_MODE_HZ
+    if not low_hz <= first_mode_hz <= high_hz:
+        yield (
+            f"beam.length_m, beam.density_kg_per_m and beam.bending_stiffness_n_m2 give a first "
+            f"mode at {first_mode_hz:.3g} Hz, outside {low_hz:g} to {high_hz:g} Hz; check their "
+            "units."
+        )
+    if not any(values["sensor.projection"]):
+        yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
+    try:
+        design_pid(
+            values["motor.inertia_kg_m2"],
+            values["motor.viscous_nm_s_per_rad"],
+            values["control.pole_rad_s"],
+        )
+    except ControlDesignError as error:
+        yield str(error)
+
+
+def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the simulated rig cannot have together with drag of the air."""
+    if not values.get("simulation.air_drag_m"):
+        return
+    for name in ("clamp_compliance_rad_per_nm", "tip_mass_kg", "torque_filter_hz"):
+        if values.get(f"simulation.{name}"):
+            yield (
+                f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "
+                "one of them out, or make it 0."
+            )
+
+
+def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield limits that nothing on this rig can leave: they look like a guard, and are none."""
+    angle_rad, inertia_kg_m2 = values["limits.angle_rad"], values["motor.inertia_kg_m2"]
+    most_rad_s2 = values["motor.peak_torque_nm"] / inertia_kg_m2
+    room = f"limits.angle_rad = {angle_rad:g} rad to either side"
+    error, speed = values["limits.tracking_error_rad"], values["limits.velocity_rad_s"]
+    if error >= 2 * angle_rad:
+        yield (
+            f"limits.tracking_error_rad = {error:g} rad can never be exceeded: reference and angle "
+            f"are within {room}; choose less than {2 * angle_rad:g} rad, some three times the "
+            "error of your excitation."
+        )
+    most_rad_s = sqrt(2 * most_rad_s2 * 2 * angle_rad)
+    if speed >= most_rad_s:
+        yield (
+            f"limits.velocity_rad_s = {speed:g} rad/s can never be exceeded: the peak torque "
+            f"accelerates the motor alone to {most_rad_s:.4g} rad/s between {room}; choose less, "
+            "some three times the speed of your excitation."
+        )
+    jump = values["limits.acceleration_rad_s2"]
+    if jump > _JUMP_FACTOR * most_rad_s2:
+        yield (
+            f"limits.acceleration_rad_s2 = {jump:g} rad/s² finds no jump of the encoder: it is "
+            f"more than {_JUMP_FACTOR:g} times the {most_rad_s2:.4g} rad/s² that the peak torque "
+            "gives the motor alone; choose some two to five times that."
+        )
+    lag = values["limits.recorder_lag_s"]
+    if lag >= BUFFERED_S:
+        yield (
+            f"limits.recorder_lag_s = {lag:g} s can never be exceeded: shared memory holds "
+            f"{BUFFERED_S:g} s, and the next sample is lost; choose less, 12 s for example."
+        )
+
+
+def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
+    """Yield one complaint for each key that is absent, or for a whole section."""
+    reported = set()
+    for key in absent:
+        section = key.rpartition(".")[0]
+        if section and not any(k.rpartition(".")[0] == section for k in given):
+            if section not in reported:
+                reported.add(section)
+                yield f"section [{section}] is missing."
+        elif key in TEXTS:
+            yield f'{key} is missing; add {key} = "…" at the top.'
+        else:
+            yield f'{key} is missing; add it as {{ value = …, source = "…" }}{_unit(key, " in")}.'
+
+
+def unknown(key: str, given: Mapping[str, Any]) -> str:
+    """Complain about a key that no profile has: a slip of the pen, or another unit."""
+    if key in SECTIONS:
+        return f"{key} = {_show(given[key])} must be a section; write [{key}] and its keys below."
+    section = key.rpartition(".")[0]
+    known = [k for k in keys() if k.rpartition(".")[0] == section]
+    if not known:
+        close = difflib.get_close_matches(section or key, SECTIONS, 1)
+        hint = f"did you mean [{close[0]}]?" if close else f"sections are {', '.join(SECTIONS)}."
+        return f"{key} is not a key of a profile; {hint}"
+    for candidate in known:
+        suffix = next((s for s in _UNITS if candidate.endswith(s)), "")
+        stem = candidate.removesuffix(suffix)
+        if suffix and key.startswith(stem + "_"):
+            return (
+                f"{key} = {_show(given[key])} has the wrong unit "
+                f"('{key.removeprefix(stem + '_')}'); write {candidate}, the value in "
+                f"{_UNITS[suffix]}."
+            )
+    close = difflib.get_close_matches(key, known, 1)
+    if close:
+        return f"{key} is unknown; did you mean {close[0]}{_unit(close[0], ', in')}?"
+    names = ", ".join(k.rpartition(".")[2] for k in known)
+    return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names}."
+
+
+_KINDS = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "text in quotes",
+    "tuple_type": "an array of six numbers",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "missing": "an array of six numbers",
+    "too_long": "an array of six numbers",
+    "string_too_short": "text",
+}
+_RANGES = {
+    "greater_than": ("gt", "more than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+
+
+def wrong(detail: ErrorDetails) -> str:
+    """Complain about a value of the wrong type or out of its range."""
+    key, *place = detail["loc"]
+    if detail["type"] == "missing":  # one of the six
+        place = []
+    where = f"{key}[{place[0]}]" if place else str(key)
+    what = f"{where} = {_show(detail['input'])}{_unit(str(key))}"
+    if detail["type"] == "literal_error":
+        remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')
+    elif detail["type"] in _RANGES:
+        name, words = _RANGES[detail["type"]]
+        remedy = f"must be {words} {detail['ctx'][name]:g}"
+        if str(key).startswith("beam.damping."):
+            remedy += ": a negative coefficient or an order of 2 or more is an unstable beam"
+    elif detail["type"] == "tuple_type" and not is_number(keys()[str(key)]):
+        remedy = "must be an array of texts in quotes"
+    else:
+        remedy = f"must be {_KINDS.get(detail['type'], detail['msg'])}"
+    return f"{what} {remedy}."
+
+
+def _unit(key: str, before: str = "") -> str:
+    """Return the unit of a key as written after its value, or nothing."""
+    unit = _UNITS_OF_SIX.get(key) or next((u for s, u in _UNITS.items() if key.endswith(s)), "")
+    return f"{before} {unit}" if unit else ""
+
+
+def _show(value: object) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_show(item) for item in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _choice(words: tuple[str, ...]) -> str:
+    return " or ".join(f'"{word}"' for word in words)
+
+
+_PER_MILLE_LIMIT = 32.767
+"""Largest torque over rated torque that fits the 16 bits of object 6071."""
+_ROUNDING = 1e-9
+
+
+def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong between values that are each in range."""
+    absent = list(_sections(values))
+    yield from absent
+    if absent:
+        return
+    if "acquisition.mode" in values:
+        yield from _acquisition(values)
+    if "cia402.node_id" in values:
+        yield from _drive(values)
+    if "ati_serial.port" in values:
+        yield from _serial(values)
+    yield from _delays(values)
+
+
+def _sections(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sections that the chosen devices lack, and those that nobody reads."""
+    drive, sensor = values["devices.drive"], values["devices.sensor"]
+    needed = {*WIRING.get(drive, ()), *WIRING.get(sensor, ())}
+    present = {
+        section
+        for section in {name for names in WIRING.values() for name in names}
+        if any(key in values for key, _ in fields_of(section))
+    }
+    for section in sorted(needed - present):
+        yield (
+            f'section [{section}] is missing, which devices.drive = "{drive}" with '
+            f'devices.sensor = "{sensor}" needs.'
+        )
+    # Noise and offset of a rig that can also be simulated are welcome in any profile.
+    for section in sorted(present - needed - {"simulation"}):
+        yield (
+            f'section [{section}] belongs to none of devices.drive = "{drive}" and '
+            f'devices.sensor = "{sensor}"; remove it.'
+        )
+
+
+def _acquisition(values: Mapping[str, Any]) -> Iterator[str]:
+    period_us = 1e6 / values["rig.rate_hz"]
+    deadline_us = values["acquisition.deadline_us"]
+    if deadline_us >= period_us:
+        yield (
+            f"acquisition.deadline_us = {deadline_us:g} µs is not below the period of "
+            f"{period_us:g} µs; choose a half of it or less."
+        )
+
+
+def _drive(values: Mapping[str, Any]) -> Iterator[str]:
+    if values["cia402.direction"] == 0:
+        yield "cia402.direction = 0 must be 1, or -1 where the drive turns the other way round."
+    if values["cia402.host_node_id"] == values["cia402.node_id"]:
+        yield (
+            f"cia402.host_node_id = {values['cia402.host_node_id']} is the drive's own "
+            "cia402.node_id; choose another."
+        )
+    speed, limit = values["cia402.max_speed_rad_s"], values["limits.velocity_rad_s"]
+    if 0 < speed < limit:
+        yield (
+            f"cia402.max_speed_rad_s = {speed:g} rad/s is below limits.velocity_rad_s = {limit:g} "
+            "rad/s; the drive would hold back torques that a session may ask for. Choose a quarter "
+            "more than the limit, or 0 to leave what the drive has."
+        )
+    ratio = values["motor.peak_torque_nm"] / values["motor.rated_torque_nm"]
+    if ratio > _PER_MILLE_LIMIT:
+        yield (
+            f"motor.peak_torque_nm is {ratio:g} times motor.rated_torque_nm; the drive's target "
+            f"torque reaches {_PER_MILLE_LIMIT:g} times."
+        )
+    for whose in ("", "drive_"):
+        period, timeout = f"cia402.{whose}heartbeat_period_s", f"cia402.{whose}heartbeat_timeout_s"
+        for key in (period, timeout):
+            if abs(values[key] * 1000 - round(values[key] * 1000)) > 1e-6 or values[key] < 1e-3:
+                yield f"{key} = {values[key]:g} s must be a whole number of milliseconds."
+        if values[timeout] < 2 * values[period]:
+            yield (
+                f"{timeout} = {values[timeout]:g} s is below twice {period} = "
+                f"{values[period]:g} s; a single late heartbeat would end a session."
+            )
+
+    for number, text in enumerate(values["cia402.set_objects"]):
+        try:
+            parse_assignment(text)
+        except ValueError as error:
+            yield f'cia402.set_objects[{number}] = "{text}" {error}.'
+    for number, name in enumerate(values["cia402.accept_without"]):
+        if name not in ACCEPTABLE:
+            yield (
+                f'cia402.accept_without[{number}] = "{name}" is nothing that a profile can accept '
+                f"the absence of; choose {', '.join(ACCEPTABLE)}."
+            )
+
+
+def _serial(values: Mapping[str, Any]) -> Iterator[str]:
+    if values["acquisition.mode"] != "same_tick":
+        yield (
+            'acquisition.mode = "previous_tick" does not go with [ati_serial]: a sensor that '
+            'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
+        )
+    baud, stream_hz = values["ati_serial.baud"], values["ati_serial.stream_hz"]
+    most_hz = baud / RECORD_BITS
+    if stream_hz > most_hz:
+        yield (
+            f"ati_serial.stream_hz = {stream_hz:g} Hz does not fit ati_serial.baud = {baud}, which "
+            f"carries {most_hz:.0f} records a second; choose 1250000."
+        )
+    if stream_hz < values["rig.rate_hz"]:
+        yield (
+            f"ati_serial.stream_hz = {stream_hz:g} Hz is below rig.rate_hz = "
+            f"{values['rig.rate_hz']:g} Hz; there would be ticks without a record."
+        )
+
+
+def _delays(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield delays that are shorter than what the protocol alone costs."""
+    period_s = 1 / values["rig.rate_hz"]
+    reply_s = period_s if values.get("acquisition.mode") == "previous_tick" else 0.0
+    wrench_s, wrench_cause = reply_s, "the reply of the previous tick"
+    if "ati_serial.port" in values:
+        serial = AtiSerial(**{field: values[key] for key, field in fields_of("ati_serial")})
+        wrench_s = serial.filter_delay_s(values["rig.rate_hz"])
+        wrench_cause = "the filter of the sensor's records"
+    delivery_s = period_s if values.get("cia402.torque_delivery") == "at_sync" else 0.0
+    causes = (
+        ("encoder.delay_s", reply_s, "the reply of the previous tick"),
+        ("sensor.delay_s", wrench_s, wrench_cause),
+        ("actuation.delay_s", delivery_s, "a torque that takes effect at the next SYNC"),
+    )
+    for key, least_s, cause in causes:
+        if values[key] < least_s - _ROUNDING:
+            yield (
+                f"{key} = {values[key]:g} s is less than {cause} alone: at least {least_s:.6g} s."
+            )

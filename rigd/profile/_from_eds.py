@@ -1,0 +1,297 @@
+"""A profile for a drive that nobody has connected yet: from its EDS and another profile."""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from rigd.devices import Eds
+from rigd.devices.cia402 import (
+    MAX_SPEED_RPM,
+    RATED_TORQUE,
+    TORQUE_FEEDBACK,
+    TORQUE_LIMIT,
+    WATCHDOG,
+    Finding,
+    Grade,
+    judge,
+)
+from rigd.profile._load import ProfileError, profile_of
+from rigd.profile._schema import Profile, keys
+from rigd.profile._write import Setting, SettingValue, with_head, with_settings
+
+
+class UnusableDriveError(ValueError):
+    """A drive that no profile can make fit; the message names what it lacks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What no EDS tells and a profile has to."""
+
+    key: str
+    text: str
+
+
+QUESTIONS = (
+    Question("can.channel", "CAN interface of this computer"),
+    Question("cia402.node_id", "Node id that is set at the drive"),
+    Question("cia402.gear_ratio", "Gear ratio, motor turns per turn of the output shaft"),
+    Question(
+        "cia402.rated_torque_unit_nm", "One count of object 6076, N·m (mN·m: 1e-3, µN·m: 1e-6)"
+    ),
+    Question("motor.rated_torque_nm", "Rated torque at the output shaft, N·m"),
+    Question("motor.peak_torque_nm", "Peak torque at the output shaft, N·m"),
+    Question("motor.continuous_torque_nm", "Continuous (rms) torque at the output shaft, N·m"),
+    Question("motor.inertia_kg_m2", "Inertia of motor and gear at the output shaft, kg·m²"),
+    Question("encoder.resolution_rad", "Encoder step at the output shaft, rad"),
+)
+"""Friction and delay are not asked for: rigd identify motor measures them."""
+_OTHER = "What stood here was of another drive."
+_OWN_WATCHDOG = Question(
+    "cia402.own_watchdog_s",
+    "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
+    "(0: none)",
+)
+_ACCEPT = "cia402.accept_without"
+_LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
+_MAKERS_OWN = range(0x2000, 0x6000)
+_MOST_NAMED = 4
+
+
+class Draft:
+    """A new profile on its way: what the EDS tells, and what is answered.
+
+    Parameters
+    ----------
+    base
+        The profile whose text and other values it takes.
+    eds
+        What the drive's file tells.
+    path
+        Of the file that is to be written.
+
+    Raises
+    ------
+    UnusableDriveError
+        If no profile makes this drive fit.
+    ProfileError
+        If the profile to start from has no CiA 402 drive.
+    """
+
+    def __init__(self, base: Profile, eds: Eds, path: Path) -> None:
+        if base.rig.cia402 is None or base.rig.can is None:
+            raise ProfileError(
+                f"{base.path}: has no CiA 402 drive to put another in the place of; start from "
+                "antenna_can or antenna_serial."
+            )
+        judgement = judge(eds)
+        if judgement.refusals:
+            raise UnusableDriveError(
+                f"{eds.path}: no session could be run with this drive, and no profile was "
+                f"written: {' '.join(judgement.refusals)}"
+            )
+        self._base = base
+        self._eds = eds
+        self._path = path
+        self._findings = judgement.findings
+        self._accepted: list[str] = []
+        self._settings = {setting.key: setting for setting in self._told()}
+
+    def value(self, key: str) -> SettingValue:
+        """Return the value that a key has so far."""
+        if key in self._settings:
+            return self._settings[key].value
+        section, _, name = key.rpartition(".")
+        of_section: object = getattr(self._base.rig, section)
+        value: SettingValue = getattr(of_section, name)
+        return value
+
+    def answer(self, key: str, text: str) -> None:
+        """Take an answer, of the operator from a data sheet.
+
+        Raises
+        ------
+        ValueError
+            If the key does not take it; the message says what it takes.
+        """
+        annotation: Any = keys()[key]
+        try:
+            value = TypeAdapter(annotation).validate_strings(text)
+        except ValidationError as error:
+            raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
+        if value != self.value(key):
+            self._settings[key] = Setting(key, value, "datasheet")
+
+    def unaccepted(self) -> list[Finding]:
+        """Return what the drive lacks and the profile does not accept, so that rigd refuses it.
+
+        Raises
+        ------
+        ProfileError
+            If the values given so far contradict one another.
+        """
+        accepted = Setting(_ACCEPT, tuple(self._accepted))
+        text = with_settings(self._base.text, [*self._settings.values(), accepted])
+        found = judge(self._eds, profile_of(text, self._path).rig).findings
+        return [each for each in found if each.accept and each.grade is Grade.REFUSED]
+
+    def accept(self, name: str) -> None:
+        """Have the profile accept that something is missing: the operator's decision, never ours.
+
+        Parameters
+        ----------
+        name
+            One of `unaccepted`.
+        """
+        self._accepted.append(name)
+
+    @property
+    def doubts(self) -> list[str]:
+        """What the operator has to know of this drive, in sentences."""
+        findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
+        told = [f.sentence for f in findings if f.sentence]
+        return told + [
+            f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
+            "rigd check asks the drive."
+            for f in findings
+            if f.grade is Grade.ASK and f.wanted
+        ]
+
+    def questions(self) -> list[Question]:
+        """Return what has to be asked for this drive."""
+        more = (_OWN_WATCHDOG,) if WATCHDOG in self._lacks() else ()
+        absent = set() if self._eds.get(RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
+        return [each for each in (*QUESTIONS, *more) if each.key not in absent]
+
+    def unanswered(self) -> list[Question]:
+        """Return the questions whose values are still those of the profile started from."""
+        answered = {key for key, setting in self._settings.items() if setting.reason != _OTHER}
+        return [each for each in self.questions() if each.key not in answered]
+
+    def text(self) -> str:
+        """Return the text of the profile.
+
+        Raises
+        ------
+        ProfileError
+            If its values contradict one another.
+        """
+        text = self._body()
+        profile_of(text, self._path)
+        return with_head(text, self._head())
+
+    def _body(self) -> str:
+        marked = [
+            Setting(question.key, self.value(question.key), reason="TO FILL IN: " + question.text)
+            for question in self.unanswered()
+        ]
+        settings = [*self._settings.values(), *marked, *self._acceptance()]
+        return with_settings(self._base.text, settings)
+
+    def _acceptance(self) -> Iterator[Setting]:
+        """Yield what the operator accepts; what nobody has decided on stands as a comment."""
+        left = [finding.accept for finding in self.unaccepted()]
+        own = self._own_limits() if TORQUE_LIMIT in (*left, *self._accepted) else ""
+        hint = (
+            f" For a torque limit of its own see {own}, set by cia402.set_objects." if own else ""
+        )
+        if self._accepted:
+            why = "The drive lacks, by its file, what these names stand for (docs/devices.md)."
+            why += f" Not accepted, so that rigd refuses it: {', '.join(left)}." if left else ""
+            yield Setting(_ACCEPT, tuple(self._accepted), reason=why + hint)
+        elif left:
+            why = (
+                "TO FILL IN: the drive lacks, by its file, what these names stand for "
+                "(docs/devices.md), and rigd refuses it. Take the # away, and from the list what "
+                "must not be missing."
+            )
+            yield Setting(_ACCEPT, tuple(left), reason=why + hint, commented=True)
+        elif self._base.rig.cia402 is not None and self._base.rig.cia402.accept_without:
+            yield Setting(_ACCEPT, (), reason="The drive has, by its file, all that is needed.")
+
+    def _lacks(self) -> list[str]:
+        """Return the names of what a profile has to accept that this drive has not."""
+        return [finding.accept for finding in self._findings if finding.accept]
+
+    def _told(self) -> Iterator[Setting]:
+        """Yield what the file tells, and what follows from what the drive lacks."""
+        eds, path = self._eds, self._path
+        product = " ".join(filter(None, (eds.vendor_name, eds.product_name))) or "CiA 402 drive"
+        yield Setting("name", path.stem)
+        yield Setting("description", f"{product}, from {eds.path.name}")
+        place = os.path.relpath(eds.path.resolve(), path.resolve().parent)
+        yield Setting("cia402.eds", place, reason="The file of the drive, from this folder on.")
+        for key, told in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
+            if told:
+                yield Setting(f"cia402.{key}", told, "datasheet", hexadecimal=True)
+        if eds.commissioned_node_id:
+            why = "The node id for which the file configures the drive."
+            yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", why)
+        can = self._base.rig.can
+        if can is not None and eds.bit_rates_bit_s and can.bitrate_bit_s not in eds.bit_rates_bit_s:
+            why = f"The drive has no {can.bitrate_bit_s / 1000:g} kbit/s; this is its highest."
+            yield Setting("can.bitrate_bit_s", max(eds.bit_rates_bit_s), "datasheet", why)
+        yield from self._of_the_other_drive()
+        yield from self._absent()
+
+    def _of_the_other_drive(self) -> Iterator[Setting]:
+        """Yield what the profile started from says of its own drive alone, taken away."""
+        drive = self._base.rig.cia402
+        assert drive is not None
+        if drive.set_objects:
+            yield Setting("cia402.set_objects", (), reason=_OTHER)
+        if drive.own_watchdog_s:
+            yield Setting("cia402.own_watchdog_s", 0.0, "assumed", _OTHER)
+
+    def _absent(self) -> Iterator[Setting]:
+        lacks = self._lacks()
+        for missing, key, why in (
+            (
+                not self._eds.get(MAX_SPEED_RPM),
+                "max_speed_rad_s",
+                "6080 (max motor speed)",
+            ),
+            (
+                not self._eds.get(RATED_TORQUE),
+                "rated_torque_unit_nm",
+                "6076 (rated torque)",
+            ),
+            (TORQUE_FEEDBACK in lacks, "torque_tolerance_percent", "6077 (actual torque)"),
+        ):
+            if missing:
+                yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
+
+    def _own_limits(self) -> str:
+        """Name objects of the maker's own that may limit the torque."""
+        found = [
+            f"{e.index:04X}:{e.sub:X} ({e.name}{'' if e.default is None else f', {e.default}'})"
+            for e in self._eds.entries.values()
+            if e.index in _MAKERS_OWN and e.writable and _LIMIT.search(e.name)
+        ]
+        return " or ".join(found[:_MOST_NAMED])
+
+    def _head(self) -> list[str]:
+        return [
+            f"Written by rigd profiles new from {self._eds.path.name} and the profile "
+            f"{self._base.name}.",
+            "",
+            "Without the hardware, a simulated rig speaks the same protocols in its place:",
+            f"  rigd simulate --profile {self._path.name}",
+            "",
+            "Every number says where it comes from:",
+            "  paper      printed in the paper (antenna, damping, encoder)",
+            "  datasheet  told by the drive's file, or typed in from a data sheet",
+            "  measured   on a rig or a computer, as said beside it",
+            "  assumed    of the profile started from: look at those marked TO FILL IN first",
+            "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
+            *(
+                ["", "Of this drive:", *(f"* {doubt}" for doubt in self.doubts)]
+                if self.doubts
+                else []
+            ),
+        ]

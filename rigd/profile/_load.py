@@ -1,0 +1,245 @@
+"""A rig's profile: one TOML file, read and validated into frozen dataclasses.
+
+Every number stands as ``{ value = 2.0e-3, source = "assumed" }``, with its unit in the key, so
+that nobody takes an assumed number for a measured one. Ranges are declared where the number is
+used (``annotated_types`` on the dataclasses) and enforced here. All problems of a file are
+reported at once.
+"""
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+
+from rigd.devices import RigParameters
+from rigd.profile import _diagnostics as diagnostics
+from rigd.profile._schema import (
+    OPTIONAL_SECTIONS,
+    SECTIONS,
+    SOURCES,
+    Profile,
+    defaults,
+    fields_of,
+    is_number,
+    keys,
+)
+
+
+class ProfileError(ValueError):
+    """A profile cannot be used; the message has one line a problem, each with its remedy."""
+
+
+def load_profile(name_or_path: str | Path) -> Profile:
+    """Read and validate a profile.
+
+    Parameters
+    ----------
+    name_or_path
+        The name of a file in ``hw_profiles`` without its ``.toml`` (of the project's checkout, or
+        of the working directory), or the path of a file.
+
+    Returns
+    -------
+    Profile
+
+    Raises
+    ------
+    ProfileError
+        If there is no such file, or anything in it is wrong; every problem is named with its
+        key, value, unit and remedy.
+    """
+    path = _find(name_or_path)
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
+    except UnicodeDecodeError as error:
+        raise ProfileError(f"{path}: is not a text file in UTF-8; save it as one.") from error
+    return profile_of(text, path)
+
+
+def profile_of(text: str, path: Path) -> Profile:
+    """Validate the text of a profile; `path` is the file that it stands in, or is to stand in.
+
+    Raises
+    ------
+    ProfileError
+        As :func:`load_profile`.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
+
+    problems: list[str] = []
+    values, sources = _flatten(document, problems)
+    values = _validate(values, problems)
+    if not problems:
+        problems.extend(_find_eds(path, values))
+        problems.extend(diagnostics.contradictions(values))
+        problems.extend(diagnostics.wiring_contradictions(values))
+    if problems:
+        # An array that is too short is found once for each number it lacks.
+        raise ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
+
+    section = {name: _build(name, values) for name in SECTIONS if _present(name, document)}
+    return Profile(
+        name=values["name"],
+        description=values["description"],
+        path=path,
+        text=text,
+        rig=RigParameters(
+            rate_hz=section["rig"].rate_hz,
+            beam=section["beam"],
+            damping=section["beam.damping"],
+            motor=section["motor"],
+            encoder=section["encoder"],
+            sensor=section["sensor"],
+            actuation=section["actuation"],
+            devices=section["devices"],
+            simulation=section.get("simulation"),
+            name=values["name"],
+            can=section.get("can"),
+            acquisition=section.get("acquisition"),
+            cia402=section.get("cia402"),
+            ati_can=section.get("ati_can"),
+            ati_serial=section.get("ati_serial"),
+        ),
+        control=section["control"],
+        limits=section["limits"],
+        session=section["session"],
+        realtime=section["realtime"],
+        sources=sources,
+    )
+
+
+def _find(name_or_path: str | Path) -> Path:
+    if not str(name_or_path):
+        raise ProfileError(f"No profile is named; {_known_profiles()}, or give a .toml file.")
+    given = Path(name_or_path)
+    if given.suffix == ".toml" or given.parent != Path():
+        if given.is_file():
+            return given
+        raise ProfileError(f"{given}: there is no such file; {_known_profiles()}.")
+    for folder in _profile_folders():
+        path = folder / f"{given}.toml"
+        if path.is_file():
+            return path
+    raise ProfileError(
+        f"There is no profile '{given}'; {_known_profiles()}, or give the path of a .toml file."
+    )
+
+
+def _profile_folders() -> tuple[Path, ...]:
+    return Path(__file__).resolve().parents[2] / "hw_profiles", Path("hw_profiles")
+
+
+def known_profiles() -> list[str]:
+    """Return the names of the profiles in ``hw_profiles``, of the project and of this folder."""
+    return sorted({path.stem for folder in _profile_folders() for path in folder.glob("*.toml")})
+
+
+def _known_profiles() -> str:
+    names = known_profiles()
+    return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
+
+
+def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
+    """Make the path of the drive's EDS file a whole one; complain where there is no such file."""
+    given = values.get("cia402.eds")
+    if not given:
+        return
+    eds = path.resolve().parent / given
+    values["cia402.eds"] = str(eds)
+    if not eds.is_file():
+        yield (
+            f'cia402.eds = "{given}": there is no file {eds}; give its path, from the profile\'s '
+            "folder on, or remove the key."
+        )
+
+
+def _flatten(
+    document: Mapping[str, Any], problems: list[str]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Take the document apart into dotted keys, and the sources off the numbers."""
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    for key, entry in _entries(document, ""):
+        if not isinstance(entry, dict):
+            values[key] = entry
+            if _is_number(key):
+                problems.append(diagnostics.bare_number(key, entry))
+            continue
+        values[key] = entry.get("value")
+        source = entry.get("source")
+        if source in SOURCES:
+            sources[key] = source
+        elif _is_number(key):
+            problems.append(diagnostics.no_source(key, source))
+        problems.extend(
+            f"{key} has the unknown part '{other}'; only value and source go there."
+            for other in sorted(entry.keys() - {"value", "source"})
+        )
+    return values, sources
+
+
+def _is_number(key: str) -> bool:
+    """Whether a key takes a number, or six; unknown keys take nothing."""
+    return key in keys() and is_number(keys()[key])
+
+
+def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield dotted keys; a table that is no known section and has a value is a number."""
+    for key, entry in table.items():
+        dotted = prefix + key
+        if isinstance(entry, dict) and (
+            dotted in SECTIONS or not entry.keys() & {"value", "source"}
+        ):
+            yield from _entries(entry, dotted + ".")
+        else:
+            yield dotted, entry
+
+
+def _validate(values: Mapping[str, Any], problems: list[str]) -> dict[str, Any]:
+    """Check types and ranges; returns the values as their dataclasses take them."""
+    # TOML knows only arrays, and strict validation wants tuples.
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    absent = {
+        name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in given)
+    }
+    try:
+        model = _schema(frozenset(absent)).model_validate(given)
+    except ValidationError as error:
+        details = error.errors(include_url=False)
+        missing = [str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]]
+        problems.extend(diagnostics.missing(missing, given))
+        for detail in details:
+            if detail["type"] == "extra_forbidden":
+                problems.append(diagnostics.unknown(str(detail["loc"][0]), given))
+            elif str(detail["loc"][0]) not in missing:
+                problems.append(diagnostics.wrong(detail))
+        return given
+    return model.model_dump(by_alias=True)
+
+
+@cache
+def _schema(absent: frozenset[str]) -> type[BaseModel]:
+    """One flat model for all keys: building one a section takes longer than all the rest."""
+    definitions: dict[str, Any] = {
+        f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
+        for index, (key, annotation) in enumerate(keys().items())
+        if key.partition(".")[0] not in absent
+    }
+    config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    return create_model("Profile", __config__=config, **definitions)
+
+
+def _present(section: str, document: Mapping[str, Any]) -> bool:
+    return section not in OPTIONAL_SECTIONS or section in document
+
+
+def _build(section: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    return SECTIONS[section](**{field: values[key] for key, field in fields_of(section)})

@@ -1,0 +1,146 @@
+"""A new profile in the text of another: other values, each with its source and its reason."""
+
+import json
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rigd.profile._load import ProfileError
+from rigd.profile._schema import is_number, keys
+
+SettingValue = bool | int | float | str | tuple[str, ...]
+
+_WIDTH = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """The value of a key of a profile."""
+
+    key: str
+    """Dotted: ``cia402.node_id``."""
+    value: SettingValue
+    source: str = "assumed"
+    """One of the words that a profile knows; only numbers have one."""
+    reason: str = ""
+    """Becomes a comment above the value."""
+    hexadecimal: bool = False
+    commented: bool = False
+    """Stands as a comment only, for somebody to decide on; the key keeps its default."""
+
+
+def with_settings(text: str, settings: Iterable[Setting]) -> str:
+    """Return the text of a profile with other values; all comments stay.
+
+    Parameters
+    ----------
+    text
+        Of a profile that can be used.
+    settings
+        What is to stand in it. A key that it has left out takes the place of the comment that
+        shows it, or comes first in its section.
+
+    Raises
+    ------
+    KeyError
+        If the profile does not have the section of a key.
+    """
+    lines = text.splitlines()
+    for setting in settings:
+        places = _places(lines)
+        line = _line(setting)
+        new = [*_comment(setting.reason), f"# {line}" if setting.commented else line]
+        if setting.key in places:
+            place = places[setting.key]
+            lines[place : place + 1] = new
+        else:
+            place = places[setting.key.rpartition(".")[0]] + 1
+            lines[place:place] = new
+    return "\n".join(lines) + "\n"
+
+
+def with_head(text: str, head: Sequence[str]) -> str:
+    """Return the text of a profile with other comments before its first key."""
+    lines = text.splitlines()
+    first = next(i for i, line in enumerate(lines) if line and not line.startswith("#"))
+    return (
+        "\n".join(
+            [*(each for line in head for each in _comment(line) or ["#"]), "", *lines[first:]]
+        )
+        + "\n"
+    )
+
+
+def check_new(path: Path) -> None:
+    """Refuse a path for a new profile under which none could be written, or found again.
+
+    Raises
+    ------
+    ProfileError
+        If there is a file, no folder for it, or its name is no profile's.
+    """
+    if path.suffix != ".toml":
+        raise ProfileError(f"{path}: the name of a profile ends in .toml.")
+    if path.exists() or path.is_symlink():
+        raise _taken(path)
+    if not path.parent.is_dir():
+        raise ProfileError(f"{path}: there is no folder {path.parent}; make it first.")
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a file that does not exist yet.
+
+    Raises
+    ------
+    ProfileError
+        If there is one, or it cannot be written.
+    """
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError as error:
+        raise _taken(path) from error
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def _taken(path: Path) -> ProfileError:
+    return ProfileError(f"{path}: is there already and is left as it is; name another file.")
+
+
+def _places(lines: Sequence[str]) -> dict[str, int]:
+    """Return the number of the line on which each section and each key of a profile stands.
+
+    Of a key that only a comment shows, it is that of the comment.
+    """
+    places: dict[str, int] = {}
+    shown: dict[str, int] = {}
+    section = ""
+    for place, line in enumerate(lines):
+        if title := re.match(r"\[([^\]]+)\]", line):
+            places[title[1]] = place
+            section = title[1] + "."
+        elif key := re.match(r"(\w+)\s*=", line):
+            places[section + key[1]] = place
+        elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in keys():
+            shown[section + key[1]] = place
+    return shown | places
+
+
+def _comment(text: str) -> list[str]:
+    """Return a text as lines of comment."""
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+
+
+def _line(setting: Setting) -> str:
+    name = setting.key.rpartition(".")[2]
+    value = setting.value
+    # What JSON makes of texts and truth, TOML reads.
+    shown = json.dumps(value, ensure_ascii=False)
+    if not is_number(keys()[setting.key]):
+        return f"{name} = {shown}"
+    if setting.hexadecimal and isinstance(value, int):
+        shown = f"0x{value:08X}"
+    return f'{name} = {{ value = {shown}, source = "{setting.source}" }}'

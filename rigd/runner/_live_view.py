@@ -1,0 +1,188 @@
+"""The live view of a rig: started with its processes, watched, started again if it is lost."""
+
+import time
+import uuid
+from collections.abc import Callable
+
+from rigd.engine import LIVE, ChildError, Event, Level, Message, Pulse, Word
+from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession
+from rigd.runner._process_group import Crew
+from rigd.runner._request import Order
+from rigd.runtime import StopRequest
+from rigd.view import Subject
+
+_PATIENCE_S = 10.0
+"""It takes its time to start: a session waits so long for it."""
+_START_PATIENCE_S = 60.0
+"""On a computer that is busy, before one that only starts counts as hung."""
+_BEGIN_PATIENCE_S = 1.0
+_MOST_RESTARTS = 3
+"""In one session: what dies again and again is not worth the processor time."""
+
+
+class LiveView:
+    """The publisher process of a rig, which no session ever waits for.
+
+    Parameters
+    ----------
+    crew
+        With a publisher, its memory laid out.
+    rig
+        The profile's name.
+
+    Attributes
+    ----------
+    address
+        Where the view is, as far as is known.
+    """
+
+    def __init__(self, crew: Crew, rig: str) -> None:
+        self.address: LiveAddress | None = None
+        self._crew = crew
+        self._job = LiveJob(rig, crew.channels.specs)
+        self._session: LiveSession | None = None
+        self._untold: list[Event] = []
+        self._restarts = 0
+        self._lost = ""
+        self._shown = False
+        self._start()
+
+    def show(self, order: Order, stop: StopRequest) -> str:
+        """Show a session that is about to be run.
+
+        Parameters
+        ----------
+        order
+            What is run.
+        stop
+            The operator's: then the view is waited for no longer.
+
+        Returns
+        -------
+        str
+            The address of the view, or why there is none, for the operator.
+        """
+        self._restarts = 0
+        if self._lost:  # perhaps not any more
+            self._start()
+        self._await(lambda: self._heard, _PATIENCE_S, stop)
+        begins = tuple(ring.written for ring in self._crew.channels.rings)
+        self._session = LiveSession(subject_of(order), str(uuid.uuid4()), begins)
+        self._shown = False
+        self._send(session=self._session)
+        # So that it is there from the first sample on; a session does not depend on it.
+        self._await(lambda: self._shown, _BEGIN_PATIENCE_S, stop)
+        if self._lost:
+            return f"No live view: {self._lost} The session goes on without it."
+        if self.address is None:
+            return "The live view takes its time to start; rigd live shows it when it is there."
+        return f"Live view: {self.address.viewer_url}"
+
+    def look(self) -> None:
+        """See whether it is at work; if it died or hangs, start it again."""
+        if not self._lost:
+            self._listen(0.0)
+        if not self._lost:
+            self._feel_pulse()
+
+    def attend(self) -> list[Event]:
+        """Look, and return what the operator is to be told."""
+        self.look()
+        told, self._untold = self._untold, []
+        return told
+
+    def finish(self, outcome: str, reason: str) -> None:
+        """Take note of the end of the session that is shown; how it ended may be unknown."""
+        if self._session is not None:
+            self._session = None
+            ends = tuple(ring.written for ring in self._crew.channels.rings)
+            self._send(finish=LiveEnd(ends, outcome, reason))
+
+    def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
+        """Listen until something is met, or cannot be any more, or there is no time for it."""
+        deadline = time.monotonic() + patience_s
+        while not (met() or self._lost or stop.requested) and time.monotonic() < deadline:
+            self._listen(0.1)
+
+    def _start(self) -> None:
+        """Set a new process to work."""
+        self._heard = False
+        self._lost = ""
+        self._pulse = Pulse()
+        try:
+            self._crew.fresh(LIVE)
+        except ChildError as error:
+            self._lost, self.address = str(error), None
+            return
+        self._send(job=self._job)
+        if self._session is not None:
+            self._send(session=self._session)
+
+    def _send(self, **message: object) -> None:
+        if self._lost:
+            return
+        ((name, value),) = message.items()
+        try:
+            self._crew[LIVE].send_object(name, value)
+        except ChildError as error:
+            self._restart(str(error))
+
+    def _listen(self, patience_s: float) -> None:
+        try:
+            answer = self._crew[LIVE].poll(patience_s)
+        except ChildError as error:
+            self._restart(str(error))
+        else:
+            if answer is not None:
+                self._understand(answer)
+
+    def _understand(self, answer: Message) -> None:
+        if "shown" in answer:
+            self._shown = True
+            return
+        if "address" not in answer:
+            # It says why it cannot do its work, and ends.
+            self._lost, self.address = str(answer.get("error", answer)), None
+            if self._session is not None:
+                self._note("warning", f"No live view: {self._lost} The session goes on.")
+            return
+        before, self.address = self.address, LiveAddress(**answer["address"])
+        self._heard = True
+        if before is not None and before.viewer_url != self.address.viewer_url:
+            self._note("info", f"Live view: {self.address.viewer_url}")
+
+    def _feel_pulse(self) -> None:
+        assert LIVE.hung_after_s is not None
+        patience_s = LIVE.hung_after_s if self._heard else _START_PATIENCE_S
+        beat = self._crew.channels.board[Word.LIVE_BEAT]
+        if self._pulse.look(beat, time.monotonic()) > patience_s:
+            self._restart(f"The live process has not moved for {patience_s:g} s and was killed.")
+
+    def _restart(self, why: str) -> None:
+        self._restarts += 1
+        if self._restarts > _MOST_RESTARTS:
+            self._lost, self.address = why, None
+            self._note("warning", f"{why} It is not started again; the session goes on.")
+            return
+        self._note("warning", f"{why} It is started again; the session goes on.")
+        self._crew[LIVE].kill()
+        self._start()
+
+    def _note(self, level: Level, message: str) -> None:
+        self._untold.append(Event(0, level, message))
+
+
+def subject_of(order: Order) -> Subject:
+    """Return what the picture of a session is of."""
+    rig = order.profile.rig
+    return Subject(
+        name=order.path.stem,
+        rate_hz=rig.rate_hz,
+        ticks=order.excitation.reference_rad.size,
+        sweep=order.excitation.segments["sweep"],
+        beam=rig.beam,
+        damping=rig.damping,
+        tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
+        angle_delay_s=rig.encoder.delay_s,
+        torque_delay_s=rig.sensor.delay_s,
+    )

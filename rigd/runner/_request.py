@@ -1,0 +1,305 @@
+"""A session as asked for: rig, excitation, file and room for it, and the file's metadata.
+
+From what the operator asks for to a session that can be run: rig, file, and room for it.
+
+Shared by sessions in the foreground and by the daemon.
+"""
+
+import json
+import os
+import platform
+import shlex
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rigd import __version__
+from rigd.devices import (
+    Reality,
+    check_selection,
+    objections,
+    reality,
+    simulated_differently,
+    unreachable_simulators,
+    what_moves,
+)
+from rigd.engine import Message
+from rigd.excitation import Excitation
+from rigd.printable import printable
+from rigd.profile import Profile, load_profile
+from rigd.runner._planning import RefusedError
+from rigd.safety import Limits
+from rigd.session import PART_SUFFIX
+
+# Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.
+_BYTES_PER_TICK = 260
+_BYTES_SPARE = 1_000_000
+
+
+class NoRoomError(RefusedError):
+    """A session's file cannot be put where it is to go."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A session to run, already checked against the profile's limits."""
+
+    profile: Profile
+    excitation: Excitation
+    path: Path
+    notes: tuple[tuple[str, str], ...] = ()
+    """Operator, specimen, note, number in a series: metadata as given."""
+
+
+def load_rig(
+    name: str, *, fast: bool = False, seed: int | None = None, hardware: bool = False
+) -> tuple[Profile, Reality]:
+    """Load a profile and see what would move.
+
+    Parameters
+    ----------
+    name
+        Of the profile, or its file.
+    fast
+        Not in real time.
+    seed
+        Of a simulated rig's noise; None leaves the profile's.
+    hardware
+        The operator says that the hardware is to move.
+
+    Raises
+    ------
+    ProfileError, UnknownDeviceError
+        If the profile cannot be used.
+    RefusedError
+        If its devices cannot share their bus, an option does not go with what would move, or a
+        simulated rig is running that cannot be reached, so that the hardware may not be meant.
+    """
+    profile = load_profile(name)
+    check_selection(profile.rig.devices, profile.path)
+    refusals = objections(profile.rig)
+    if refusals:
+        raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
+    moving = reality(profile.rig)
+    if hardware and moving is not Reality.HARDWARE:
+        raise RefusedError(
+            f"--hardware: {what_moves(profile.rig, moving)} Leave the option out, or end what "
+            "stands in for the hardware."
+        )
+    if moving is Reality.HARDWARE and not hardware:
+        _refuse_unreachable_simulators(profile)
+    if fast and not moving.any_clock:
+        raise RefusedError(
+            f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
+            "skipped; leave the option out."
+            + (" Or start rigd simulate with --lock-step." if moving is Reality.SIMULATOR else "")
+        )
+    if seed is not None:
+        if moving is not Reality.SIMULATED:
+            raise RefusedError(
+                f"--seed: the noise of {moving.value} of {profile.path} is not made here; leave "
+                "the option out."
+            )
+        assert profile.rig.simulation is not None
+        simulation = replace(profile.rig.simulation, seed=seed)
+        profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
+    return profile, moving
+
+
+def _refuse_unreachable_simulators(profile: Profile) -> None:
+    """Refuse to move the hardware while somebody simulates it where this command does not look."""
+    for path in unreachable_simulators(profile.rig.name):
+        remedy, whose = "run this command as its user to use it", "by another user"
+        with suppress(OSError, ValueError):
+            uid = path.stat().st_uid
+            whose = f"by user {uid}"
+            if uid == os.getuid():
+                whose = "in another environment"
+                remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
+        shown = printable(str(path))  # whoever made it has chosen its name
+        raise RefusedError(
+            f"A simulated rig of {profile.name} is run {whose} ({shown}), which this command does "
+            f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "
+            "--hardware if the hardware is meant."
+        )
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of the session files, unless it is there.
+
+    Raises
+    ------
+    NoRoomError
+        If it cannot be made, or nothing can be written into it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NoRoomError(
+            f"{folder} cannot be made a folder ({error.strerror}); choose another (--output)."
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise NoRoomError(
+            f"{folder}: you may not write there; have its owner open it, or choose another folder "
+            "(--output)."
+        )
+
+
+def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
+    """Make the folder, and see that a session fits on its disk and leaves room there.
+
+    Raises
+    ------
+    NoRoomError
+        If the folder cannot be made or written to, or the disk is too full.
+    """
+    make_folder(folder)
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise NoRoomError(
+            f"{folder}: how much room there is cannot be told ({error.strerror}); see whether its "
+            "disk is there."
+        ) from error
+    needed = excitation.reference_rad.size * _BYTES_PER_TICK + _BYTES_SPARE
+    if free - needed < limits.disk_free_mb * 1e6:
+        raise NoRoomError(
+            f"{folder}: {free / 1e6:.1f} MB are free on its disk, of which the session may take "
+            f"{needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB have to "
+            "be left; make room or choose another folder (--output)."
+        )
+
+
+def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
+    """Name a new session file: time, excitation, and its number in a series.
+
+    Nothing is created; the recorder refuses a name that is taken.
+    """
+    stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
+    if number is not None:
+        stem += f"-{number:02d}"
+    path = folder / f"{stem}.mcap"
+    return _free(path)
+
+
+def part_of(path: Path) -> Path:
+    """Name the file that is to become another when it is whole."""
+    return path.with_name(path.name + PART_SUFFIX)
+
+
+def _free(path: Path) -> Path:
+    while path.exists() or part_of(path).exists():
+        path = another_path(path)
+    return path
+
+
+def another_path(path: Path) -> Path:
+    """Name a session file in place of one whose name somebody else took: X.mcap, X_2.mcap, …."""
+    stem, _, number = path.stem.rpartition("_")
+    if stem and number.isdecimal():
+        return path.with_name(f"{stem}_{int(number) + 1}{path.suffix}")
+    return path.with_name(f"{path.stem}_2{path.suffix}")
+
+
+def what_is_kept(path: Path | None) -> str:
+    """Say what there is of a session that failed, once its processes have ended.
+
+    Parameters
+    ----------
+    path
+        The file that was begun for it, if any.
+    """
+    from rigd.session import holds_samples
+
+    if path is None:
+        return "There is no file of it."
+    part = part_of(path)
+    try:
+        kept, whole = part.exists(), path.exists()
+    except OSError as error:
+        return f"Its folder {path.parent} cannot be looked into ({error.strerror})."
+    if not kept:
+        return f"Its file is {path}." if whole else f"There is no {path.name} in {path.parent}."
+    if not holds_samples(part):
+        return f"Nothing was recorded; {part} holds no sample and can be removed."
+    old, new = (shlex.quote(str(part_of(name))) for name in (path, _free(path)))
+    if not whole:
+        return f"What was recorded is in {part}; rigd recover {old} makes a clean file of it."
+    return (
+        f"What was recorded is in {part}, whose name without {PART_SUFFIX} is taken: after "
+        f"mv {old} {new} rigd recover {new} makes a clean file of it."
+    )
+
+
+def file_header(order: Order, connected: Message, tare: Message) -> Message:
+    """Return metadata, segments and attachments of a session.
+
+    Parameters
+    ----------
+    order
+        What is run.
+    connected
+        What the control process told of the devices and of its real-time settings.
+    tare
+        Metadata of the tare.
+    """
+    return {
+        "metadata": _metadata(order, connected, tare),
+        "segments": order.excitation.segments,
+        "attachments": {
+            "profile.toml": order.profile.text,
+            "calibration.json": json.dumps(connected["calibration"], indent=1),
+        },
+    }
+
+
+def _metadata(order: Order, connected: Message, tare: Message) -> dict[str, str]:
+    rig = order.profile.rig
+    metadata = {
+        "id": order.path.stem,
+        "rate_hz": repr(rig.rate_hz),
+        "excitation": order.excitation.kind,
+        **{name: _text(value) for name, value in order.excitation.parameters.items()},
+        "beam_length_m": repr(rig.beam.length_m),
+        "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
+        "beam_bending_stiffness_n_m2": repr(rig.beam.bending_stiffness_n_m2),
+        "tool_inertia_kg_m2": repr(rig.sensor.tool_inertia_kg_m2),
+        "angle_delay_s": repr(rig.encoder.delay_s),
+        "torque_delay_s": repr(rig.sensor.delay_s),
+        "actuation_delay_s": repr(rig.actuation.delay_s),
+        "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
+        "drive": rig.devices.drive,
+        "sensor": rig.devices.sensor,
+        "simulated": str(connected["simulated"]).lower(),
+        "profile": order.profile.name,
+        "software": f"rigd {__version__}",
+        "host": platform.node(),
+        **{f"realtime_{name}": value for name, value in connected["realtime"].items()},
+        **connected.get("drive", {}),
+        **tare,
+        **dict(order.notes),
+    }
+    differences = simulated_differently(rig)
+    if differences:
+        metadata["simulated_differently"] = "; ".join(differences)
+    if rig.acquisition is not None:
+        metadata["acquisition_mode"] = rig.acquisition.mode
+        metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
+    if rig.ati_serial is not None:
+        metadata["sensor_filter"] = rig.ati_serial.filter
+        metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+    if rig.sensor.filter_hz > 0:
+        metadata["torque_filter_hz"] = repr(rig.sensor.filter_hz)
+        metadata["torque_filter_order"] = repr(rig.sensor.filter_order)
+    if rig.devices.drive == "sim" and rig.simulation is not None:
+        metadata["simulation_seed"] = str(rig.simulation.seed)
+    return metadata
+
+
+def _text(value: float | str) -> str:
+    # A file's name may be no text; nothing of it may keep the session from being written.
+    return (
+        value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
+    )

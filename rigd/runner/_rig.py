@@ -1,0 +1,354 @@
+"""A rig as whoever runs sessions on it sees it: connect, run, tare, zero, status, disconnect."""
+
+import contextlib
+import gc
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from rigd.devices import DeviceError, Reality, reset_drive
+from rigd.engine import (
+    CONTROL,
+    LIVE,
+    Board,
+    ChildError,
+    ControlJob,
+    Message,
+    Precedence,
+    Pulse,
+    Stop,
+    Word,
+)
+from rigd.profile import Profile
+from rigd.runner._live_view import LiveView
+from rigd.runner._process_group import Crew
+from rigd.runner._request import Order
+from rigd.runner._session import Session, SessionFailedError, SessionResult, Watcher, always
+from rigd.runner._status import RigStatus, StatusWatch
+from rigd.runtime import StopRequest
+
+_POLL_S = 0.05
+_CONNECT_PATIENCE_S = 30.0
+_ANSWER_PATIENCE_S = 10.0
+"""Beyond the time that is measured."""
+
+
+class RigError(Exception):
+    """The rig cannot do what is asked, or is lost; the message is for the operator."""
+
+
+class Rig:
+    """The devices of one profile, in processes of their own.
+
+    All but :meth:`status` is called from one thread.
+
+    Parameters
+    ----------
+    profile
+        Of the rig.
+    fast
+        Under the virtual clock.
+    live
+        Show each session in a live view.
+    crew
+        Processes that have been started already, for the first connection.
+
+    Attributes
+    ----------
+    connected
+        The control process owns the devices.
+    zero_lost
+        The operator set a zero, and the connection that it belonged to is gone.
+    """
+
+    def __init__(
+        self, profile: Profile, *, fast: bool = False, live: bool = False, crew: Crew | None = None
+    ) -> None:
+        self._profile = profile
+        self._fast = fast
+        self._live = live
+        self._crew = crew
+        self._told: Message = {}
+        self._view: LiveView | None = None
+        self._zero_set = False
+        self._pulse = Pulse()
+        self._precedence: Precedence | None = None
+        self._looking = threading.Lock()
+        self._statuses = StatusWatch(profile.rig.rate_hz)
+        self.connected = False
+        self.zero_lost = False
+
+    @property
+    def simulated(self) -> bool:
+        """Whether no motor moves; known once connected."""
+        return bool(self._told.get("simulated", False))
+
+    def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
+        """Start the processes and connect the devices; the torque stays off.
+
+        Parameters
+        ----------
+        moving
+            What the operator was told would move: anything else is refused.
+        reset_fault
+            Reset a fault of the drive first: the operator's decision.
+
+        Raises
+        ------
+        RigError
+            If that fails; everything is closed again then.
+        """
+        if self.connected:
+            self.disconnect()
+        try:
+            crew = self._crew = self._crew or Crew(live=self._live)
+            granted = self._take_precedence(crew)
+            if reset_fault:
+                self._reset_fault(moving)
+            _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast)
+            job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
+            crew.fresh(CONTROL).start(job)
+            self._told = self._ask(_CONNECT_PATIENCE_S)
+            self._told["realtime"] |= granted
+        except (RigError, ChildError, OSError) as error:
+            self.disconnect()
+            raise RigError(str(error)) from None
+        if LIVE in crew:
+            self._view = LiveView(crew, self._profile.name)
+        self.connected = True
+        self.zero_lost |= self._zero_set
+        self._zero_set = False
+
+    def run(
+        self,
+        order: Order,
+        stop: StopRequest,
+        watcher: Watcher,
+        listens: Callable[[], bool] = always,
+    ) -> SessionResult:
+        """Run one session.
+
+        Parameters
+        ----------
+        order
+            What to run.
+        stop
+            The operator's, which ends it.
+        watcher, listens
+            See :class:`rigd.runner._session.Session`.
+
+        Raises
+        ------
+        RigError
+            If the rig is not connected, or its zero is lost.
+        SessionFailedError
+            If the file cannot be written, or the recorder died.
+        """
+        crew = self._require()
+        if self.zero_lost:
+            raise RigError(
+                "The zero of the angle was lost with the connection, and the limits with it; move "
+                "the motor to its middle and run rigd zero."
+            )
+        if self._precedence is not None:
+            self._precedence.cover()
+        _wipe(crew.channels.board)
+        crew.channels.clear()
+        session = Session(order, crew, self._told, self._view, watcher, listens)
+        outcome = reason = ""
+        try:
+            result = replace(session.run(stop), hardware=not self.simulated)
+            outcome, reason = result.outcome, result.reason
+            return result
+        except SessionFailedError as error:
+            error.hardware = not self.simulated
+            raise
+        finally:
+            if self._view is not None:
+                self._view.finish(outcome, reason)
+            if session.device_failed:
+                self._await_end()
+            # Between sessions: what a session leaves behind would lie scattered among what stays,
+            # and a long series would take 4 kB more for each.
+            gc.collect()
+
+    def show(self, order: Order, stop: StopRequest) -> str:
+        """Show a session that is about to be run in the live view.
+
+        Parameters
+        ----------
+        order, stop
+            As for :meth:`run`.
+
+        Returns
+        -------
+        str
+            Its address, or why there is none, for the operator.
+        """
+        crew = self._require()
+        if self._view is None:
+            return "No live view was asked for."
+        _wipe(crew.channels.board)
+        return self._view.show(order, stop)
+
+    def tare(self) -> dict[str, Any]:
+        """Average the sensor at rest.
+
+        Returns
+        -------
+        dict
+            ``mean`` and ``std``: a number an axis (N, N·m); ``torque_std_nm``.
+
+        Raises
+        ------
+        RigError
+            If it cannot be done.
+        """
+        return self._order("tare", self._profile.session.tare_s)
+
+    def zero(self) -> dict[str, Any]:
+        """Make the angle where the motor stands the zero to which the limits are relative.
+
+        Returns
+        -------
+        dict
+            ``moved_rad``: the angle that became 0.
+
+        Raises
+        ------
+        RigError
+            If the motor moves.
+        """
+        answer = self._order("zero", 0.0)
+        self._zero_set, self.zero_lost = True, False
+        return answer
+
+    def watch(self) -> None:
+        """See whether the control process is well; call it some times a second between sessions.
+
+        Raises
+        ------
+        RigError
+            If it reported a fault, died or hangs; everything is closed then.
+        """
+        crew = self._require()
+        if self._view is not None:
+            self._view.look()
+        try:
+            message = crew.control.poll(0.0)
+        except ChildError as error:
+            message = {"ended": str(error)}
+        board = crew.channels.board
+        board.beat(Word.SUPERVISOR_BEAT)
+        assert CONTROL.hung_after_s is not None
+        still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
+        if message is None and still_s > CONTROL.hung_after_s:
+            crew.control.kill()
+            message = {
+                "ended": f"The control process has not moved for {still_s:.1f} s. Check CPU load."
+            }
+        if message is not None:
+            self.disconnect()
+            raise RigError(message.get("ended") or "The control process was asked to end.")
+
+    def status(self) -> RigStatus | None:
+        """Return a look at the board, from any thread; None while there is none."""
+        with self._looking:
+            crew, view = self._crew, self._view
+            if crew is None or not crew.laid_out:
+                return None
+            address = None if view is None else view.address
+            return replace(self._statuses.look(crew), live_view=address)
+
+    def disconnect(self) -> None:
+        """Disable the drive, close the devices, end the processes; harmless when repeated."""
+        with self._looking:
+            crew, self._crew = self._crew, None
+            self._view = None
+            self.connected = False
+        if crew is not None:
+            crew.end()
+        if self._precedence is not None:
+            self._precedence.release()
+            self._precedence = None
+
+    def _take_precedence(self, crew: Crew) -> dict[str, str]:
+        """Put this process before the ordinary ones; say what was granted."""
+        if self._fast:
+            return {}
+        realtime = self._profile.realtime
+        self._precedence = Precedence(realtime.supervision_priority, realtime.cpu)
+        crew.cores = self._precedence.cores_before
+        return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
+
+    def _reset_fault(self, moving: Reality | None) -> None:
+        try:
+            reset_drive(self._profile.rig, moving)
+        except (DeviceError, OSError) as error:
+            raise RigError(str(error)) from None
+
+    def _require(self) -> Crew:
+        if self._crew is None or not self.connected:
+            raise RigError("The rig is not connected.")
+        return self._crew
+
+    def _order(self, name: str, duration_s: float) -> dict[str, Any]:
+        """Have the control process measure something between sessions."""
+        crew = self._require()
+        try:
+            crew.control.send(**{name: True})
+            answer = self._ask(_ANSWER_PATIENCE_S + duration_s)
+        except (ChildError, RigError) as error:
+            self.disconnect()
+            raise RigError(str(error)) from None
+        if "refused" in answer:
+            raise RigError(answer["refused"])
+        measured: dict[str, Any] = answer["done"]
+        return measured
+
+    def _ask(self, patience_s: float) -> Message:
+        """Wait for what the control process answers.
+
+        Raises
+        ------
+        RigError
+            If it ends instead, or does not answer in time.
+        ChildError
+            If it died.
+        """
+        assert self._crew is not None
+        answer = self._crew.control.poll(patience_s)
+        if answer is None:
+            raise RigError(
+                f"The control process does not answer within {patience_s:g} s; see whether the "
+                "devices are on, and check CPU load."
+            )
+        if "ended" in answer:
+            raise RigError(answer["ended"] or "It was stopped.")
+        return answer
+
+    def _await_end(self) -> None:
+        """Let a control process whose device failed close what can be closed."""
+        assert self._crew is not None
+        with contextlib.suppress(ChildError):
+            self._crew.control.poll(_ANSWER_PATIENCE_S)
+        self.disconnect()
+
+
+def _wipe(board: Board) -> None:
+    """Take from the board what is said to or of one session."""
+    board[Word.STOP] = Stop.NO
+    board[Word.GO] = 0
+    board[Word.LIVE_DROPPED] = 0
+
+
+def _lay_out(crew: Crew, rate_hz: float, *, fast: bool) -> None:
+    try:
+        crew.lay_out(rate_hz, fast=fast)
+    except OSError as error:
+        raise RigError(
+            f"The processes of a session get no shared memory ({error.strerror}); look at the "
+            "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
+        ) from error

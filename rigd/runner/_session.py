@@ -1,0 +1,468 @@
+"""One session in the processes of a rig, watched from its start to its file.
+
+It moves nothing itself. It has the file opened before the drive is enabled, lets tick 0 happen when
+the recorder is ready, shows the progress, passes a stop on, sees that every process is at work, and
+has the file closed with the outcome.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from rigd.engine import (
+    CONTROL,
+    RECORDER,
+    REFUSED,
+    ChildError,
+    Event,
+    Message,
+    Observer,
+    Phase,
+    Pulse,
+    RecorderJob,
+    SessionJob,
+    Stop,
+    Word,
+    put_reference,
+    read_events,
+)
+from rigd.runner._live_view import LiveView
+from rigd.runner._process_group import Crew
+from rigd.runner._request import Order, another_path, file_header, part_of
+from rigd.runtime import StopRequest
+
+_POLL_S = 0.05
+_PATIENCE_S = 5.0
+_SLOW_PATIENCE_S = 30.0
+"""For enabling a drive and for switching it off, which may take its time."""
+_START_PATIENCE_S = 30.0
+"""For a recorder that is only starting, on a computer that is busy; nothing moves yet."""
+_MOST_NAMES = 100
+_TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
+
+_COUNTED = {
+    "scheduled": Word.SCHEDULED,
+    "missed": Word.MISSED,
+    "late": Word.LATE,
+    "stale_angles": Word.STALE_ANGLES,
+    "stale_wrenches": Word.STALE_WRENCHES,
+}
+"""What the control process counts on the board, by the names of the outcome."""
+_NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
+
+
+class SessionFailedError(Exception):
+    """A session could not be run or ended; the message says why, in the operator's words.
+
+    Attributes
+    ----------
+    path
+        Its file, if one was begun.
+    kept
+        Where its record was saved, if that is not the ``.part`` of the file.
+    counts
+        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``,
+        ``stale_angles``, ``stale_wrenches``.
+    """
+
+    path: Path | None = None
+    kept: Path | None = None
+    counts: Mapping[str, int] = _NO_TICKS
+    hardware: bool | None = None
+
+    def result(self) -> "SessionResult":
+        """Return how the session ended, once its processes have."""
+        part, whole = self.kept, None
+        if part is None and self.path is not None:
+            try:
+                if part_of(self.path).exists():
+                    part = part_of(self.path)
+                elif self.path.exists():
+                    whole = self.path  # by a recorder that was only slow
+            except OSError:
+                part = part_of(self.path)  # as far as anybody knows
+        return SessionResult(
+            path=whole,
+            outcome="fault",
+            reason=str(self),
+            recorded=None,
+            lost=None,
+            fault=True,
+            part=part,
+            hardware=self.hardware,
+            **self.counts,
+        )
+
+
+class _NameTakenError(SessionFailedError):
+    """The file is there already, and is somebody else's."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionResult:
+    """How a session ended."""
+
+    path: Path | None
+    """None: there is no file, for it ended before tick 0, or none that is whole."""
+    outcome: str
+    reason: str
+    scheduled: int
+    recorded: int | None
+    """None: not known before the file is recovered; likewise `lost`."""
+    missed: int
+    late: int
+    lost: int | None
+    fault: bool
+    """Something failed, in the record or after it, whatever was asked for meanwhile."""
+    stale_angles: int = 0
+    """Recorded ticks whose angle is an old one; likewise `stale_wrenches`."""
+    stale_wrenches: int = 0
+    live_dropped: int = 0
+    """Samples that the live view did not get."""
+    part: Path | None = None
+    """What there is of a file that could not be made whole."""
+    hardware: bool | None = None
+    """Whether it was the hardware that moved, and nothing simulated; None: not known."""
+
+    @property
+    def went_well(self) -> bool:
+        """Whether nothing at all is to be said against it."""
+        return self.outcome == "complete" and not self.reason
+
+    def as_dict(self) -> dict[str, object]:
+        """Return it as JSON documents have it."""
+        return {
+            "path": None if self.path is None else str(self.path),
+            "part": None if self.part is None else str(self.part),
+            "outcome": self.outcome,
+            "reason": self.reason,
+            "scheduled": self.scheduled,
+            "recorded": self.recorded,
+            "missed": self.missed,
+            "late": self.late,
+            "lost": self.lost,
+            "stale_angles": self.stale_angles,
+            "stale_wrenches": self.stale_wrenches,
+            "hardware": self.hardware,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class SessionProgress:
+    """Where a running session is."""
+
+    phase: Phase
+    tick: int
+    missed: int
+    late: int
+
+
+Watcher = Callable[[SessionProgress, list[Event]], None]
+
+
+class Session:
+    """One session; :meth:`run` may be called once.
+
+    Parameters
+    ----------
+    order
+        What to run.
+    crew
+        Whose control process is connected and idle.
+    connected
+        What that process told when it was.
+    live
+        The view to keep up, or None.
+    watcher
+        Called some twenty times a second with the progress and the events since the last call.
+    listens
+        Whether a stop would be heard. Where it would not, the control process is to take this one
+        for hung.
+
+    Attributes
+    ----------
+    device_failed
+        A device failed: the control process has let go of all.
+    """
+
+    def __init__(
+        self,
+        order: Order,
+        crew: Crew,
+        connected: Message,
+        live: LiveView | None,
+        watcher: Watcher,
+        listens: Callable[[], bool],
+    ) -> None:
+        self._order = order
+        self._crew = crew
+        self._connected = connected
+        self._live = live
+        self._board = crew.channels.board
+        self._events = Observer(crew.channels.events)
+        self._watcher = watcher
+        self._listens = listens
+        self._virtual = connected["realtime"]["clock"] == "virtual"
+        self._pulse = Pulse()
+        self._recorder_lost: str | None = None
+        self._control_at_work = False
+        # Until it is enabled it is off; then the control process has to have seen that it is.
+        self._drive_at_end = "The drive is disabled."
+        self._opened: Path | None = None
+        self._kept: Path | None = None
+        self.device_failed = False
+
+    def run(self, stop: StopRequest) -> SessionResult:
+        """Run it to its end.
+
+        Raises
+        ------
+        SessionFailedError
+            If the file cannot be opened or written, or the recorder died or hangs.
+        """
+        stop.on_request = self._stop
+        if stop.requested:
+            self._stop()
+        try:
+            return self._run()
+        except (ChildError, SessionFailedError) as error:
+            self._recorder_lost = self._recorder_lost or str(error)
+            if self._control_at_work:
+                self._board[Word.STOP] = Stop.NO_RECORDER
+                self._listen_to_control()
+            failure = SessionFailedError(f"{self._recorder_lost} {self._drive_at_end}")
+            failure.path, failure.kept = self._opened, self._kept
+            failure.counts = self._counts()
+            raise failure from None
+        finally:
+            stop.on_request = _nothing
+
+    def _stop(self) -> None:
+        self._board[Word.STOP] = Stop.OPERATOR
+
+    def _run(self) -> SessionResult:
+        crew = self._crew
+        try:
+            reference = put_reference(
+                crew.channels.reference_fd, self._order.excitation.reference_rad
+            )
+        except OSError as error:
+            raise SessionFailedError(
+                f"A session of this length gets no shared memory ({error.strerror}); look at the "
+                "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
+            ) from None
+        self._open_file()
+        order = self._order
+        self._control_at_work = True
+        job = SessionJob(order.profile, reference, self._refused_to_supervision())
+        crew.control.send_object("session", job)
+        answer = self._listen_to_control()
+        if "ready" in answer:
+            crew.recorder.send(begin=file_header(order, self._connected, answer["ready"]))
+            self._ask_recorder("armed")
+            self._board[Word.GO] = 1
+            answer = self._listen_to_control()
+        if self._recorder_lost is not None:
+            raise SessionFailedError(self._recorder_lost)
+        return self._close(answer)
+
+    def _open_file(self) -> None:
+        """Have the file made, under another name if somebody else has just taken the one chosen."""
+        crew = self._crew
+        realtime = None if self._virtual else self._order.profile.realtime
+        for _ in range(_MOST_NAMES):
+            job = RecorderJob(self._order.path, crew.channels.specs, realtime)
+            crew.fresh(RECORDER).start(job)
+            try:
+                opened = self._ask_recorder("opened", _START_PATIENCE_S)
+            except _NameTakenError as error:
+                taken = error
+                self._order = replace(self._order, path=another_path(self._order.path))
+            else:
+                self._opened = self._order.path
+                granted = {f"recorder_{name}": text for name, text in opened["realtime"].items()}
+                self._connected = {
+                    **self._connected,
+                    "realtime": self._connected["realtime"] | granted,
+                }
+                return
+        raise taken
+
+    def _refused_to_supervision(self) -> dict[str, str]:
+        """Return what the scheduler did not grant supervisor and recorder, and why."""
+        return {
+            name: text
+            for name, text in self._connected["realtime"].items()
+            if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
+        }
+
+    def _listen_to_control(self) -> Message:
+        """Wait for the control process's next message, watching everybody meanwhile."""
+        deadline, phase = 0.0, -1
+        while True:
+            try:
+                answer = self._crew.control.poll(_POLL_S)
+            except ChildError as error:
+                return self._control_died(str(error))
+            self._report()
+            now_s = time.monotonic()
+            # In lock-step with a simulated rig each tick may wait for replies that do not come.
+            torque = self._board[Word.PHASE] in _TORQUE_PHASES and not self._virtual
+            if self._board[Word.STOP] == Stop.NO or self._board[Word.PHASE] != phase:
+                phase = self._board[Word.PHASE]
+                patience_s = _PATIENCE_S if torque else _SLOW_PATIENCE_S
+                deadline = now_s + patience_s
+            elif answer is None and now_s > deadline:
+                return self._kill_control(f"did not stop within {patience_s:g} s")
+            assert CONTROL.hung_after_s is not None
+            hung_after_s = CONTROL.hung_after_s if torque else _SLOW_PATIENCE_S
+            still_s = self._pulse.look(self._board[Word.CONTROL_BEAT], now_s)
+            if answer is None and still_s > hung_after_s:
+                return self._kill_control(f"has not moved for {hung_after_s:g} s (check CPU load)")
+            if answer is not None:
+                return self._understood(answer)
+            if self._recorder_lost is None:
+                self._recorder_lost = self._recorder_trouble()
+                if self._recorder_lost is not None:
+                    self._board[Word.STOP] = Stop.NO_RECORDER
+
+    def _understood(self, answer: Message) -> Message:
+        if "ended" in answer:  # before the session began
+            finished = self._control_died(str(answer["ended"]))
+            if not answer["ended"]:  # the signal for a stop reached it between two sessions
+                finished |= {
+                    "finished": "stopped",
+                    "reason": "Stopped by the operator.",
+                    "fault": False,
+                }
+            return finished
+        if "finished" in answer:
+            self._control_at_work = False
+            if answer["device_failed"]:
+                self.device_failed = True
+                self._drive_at_end = answer["reason"]
+        return answer
+
+    def _kill_control(self, why: str) -> Message:
+        """End a control process that hangs: the drive's own watch is what switches off then."""
+        self._crew.control.kill()
+        return self._control_died(
+            f"The control process {why} and was killed: without its heartbeat the drive switches "
+            "itself off. See that it has."
+        )
+
+    def _control_died(self, reason: str) -> Message:
+        self._control_at_work = False
+        self.device_failed = True
+        self._drive_at_end = reason
+        return self._as_finished(reason)
+
+    def _as_finished(self, reason: str) -> Message:
+        """Say what the control process would have said, as far as the board tells."""
+        counts = self._counts()
+        whole = counts["scheduled"] == self._order.excitation.reference_rad.size
+        return {
+            "finished": "complete" if whole else "fault",
+            "reason": f"After the record: {reason}" if whole else reason,
+            "fault": True,
+            "counts": counts,
+            "results": {},
+        }
+
+    def _counts(self) -> dict[str, int]:
+        board = self._board
+        # Before this session's record they stand where the last one left them.
+        return {name: board[word] if board[Word.GO] else 0 for name, word in _COUNTED.items()}
+
+    def _recorder_trouble(self) -> str | None:
+        try:
+            message = self._crew.recorder.poll(0.0)
+        except ChildError as error:
+            return str(error)
+        if message is None:
+            return None
+        self._note_kept(message)
+        return str(message.get("error", message))
+
+    def _note_kept(self, message: Message) -> None:
+        if message.get("kept"):
+            self._kept = Path(message["kept"])
+
+    def _ask_recorder(self, expected: str, patience_s: float = _PATIENCE_S) -> Message:
+        """Wait for its answer, going on watching: the motor may be held meanwhile."""
+        deadline = time.monotonic() + patience_s
+        message = None
+        while message is None and time.monotonic() < deadline:
+            message = self._crew.recorder.poll(_POLL_S)
+            self._report()
+        if message is None:
+            raise SessionFailedError(
+                f"The recorder process does not answer within {patience_s:g} s. Check CPU load and "
+                "disk."
+            )
+        if "error" in message:
+            self._note_kept(message)
+            failed = _NameTakenError if message.get("taken") else SessionFailedError
+            raise failed(message["error"])
+        if expected not in message:
+            raise SessionFailedError(f"The recorder process answers {message}.")
+        return message
+
+    def _report(self) -> None:
+        board = self._board
+        if self._listens():
+            board.beat(Word.SUPERVISOR_BEAT)
+        events = read_events(self._events.take(16))
+        if self._live is not None:
+            events += self._live.attend()
+        self._watcher(
+            SessionProgress(
+                Phase(board[Word.PHASE]),
+                board[Word.SCHEDULED],
+                board[Word.MISSED],
+                board[Word.LATE],
+            ),
+            events,
+        )
+
+    def _close(self, finished: Message) -> SessionResult:
+        self._report()
+        counts = finished["counts"]
+        outcome = {
+            "outcome": finished["finished"],
+            "reason": finished["reason"],
+            **{name: str(count) for name, count in counts.items()},
+            **finished["results"],
+        }
+        self._crew.recorder.wake()
+        self._crew.recorder.send(close=outcome)
+        closed = self._ask_recorder("closed", 2 * _PATIENCE_S)
+        # What the recorder counted in the file has the last word.
+        counts = {**_NO_TICKS, **counts, **closed.get("counts", {})}
+        ended, reason = closed.get("outcome", (finished["finished"], finished["reason"]))
+        return SessionResult(
+            path=None if closed["closed"] is None else Path(closed["closed"]),
+            outcome=ended,
+            reason=reason,
+            scheduled=counts["scheduled"],
+            recorded=counts.get("recorded", 0),
+            missed=counts["missed"],
+            late=counts["late"],
+            lost=counts.get("lost", 0),
+            stale_angles=counts["stale_angles"],
+            stale_wrenches=counts["stale_wrenches"],
+            fault=finished["fault"] or ended == "fault",
+            live_dropped=self._board[Word.LIVE_DROPPED],
+        )
+
+
+def always() -> bool:
+    """Answer for somebody whose stop comes as a signal."""
+    return True
+
+
+def _nothing() -> None:
+    """Answer a stop request that comes between two sessions: its being noted is enough."""

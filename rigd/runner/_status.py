@@ -1,0 +1,225 @@
+"""What the shared memory tells of a rig and of a record that grows."""
+
+import os
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.engine import PROCESSES, SUPERVISOR, TOPICS, Observer, Phase, Pulse, Ring, Word
+from rigd.live import LiveAddress
+from rigd.runner._process_group import Crew
+from rigd.session import decode_samples
+
+_WINDOW_S: Final = 1.0
+"""Of samples by which lateness and rate are told."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignalStatus:
+    """Figures of a record that is being made, or of the last one."""
+
+    rate_hz: float
+    """Ticks a second over the last second, without those that were missed."""
+    lateness_p50_us: float
+    """Over the last second; likewise:"""
+    lateness_p99_us: float
+    work_p99_us: float
+    tracking_error_rad: float
+    """Reference less angle, now."""
+    peak_tracking_error_rad: float
+    """Largest magnitude since the record began; likewise:"""
+    peak_coupling_torque_nm: float
+    peak_torque_command_nm: float
+
+
+class SignalWatch:
+    """Looks at the samples in the ring, as one who may miss some and holds nobody up.
+
+    Parameters
+    ----------
+    rate_hz
+        Of the rig.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._seen: tuple[Ring, Observer] | None = None
+        self._recent: deque[npt.NDArray[Any]] = deque()
+        self._peaks = np.zeros(3)
+
+    def look(self, ring: Ring) -> SignalStatus | None:
+        """Take what has come since the last look; None as long as nothing has."""
+        if self._seen is None or self._seen[0] is not ring:
+            recent = max(0, ring.written - round(_WINDOW_S * self._rate_hz))
+            self._seen = ring, Observer(ring, recent)
+        while block := self._seen[1].take(ring.capacity // 4):
+            try:
+                samples = decode_samples(block)
+            except ValueError:
+                continue  # overwritten while it was copied
+            for part in np.split(samples, np.flatnonzero(samples["tick"] == 0)):
+                self._take(part)
+        return self._status() if self._recent else None
+
+    def _take(self, samples: npt.NDArray[Any]) -> None:
+        if samples.size == 0:
+            return
+        if samples["tick"][0] == 0:  # another record
+            self._recent.clear()
+            self._peaks[:] = 0.0
+        signals = (
+            samples["angle_reference_rad"] - samples["angle_rad"],
+            samples["coupling_torque_nm"],
+            samples["torque_command_nm"],
+        )
+        self._peaks = np.maximum(self._peaks, [np.abs(signal).max() for signal in signals])
+        self._recent.append(samples)
+        oldest_ns = int(samples["t_ns"][-1]) - round(_WINDOW_S * 1e9)
+        while self._recent[0]["t_ns"][-1] < oldest_ns:
+            self._recent.popleft()
+
+    def _status(self) -> SignalStatus:
+        recent = np.concatenate(self._recent)
+        last = recent[-1]
+        span = int(last["tick"]) - int(recent["tick"][0]) + 1
+        late_us = 1e-3 * np.percentile(recent["lateness_ns"], (50, 99))
+        return SignalStatus(
+            rate_hz=self._rate_hz * recent.size / span,
+            lateness_p50_us=float(late_us[0]),
+            lateness_p99_us=float(late_us[1]),
+            work_p99_us=float(1e-3 * np.percentile(recent["work_ns"], 99)),
+            tracking_error_rad=float(last["angle_reference_rad"] - last["angle_rad"]),
+            peak_tracking_error_rad=float(self._peaks[0]),
+            peak_coupling_torque_nm=float(self._peaks[1]),
+            peak_torque_command_nm=float(self._peaks[2]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStatus:
+    """How one process of the table is."""
+
+    name: str
+    pid: int
+    state: str
+    """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
+    still_s: float
+    """For how long it has shown no sign of work, as far as somebody looked."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicStatus:
+    """What came of one topic of the table."""
+
+    name: str
+    written: int
+    rate_hz: float | None
+    """Since the last look; None where there was none."""
+    expected_hz: float | None
+    """While a session is recorded."""
+    waiting: int
+    """Records that the recorder has yet to take."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigStatus:
+    """A look at the board."""
+
+    phase: Phase
+    angle_rad: float
+    """From the rig's zero."""
+    coupling_torque_nm: float
+    torque_command_nm: float
+    tick: int
+    missed: int
+    late: int
+    lost: int
+    bus_load_percent: float | None
+    """Of the busiest line; None where there is none. Likewise:"""
+    bus_errors: int | None
+    sensor_status: int | None
+    disk_free_mb: int | None
+    view_dropped: int
+    """Samples that the live view did not get."""
+    signals: SignalStatus | None
+    """Of the record; None before its first sample."""
+    processes: tuple[ProcessStatus, ...]
+    topics: tuple[TopicStatus, ...]
+    live_view: LiveAddress | None = None
+    """Where the sessions are shown, if they are."""
+
+
+class StatusWatch:
+    """Looks at a rig now and again; what moves between two looks is known by them.
+
+    Parameters
+    ----------
+    rate_hz
+        Of the rig.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._pulses = {process: Pulse() for process in PROCESSES}
+        self._written: tuple[float, tuple[int, ...]] | None = None
+        self._signals = SignalWatch(rate_hz)
+
+    def look(self, crew: Crew) -> RigStatus:
+        """Return how it stands now."""
+        board = crew.channels.board
+        load_ppm = board.known(Word.BUS_LOAD_PPM)
+        return RigStatus(
+            phase=Phase(board[Word.PHASE]),
+            angle_rad=board[Word.ANGLE_NRAD] * 1e-9,
+            coupling_torque_nm=board[Word.COUPLING_TORQUE_NNM] * 1e-9,
+            torque_command_nm=board[Word.TORQUE_COMMAND_NNM] * 1e-9,
+            tick=board[Word.SCHEDULED],
+            missed=board[Word.MISSED],
+            late=board[Word.LATE],
+            lost=board[Word.LOST],
+            bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
+            bus_errors=board.known(Word.BUS_ERRORS),
+            sensor_status=board.known(Word.SENSOR_STATUS),
+            disk_free_mb=board[Word.DISK_FREE_MB] or None,
+            view_dropped=board[Word.LIVE_DROPPED],
+            signals=self._signals.look(crew.channels.samples),
+            processes=tuple(self._processes(crew)),
+            topics=tuple(self._topics(crew)),
+        )
+
+    def _topics(self, crew: Crew) -> Iterator[TopicStatus]:
+        rings, now_s = crew.channels.rings, time.monotonic()
+        written = tuple(ring.written for ring in rings)
+        before_s, before = self._written or (now_s, written)
+        self._written = now_s, written
+        passed_s = now_s - before_s
+        for topic, ring, now, first in zip(TOPICS, rings, written, before, strict=True):
+            # Other processes, other rings: they begin at 0 again.
+            rate_hz = (now - first) / passed_s if passed_s > 0.0 and now >= first else None
+            expected_hz = topic.expected_hz(self._rate_hz)
+            yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
+
+    def _processes(self, crew: Crew) -> Iterator[ProcessStatus]:
+        board, now_s = crew.channels.board, time.monotonic()
+        for process in PROCESSES:
+            still_s = self._pulses[process].look(board[process.beat], now_s)
+            if process is SUPERVISOR:
+                yield ProcessStatus(process.name, os.getpid(), "at work", still_s)
+                continue
+            if process not in crew:
+                continue
+            child = crew[process]
+            if not child.running:
+                state = "ended"
+            elif not crew.has_job(process):
+                state = "waiting"
+            elif process.hung_after_s is not None and still_s > process.hung_after_s:
+                state = "hung"
+            else:
+                state = "at work"
+            yield ProcessStatus(process.name, child.pid, state, still_s)

@@ -1,0 +1,267 @@
+"""Summary of a session file, for people and for programs."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from rigd.printable import printable
+from rigd.session._format import SessionError, Status
+from rigd.session._reader import MAX_SURVEYED, SURVEY_FIELDS, Event, Session, read_session
+
+_RECOVERED: Final = "recovered_"
+_MOST_CHARACTERS: Final = 200_000
+_AROUND: Final = 120
+"""Characters around an entry, whatever it says."""
+_LONGEST_KEY: Final = 200
+_LONGEST_TEXT: Final = 10_000
+_WIDEST_KEY: Final = 40
+_LONGEST_COUNT: Final = 12
+"""Digits of a number of ticks: of thirty years at 1 kHz."""
+
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True, slots=True)
+class SessionInfo:
+    """What there is to know of a session file without analysing it."""
+
+    path: Path
+    size_bytes: int
+    start_utc: str
+    """ISO 8601, to the microsecond."""
+    rate_hz: float
+    samples: int
+    ticks: int
+    """From the first recorded tick to the last, both counted."""
+    duration_s: float
+    """`ticks` at the nominal rate."""
+    missing_ticks: int
+    """Gaps between the first recorded tick and the last."""
+    status_counts: dict[str, int]
+    """Name of a status bit → samples that have it; only those that occur."""
+    segments: dict[str, tuple[int, int]]
+    metadata: dict[str, str]
+    outcome: dict[str, str] | None
+    events: list[Event]
+    attachments: dict[str, int]
+    """Name → bytes."""
+    left_out: list[str]
+    """What of the file is not here because it is too much to be shown, in words."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as a document of JSON types."""
+        return {
+            "path": str(self.path),
+            "size_bytes": self.size_bytes,
+            "start_utc": self.start_utc,
+            "rate_hz": self.rate_hz,
+            "samples": self.samples,
+            "ticks": self.ticks,
+            "duration_s": self.duration_s,
+            "missing_ticks": self.missing_ticks,
+            "status_counts": self.status_counts,
+            "segments": {name: list(ticks) for name, ticks in self.segments.items()},
+            "metadata": self.metadata,
+            "outcome": self.outcome,
+            "events": [
+                {
+                    "t_ns": event.t_ns,
+                    "level": event.level,
+                    "name": event.name,
+                    "message": event.message,
+                }
+                for event in self.events
+            ],
+            "attachments": self.attachments,
+            "left_out": self.left_out,
+        }
+
+    def lines(self) -> list[str]:
+        """Return it as lines of text."""
+        rows = [
+            ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
+            ("started", self.start_utc),
+            ("outcome", "unknown" if self.outcome is None else _outcome(self.outcome)),
+            *(("recovered", f"{k}: {v}") for k, v in _recovery(self.outcome or {}).items()),
+            (
+                "samples",
+                f"{self.samples} at {self.rate_hz:g} Hz, {self.duration_s:.3f} s, "
+                f"{self.missing_ticks} ticks missing",
+            ),
+            *(("flagged", f"{name}: {n} samples") for name, n in self.status_counts.items()),
+            *(
+                ("segment", f"{name}: {first} to {end} ({(end - first) / self.rate_hz:g} s)")
+                for name, (first, end) in self.segments.items()
+            ),
+            *(("attached", f"{name} ({size} bytes)") for name, size in self.attachments.items()),
+            *((key, value) for key, value in self.metadata.items()),
+            *(
+                (f"{event.t_ns / 1e9:.3f} s", f"{event.level}: {event.message} [{event.name}]")
+                for event in self.events
+            ),
+            *(("not shown", sentence) for sentence in self.left_out),
+        ]
+        width = min(max(len(key) for key, _ in rows), _WIDEST_KEY)
+        return [f"{printable(key):{width}}  {printable(value)}" for key, value in rows]
+
+
+def describe(path: str | PathLike[str]) -> SessionInfo:
+    """Read a session file and summarise it.
+
+    Raises
+    ------
+    SessionError
+        If the file cannot be read or does not state a rate greater than 0.
+    """
+    path = Path(path)
+    session = read_session(path, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED)
+    rate_hz = session.number("rate_hz")
+    if rate_hz <= 0:
+        raise SessionError(
+            f"{path}: rate_hz in the metadata 'session' is {rate_hz:g}, but must be greater than 0 "
+            "Hz. Whoever writes the file must correct it."
+        )
+    ticks = session.samples["tick"]
+    span = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
+    left_out: list[str] = []
+    # Ticks that are missing at the end leave no gap; only the outcome knows of them.
+    scheduled = (session.outcome or {}).get("scheduled", "")
+    if scheduled.isascii() and scheduled.isdigit():
+        if len(scheduled) <= _LONGEST_COUNT:
+            span = max(span, int(scheduled))
+        else:
+            left_out.append(f"scheduled of the outcome, a number of {len(scheduled)} digits")
+    return SessionInfo(
+        path=path,
+        size_bytes=path.stat().st_size,
+        start_utc=_iso(session.start_utc_ns),
+        rate_hz=rate_hz,
+        samples=len(ticks),
+        ticks=span,
+        duration_s=span / rate_hz,
+        missing_ticks=span - len(ticks),
+        status_counts=_status_counts(session),
+        segments=_Shown("segments", 50_000, left_out).mapping(session.segments),
+        metadata=_Shown("keys", _MOST_CHARACTERS, left_out).texts(session.metadata),
+        outcome=None
+        if session.outcome is None
+        else _Shown("keys of the outcome", 100_000, left_out).texts(session.outcome),
+        events=_Shown("messages of the log", 500_000, left_out).events(
+            session.events, session.events_left_out
+        ),
+        attachments=_Shown("attachments", 50_000, left_out).mapping(
+            {name: len(data) for name, data in session.attachments.items()}
+        ),
+        left_out=left_out,
+    )
+
+
+def _cut(text: str, most: int) -> str:
+    if len(text) <= most:
+        return text
+    return f"{text[:most]}… and {len(text) - most} more characters"
+
+
+def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str], list[str]]:
+    """Cut texts of a file to what can be read, and make them harmless to a terminal.
+
+    Parameters
+    ----------
+    values : by their keys, of any number and length
+    what : they are, in the plural
+
+    Returns
+    -------
+    The first of them, and a line on the others if there are any.
+    """
+    left_out: list[str] = []
+    shown = _Shown(what, _MOST_CHARACTERS, left_out).texts(values)
+    return {printable(key): printable(value) for key, value in shown.items()}, left_out
+
+
+class _Shown:
+    """What is shown of a part of the file that may be of any length.
+
+    Parameters
+    ----------
+    what : the part, in the plural
+    most : characters of it that are shown, in either form; those of all parts stay below 1 MB
+    left_out : gets a line if not all of it is shown
+    """
+
+    def __init__(self, what: str, most: int, left_out: list[str]) -> None:
+        self._what = what
+        self._left_out = left_out
+        self._room = most
+
+    def mapping(self, values: Mapping[str, _Value]) -> dict[str, _Value]:
+        """Return the first entries, each cut to a length that can be read."""
+        shown: dict[str, _Value] = {}
+        for count, (key, value) in enumerate(values.items()):
+            short_key = _cut(key, _LONGEST_KEY)
+            if not self._has_room(short_key, str(value)):
+                self._leave_out(len(values) - count)
+                break
+            shown[short_key] = value
+        return shown
+
+    def texts(self, values: Mapping[str, str]) -> dict[str, str]:
+        """Return the first entries, values cut likewise."""
+        return self.mapping({key: _cut(value, _LONGEST_TEXT) for key, value in values.items()})
+
+    def events(self, events: Sequence[Event], unread: int) -> list[Event]:
+        """Return the first events, likewise; `unread` more are in the file."""
+        shown: list[Event] = []
+        for event in events:
+            short = replace(
+                event,
+                name=_cut(event.name, _LONGEST_KEY),
+                message=_cut(event.message, _LONGEST_TEXT),
+            )
+            if not self._has_room(short.name, short.message):
+                break
+            shown.append(short)
+        self._leave_out(len(events) - len(shown) + unread)
+        return shown
+
+    def _has_room(self, *texts: str) -> bool:
+        # In JSON a character may take twelve, and either form has something around a text.
+        self._room -= sum(len(json.dumps(text)) for text in texts) + _AROUND
+        return self._room >= 0
+
+    def _leave_out(self, count: int) -> None:
+        if count:
+            self._left_out.append(f"… and {count} more {self._what} not shown")
+
+
+def _status_counts(session: Session) -> dict[str, int]:
+    status = session.samples["status"]
+    counts = {flag.name or "": int(np.count_nonzero(status & flag.value)) for flag in Status}
+    return {name.lower(): count for name, count in counts.items() if count}
+
+
+def _iso(utc_ns: int) -> str:
+    moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
+    return moment.isoformat(timespec="microseconds")
+
+
+def _outcome(outcome: dict[str, str]) -> str:
+    first = outcome.get("outcome", "unknown")
+    told_apart = ("outcome", *(_RECOVERED + key for key in _recovery(outcome)))
+    others = ", ".join(f"{k} {v}" for k, v in outcome.items() if k not in told_apart and v)
+    return f"{first} ({others})" if others else first
+
+
+def _recovery(outcome: dict[str, str]) -> dict[str, str]:
+    """Return what the outcome says of a recovery, without the common part of the keys."""
+    return {
+        key.removeprefix(_RECOVERED): value
+        for key, value in outcome.items()
+        if key.startswith(_RECOVERED)
+    }

@@ -1,0 +1,561 @@
+"""Messages of samples, controls and timings as arrays, whoever wrote them.
+
+Messages of the fixed layout (`rigd.session._format`) are taken as they are. Any other protobuf
+library may put the fields in another order, leave out zeros, number or type them differently: the
+places of the fields in one such message are found by its schema, and all others that have the same
+tags in the same places are taken together. What is left is decoded one by one, but not without end.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.session._format import (
+    CONTROL_DTYPE,
+    CONTROL_TYPES,
+    CONTROL_WIRE_DTYPE,
+    SAMPLE_DTYPE,
+    SAMPLE_TYPES,
+    SAMPLE_WIRE_DTYPE,
+    TIMING_DTYPE,
+    TIMING_TYPES,
+    TIMING_WIRE_DTYPE,
+    Buffer,
+    SessionError,
+    is_fixed_layout,
+    to_native,
+)
+from rigd.session._mcap_reader import McapContents, Stretch, message_starts
+from rigd.session._mcap_writer import MESSAGE_HEAD
+from rigd.session._schema import (
+    CONTROL_SCHEMA,
+    CONTROL_TOPIC,
+    SAMPLE_SCHEMA,
+    SAMPLE_TOPIC,
+    TIMING_SCHEMA,
+    TIMING_TOPIC,
+    message_class,
+    schema_data,
+)
+
+if TYPE_CHECKING:
+    from google._upb._message import FieldDescriptor as UpbFieldDescriptor
+    from google.protobuf.descriptor import FieldDescriptor
+    from google.protobuf.message import Message
+
+MAX_SINGLE_MESSAGES: Final = 200_000
+"""Most messages of a topic that are decoded one by one, at some 20 µs each."""
+MAX_CHANNELS: Final = 16
+"""Most channels of a topic."""
+MAX_MESSAGE_BYTES: Final = 1 << 14
+"""Longest message that is decoded; the fixed layout takes 119."""
+
+_BLOCK_BYTES: Final = 1 << 18
+"""Of messages that are decoded together: they stay in a processor's cache."""
+_BLOCK_RUNS: Final = 1 << 16
+_FEW: Final = 16
+"""Messages that are sooner decoded one by one."""
+_MOST_LAYOUTS: Final = 16
+"""Of messages of one channel and length: a writer that leaves out zeros makes a few."""
+_MOST_GROUPS: Final = 100_000
+"""Times that messages of one layout are taken together, at some 100 µs each."""
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
+_MOST_FIELD_NUMBER: Final = (1 << 29) - 1
+_MOST_TAG_BYTES: Final = 5
+_MOST_VARINT_BYTES: Final = 9
+"""Of 63 bits: what is longer is negative, or padded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A channel of fixed-layout messages."""
+
+    topic: str
+    schema_name: str
+    types: dict[str, str]
+    required: tuple[str, ...]
+    """Fields that a schema cannot leave out; any other absent one reads as 0."""
+    record_dtype: np.dtype[np.void]
+    """A message record in the file: its ``head``, then the ``wire`` form."""
+    dtype: np.dtype[np.void]
+
+    def dtype_of(self, fields: Sequence[str] | None) -> np.dtype[np.void]:
+        """Return the type of a decoded message of some fields; None for all."""
+        if fields is None:
+            return self.dtype
+        return np.dtype([(name, self.dtype[name]) for name in fields], align=True)
+
+
+def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
+    return np.dtype([("head", f"V{MESSAGE_HEAD.size}"), ("wire", wire_dtype)])
+
+
+SAMPLES: Final = Layout(
+    SAMPLE_TOPIC,
+    SAMPLE_SCHEMA,
+    SAMPLE_TYPES,
+    ("t_ns", "tick", "angle_rad", "coupling_torque_nm"),
+    _record_dtype(SAMPLE_WIRE_DTYPE),
+    SAMPLE_DTYPE,
+)
+CONTROLS: Final = Layout(
+    CONTROL_TOPIC,
+    CONTROL_SCHEMA,
+    CONTROL_TYPES,
+    ("t_ns", "tick"),
+    _record_dtype(CONTROL_WIRE_DTYPE),
+    CONTROL_DTYPE,
+)
+TIMINGS: Final = Layout(
+    TIMING_TOPIC,
+    TIMING_SCHEMA,
+    TIMING_TYPES,
+    ("t_ns", "tick"),
+    _record_dtype(TIMING_WIRE_DTYPE),
+    TIMING_DTYPE,
+)
+
+# Declared type → how to take it where the array has that type, if no value can be lost by it.
+_SAME: Final = {
+    "double": {"TYPE_DOUBLE": "<f8", "TYPE_FLOAT": "<f4"},
+    "sfixed64": {"TYPE_SFIXED64": "<i8", "TYPE_INT64": "varint", "TYPE_UINT32": "varint32"},
+    "fixed32": {"TYPE_FIXED32": "<u4", "TYPE_UINT32": "varint32"},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Where the fields stand in messages of one length whose bytes are `pattern` under `mask`."""
+
+    mask: npt.NDArray[np.uint8]
+    pattern: npt.NDArray[np.uint8]
+    fields: tuple[tuple[str, int, int, str], ...]
+    """Name, first byte, bytes, and numpy type, "varint" or "varint32"."""
+    absent: tuple[str, ...]
+    """Fields that are not there, and read as 0."""
+
+
+class Keeper(Protocol):
+    """Where decoded messages go."""
+
+    def room(self, count: int) -> npt.NDArray[np.void]:
+        """Return an array (count,) of the decoder's dtype to be filled with the next messages."""
+        ...
+
+    def keep(self, messages: npt.NDArray[np.void]) -> None:
+        """Take that array, filled."""
+        ...
+
+
+class MessageDecoder:
+    """Decodes the messages of one topic, in the order of the file.
+
+    What cannot be decoded is told at the end: a file that is damaged as well is first of all that.
+
+    Parameters
+    ----------
+    path : the file, for messages
+    layout : what the messages should hold
+    keeper : gets the decoded messages of `fields`, block by block
+    fields : those of the layout that are wanted; by default all
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        layout: Layout,
+        keeper: Keeper,
+        fields: Sequence[str] | None = None,
+    ) -> None:
+        self._path = path
+        self._layout = layout
+        self._keeper = keeper
+        self.dtype = layout.dtype_of(fields)
+        self.error: SessionError | None = None
+        self._channels: dict[int, bool] = {}  # channel → whether it is of the topic
+        self._fixed: dict[int, bool] = {}  # channel of the topic → whether its schema is the fixed
+        self._classes: dict[int, type[Message]] = {}
+        self._places: dict[tuple[int, int], list[_Places]] = {}
+        self._contents: McapContents | None = None
+        self._pieces: list[Buffer] = []
+        self._runs: list[tuple[int, int, int]] = []  # channel, bytes of a record, count
+        self._length = 0
+        self._single = 0
+        self._groups = 0
+
+    def take(self, contents: McapContents, stretch: Stretch) -> None:
+        """Take the messages of the topic out of those read."""
+        if self.error is not None:
+            return
+        self._contents = contents
+        known = self._channels
+        records = memoryview(stretch.records)
+        for channel, size, start, count in stretch.runs:
+            is_mine = known.get(channel)
+            if is_mine is None:
+                is_mine = self.is_of_topic(contents, channel)
+            if not is_mine:
+                continue
+            piece = records[start : start + size * count]
+            # A slice keeps all of the records in memory, which is well where it is most of them.
+            self._pieces.append(piece if 2 * len(piece) > len(records) else bytes(piece))
+            self._runs.append((channel, size, count))
+            self._length += len(piece)
+            if self._length >= _BLOCK_BYTES or len(self._runs) >= _BLOCK_RUNS:
+                self.flush()
+                if self.error is not None:
+                    return
+
+    def is_of_topic(self, contents: McapContents, channel: int) -> bool:
+        """Tell whether a channel is of the topic that is decoded."""
+        is_mine = self._channels.get(channel)
+        if is_mine is None:
+            is_mine = contents.channels[channel].topic == self._layout.topic
+            self._channels[channel] = is_mine
+        return is_mine
+
+    def flush(self) -> None:
+        """Decode what has been taken, and hand it on."""
+        pieces, runs = self._pieces, self._runs
+        self._pieces, self._runs, self._length = [], [], 0
+        if not runs or self.error is not None:
+            return
+        try:
+            self._decode(pieces, np.array(runs, np.int64))
+        except SessionError as error:
+            self.error = error
+
+    def finish(self, contents: McapContents) -> None:
+        """Decode the last messages.
+
+        Raises
+        ------
+        SessionError
+            If a message, or a schema of the topic, cannot be read.
+        """
+        self.flush()
+        if self.error is None:
+            for channel in contents.channels.values():
+                if channel.topic == self._layout.topic:
+                    self._has_fixed_schema(contents, channel.id)
+        else:
+            raise self.error
+
+    def _decode(self, pieces: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
+        """Decode runs of messages, whose bytes stand one behind the other in `pieces`."""
+        channel, size, _ = runs[0].tolist()
+        if (runs[:, :2] == runs[0, :2]).all():
+            block = b"".join(pieces)
+            # A block is a little longer than asked for; what is much longer is cut.
+            is_long = len(block) > 2 * _BLOCK_BYTES
+            most = max(_BLOCK_BYTES // size, 1) * size if is_long else len(block)
+            for first in range(0, len(block), most):
+                part = block[first : first + most]
+                out = self._keeper.room(len(part) // size)
+                self._decode_group(channel, size, part, out)
+                self._keeper.keep(out)
+            return
+        records = np.frombuffer(b"".join(pieces), np.uint8)
+        starts = message_starts(runs)
+        kinds = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
+        out = self._keeper.room(len(starts))
+        for kind in np.unique(kinds).tolist():
+            (places,) = np.nonzero(kinds == kind)
+            size = kind & ((1 << 40) - 1)
+            every = np.ndarray(len(records) - size + 1, f"V{size}", records, 0, (1,))
+            group = every[starts[places]].tobytes()
+            decoded = np.empty(len(places), self.dtype)
+            self._decode_group(kind >> 40, size, group, decoded)
+            out[places] = decoded
+        self._keeper.keep(out)
+
+    def _decode_group(
+        self, channel: int, size: int, records: bytes, out: npt.NDArray[np.void]
+    ) -> None:
+        """Decode message records of one channel and length."""
+        contents, layout = self._contents, self._layout
+        assert contents is not None
+        if size > MAX_MESSAGE_BYTES:
+            raise SessionError(
+                f"{self._path}: a message of {layout.topic} has {size} bytes, more than the "
+                f"{MAX_MESSAGE_BYTES} that are read. Whoever writes the file must write one sample "
+                "a message."
+            )
+        if self._has_fixed_schema(contents, channel) and size == layout.record_dtype.itemsize:
+            wire = np.frombuffer(records, layout.record_dtype)["wire"]
+            to_native(wire, out.dtype.names or (), out)
+            fixed = is_fixed_layout(wire, layout.types)
+            if fixed.all():
+                return
+            (places,) = np.nonzero(~fixed)
+        else:
+            places = np.arange(len(out))
+        data = np.frombuffer(records, np.uint8).reshape(len(out), size)[:, MESSAGE_HEAD.size :]
+        self._decode_by_places(channel, data, places, out)
+
+    def _decode_by_places(
+        self,
+        channel: int,
+        data: npt.NDArray[np.uint8],
+        places: npt.NDArray[np.int64],
+        out: npt.NDArray[np.void],
+    ) -> None:
+        """Decode the messages (n, bytes) at `places`, those of one layout together."""
+        known = self._places.setdefault((channel, data.shape[1]), [])
+        number = 0
+        while len(places) >= _FEW and self._groups < _MOST_GROUPS:
+            rows = data if len(places) == len(data) else data[places]
+            if number == len(known):
+                found = self._find_places(channel, rows[0].tobytes())
+                if found is None or number == _MOST_LAYOUTS:
+                    break
+                known.append(found)
+            layout = known[number]
+            alike = ((rows & layout.mask) == layout.pattern).all(axis=1)
+            self._groups += 1
+            number += 1
+            if alike.any():
+                _take_places(layout, rows[alike], places[alike], out)
+                places = places[~alike]
+        if len(places):
+            self._decode_single(channel, [data[i].tobytes() for i in places], places, out)
+
+    def _find_places(self, channel: int, message: bytes) -> _Places | None:
+        """Return where the fields of a message stand; None if it must be decoded by itself."""
+        cls = self._class(channel)
+        empty, descriptor = cls(), cls.DESCRIPTOR
+        if not empty.IsInitialized() or any(len(group.fields) > 1 for group in descriptor.oneofs):
+            return None
+        mask, fields = np.zeros(len(message), np.uint8), {}
+        position = 0
+        while position < len(message):
+            start = position
+            tag, position = _varint(message, start)
+            number, wire = tag >> 3, tag & 7
+            begin = position
+            if wire == _VARINT:
+                _, position = _varint(message, begin)
+                mask[begin:position] = 0x80
+            elif wire in (_FIXED64, _FIXED32):
+                position += 8 if wire == _FIXED64 else 4
+            elif wire == _BYTES:
+                length, position = _varint(message, begin)
+                mask[begin:position] = 0xFF
+                position += length
+            else:
+                return None
+            if (
+                not 1 <= number <= _MOST_FIELD_NUMBER
+                or position > len(message)
+                or begin - start > _MOST_TAG_BYTES
+                or (wire == _VARINT and position - begin > _MOST_VARINT_BYTES)
+            ):
+                return None
+            mask[start:begin] = 0xFF
+            declared = descriptor.fields_by_number.get(number)
+            if declared is not None:
+                kind = self._kind(declared, wire)
+                if kind is None:
+                    return None
+                fields[declared.name] = (declared.name, begin, position - begin, kind)
+        names = self.dtype.names or ()
+        absent = {name: getattr(empty, name, 0) for name in names if name not in fields}
+        if any(absent.values()):  # not zero by default, and so perhaps out of range
+            return None
+        return _Places(
+            mask,
+            np.frombuffer(message, np.uint8) & mask,
+            tuple(place for name, place in fields.items() if name in names),
+            tuple(absent),
+        )
+
+    def _kind(self, declared: "FieldDescriptor | UpbFieldDescriptor", wire: int) -> str | None:
+        """Tell how a field is taken out of many messages at once; None if it cannot be."""
+        kinds = _SAME.get(self._layout.types.get(declared.name, ""), {})
+        for name, kind in kinds.items():
+            if declared.type == getattr(declared, name):
+                needed = {"<f8": _FIXED64, "<i8": _FIXED64, "<f4": _FIXED32, "<u4": _FIXED32}
+                return kind if wire == needed.get(kind, _VARINT) else None
+        return None
+
+    def _decode_single(
+        self,
+        channel: int,
+        messages: list[bytes],
+        places: npt.NDArray[np.int64],
+        out: npt.NDArray[np.void],
+    ) -> None:
+        """Decode messages with protobuf, absent fields as 0."""
+        self._single += len(messages)
+        if self._single > MAX_SINGLE_MESSAGES:
+            raise SessionError(
+                f"{self._path}: more than {MAX_SINGLE_MESSAGES} messages of {self._layout.topic} "
+                "differ so much from one another that they would have to be decoded one by one, "
+                "which would take too long. Whoever writes the file must write all fields of every "
+                "message, in one order."
+            )
+        decode = self._class(channel).FromString
+        decoded = [decoded_message(self._path, self._layout.topic, decode, m) for m in messages]
+        names = self.dtype.names or ()
+        try:
+            out[places] = np.array(
+                [tuple([getattr(each, name, 0) for name in names]) for each in decoded],
+                self.dtype,
+            )
+        except OverflowError as error:
+            raise SessionError(
+                f"{self._path}: a message of {self._layout.topic} holds a number that its field "
+                f"cannot take ({error}). Whoever writes the file must keep to the types of the "
+                "format."
+            ) from None
+
+    def _class(self, channel: int) -> "type[Message]":
+        """Return the class that decodes the messages of a channel of the topic."""
+        found = self._classes.get(channel)
+        if found is None:
+            assert self._contents is not None
+            found = class_of_channel(self._path, self._contents, channel)
+            self._classes[channel] = found
+        return found
+
+    def _has_fixed_schema(self, contents: McapContents, channel: int) -> bool:
+        known = self._fixed.get(channel)
+        if known is None:
+            self._contents = contents
+            known = self._fixed[channel] = self._check_schema(contents, channel)
+        return known
+
+    def _check_schema(self, contents: McapContents, channel_id: int) -> bool:
+        """Tell whether a schema gives every field the number and type of the fixed layout.
+
+        Raises
+        ------
+        SessionError
+            If by that schema messages cannot be decoded to the layout's fields at all.
+        """
+        layout, path = self._layout, self._path
+        channel = contents.channels[channel_id]
+        schema = contents.schemas.get(channel.schema_id)
+        if len(self._fixed) >= MAX_CHANNELS:
+            raise SessionError(
+                f"{path} has more than {MAX_CHANNELS} channels {layout.topic}. Whoever writes the "
+                "file must put all such messages into one."
+            )
+        if (
+            channel.message_encoding == "protobuf"
+            and schema is not None
+            and (schema.name, schema.encoding) == (layout.schema_name, "protobuf")
+            and schema.data == schema_data(layout.schema_name)
+        ):
+            return True
+        decoding = self._class(channel_id)
+        empty = decoding()
+        fixed = True
+        for number, (name, kind) in enumerate(layout.types.items(), start=1):
+            declared = decoding.DESCRIPTOR.fields_by_name.get(name)
+            if declared is None:
+                if name in layout.required:
+                    raise SessionError(
+                        f"{path}: the schema of {layout.topic} has no field {name}, which is "
+                        f"required there, of type {kind}."
+                    )
+                fixed = False
+                continue
+            # What an empty message holds tells singular numbers from everything else.
+            if not isinstance(getattr(empty, name), float | int if kind == "double" else int):
+                raise SessionError(
+                    f"{path}: the field {name} of {layout.topic} is not of a type that can be read "
+                    f"as {kind}, which it should be."
+                )
+            expected = getattr(declared, f"TYPE_{kind.upper()}")
+            fixed = fixed and declared.number == number and declared.type == expected
+        return fixed
+
+
+def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "type[Message]":
+    """Return the class that decodes the messages of a channel, by the schema in the file.
+
+    Raises
+    ------
+    SessionError
+        If the channel is not of protobuf, or its schema cannot be used.
+    """
+    channel = contents.channels[channel_id]
+    schema = contents.schemas.get(channel.schema_id)
+    if channel.message_encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
+        raise SessionError(
+            f"{path}: {channel.topic} has the encoding {quoted(channel.message_encoding)} and the "
+            f"schema encoding {quoted(schema.encoding if schema else '')}. A session file has "
+            "protobuf there, for both."
+        )
+    try:
+        return message_class(schema.name, schema.data)
+    except ValueError as error:
+        raise SessionError(
+            f"{path}: {channel.topic} cannot be decoded, because its {error}. Whoever writes the "
+            "file must put a FileDescriptorSet with all it needs there."
+        ) from None
+
+
+def decoded_message(
+    path: Path, topic: str, decode: "Callable[[bytes], Message]", data: bytes
+) -> "Message":
+    """Decode a message.
+
+    Raises
+    ------
+    SessionError
+        If it contradicts its schema.
+    """
+    from google.protobuf.message import DecodeError
+
+    try:
+        return decode(data)
+    except DecodeError:
+        raise SessionError(
+            f"{path}: a message of {topic} is not what its schema says. The file is damaged or was "
+            "not written as the format asks."
+        ) from None
+
+
+def quoted(text: str) -> str:
+    """Quote a value of the file, which may be of any length and contain anything."""
+    return repr(text if len(text) <= 40 else text[:40] + "…")
+
+
+def _take_places(
+    layout: _Places,
+    rows: npt.NDArray[np.uint8],
+    places: npt.NDArray[np.int64],
+    out: npt.NDArray[np.void],
+) -> None:
+    """Decode messages (n, bytes) of one layout to `places` of the array."""
+    rows = np.ascontiguousarray(rows)
+    count, size = rows.shape
+    for name, first, length, kind in layout.fields:
+        if kind.startswith("varint"):
+            value = np.zeros(count, np.uint64)
+            for i in range(length):
+                value |= (rows[:, first + i] & 0x7F).astype(np.uint64) << np.uint64(7 * i)
+            if kind == "varint32":
+                value &= np.uint64(0xFFFFFFFF)
+            out[name][places] = value.astype(out.dtype[name])
+        else:
+            out[name][places] = np.ndarray(count, kind, rows, first, (size,))
+    for name in layout.absent:
+        out[name][places] = 0
+
+
+def _varint(data: bytes, position: int) -> tuple[int, int]:
+    """Return a number and where it ends; negative if it is none, which ends behind the data."""
+    value = 0
+    for i, byte in enumerate(data[position : position + 10]):
+        value |= (byte & 0x7F) << 7 * i
+        if byte < 0x80:
+            return value, position + i + 1
+    return -1, len(data) + 1

@@ -1,0 +1,177 @@
+"""Channels of a session file and their protobuf schemas, built without a protobuf compiler.
+
+An MCAP schema of encoding ``protobuf`` is a serialised ``FileDescriptorSet`` that holds the message
+and everything it refers to.
+"""
+
+from collections.abc import Mapping
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Final
+
+from rigd.session._format import CONTROL_TYPES, SAMPLE_TYPES, TIMING_TYPES
+
+if TYPE_CHECKING:
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto
+    from google.protobuf.message import Message
+
+FORMAT_VERSION: Final = "1"
+
+SAMPLE_TOPIC: Final = "/rig/sample"
+CONTROL_TOPIC: Final = "/rig/control"
+TIMING_TOPIC: Final = "/rig/timing"
+EVENT_TOPIC: Final = "/rig/event"
+
+OWN_TOPICS: Final = (SAMPLE_TOPIC, CONTROL_TOPIC, TIMING_TOPIC, EVENT_TOPIC)
+
+SAMPLE_SCHEMA: Final = "rigd.Sample"
+CONTROL_SCHEMA: Final = "rigd.Control"
+TIMING_SCHEMA: Final = "rigd.Timing"
+EVENT_SCHEMA: Final = "foxglove.Log"
+
+MAX_SCHEMA_BYTES: Final = 1 << 17
+"""Longest schema that is interpreted; those of this package take some hundred bytes."""
+
+EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
+"""Names of the values 0…5 of ``foxglove.Log.Level``."""
+
+
+def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescriptorProto":
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+
+    package, name = schema_name.split(".")
+    file = FileDescriptorProto(
+        name=f"{package}/{name.lower()}.proto", package=package, syntax="proto3"
+    )
+    message = file.message_type.add(name=name)
+    for number, (field, kind) in enumerate(types.items(), start=1):
+        message.field.add(
+            name=field,
+            number=number,
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+            type=FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}"),
+        )
+    return file
+
+
+def _event_file() -> "FileDescriptorProto":
+    """Return the part of https://github.com/foxglove/foxglove-sdk's ``foxglove.Log`` in use."""
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
+
+    file = FileDescriptorProto(
+        name="foxglove/Log.proto",
+        package="foxglove",
+        syntax="proto3",
+        dependency=["google/protobuf/timestamp.proto"],
+    )
+    message = file.message_type.add(name="Log")
+    level = message.enum_type.add(name="Level")
+    for value, name in enumerate(EVENT_LEVELS):
+        level.value.add(name=name.upper(), number=value)
+    fields = (
+        ("timestamp", FieldDescriptorProto.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
+        ("level", FieldDescriptorProto.TYPE_ENUM, ".foxglove.Log.Level"),
+        ("message", FieldDescriptorProto.TYPE_STRING, None),
+        ("name", FieldDescriptorProto.TYPE_STRING, None),
+        ("file", FieldDescriptorProto.TYPE_STRING, None),
+        ("line", FieldDescriptorProto.TYPE_FIXED32, None),
+    )
+    for number, (name, kind, type_name) in enumerate(fields, start=1):
+        message.field.add(
+            name=name,
+            number=number,
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+            type=kind,
+            type_name=type_name,
+        )
+    return file
+
+
+@cache
+def schema_data(schema_name: str) -> bytes:
+    """Return the serialised ``FileDescriptorSet`` of one of the four schemas of a session file."""
+    from google.protobuf import timestamp_pb2
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+
+    if schema_name == EVENT_SCHEMA:
+        timestamp = FileDescriptorProto()
+        timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+        files = [timestamp, _event_file()]
+    else:
+        types = {
+            SAMPLE_SCHEMA: SAMPLE_TYPES,
+            CONTROL_SCHEMA: CONTROL_TYPES,
+            TIMING_SCHEMA: TIMING_TYPES,
+        }[schema_name]
+        files = [_fixed_layout_file(schema_name, types)]
+    return FileDescriptorSet(file=files).SerializeToString(deterministic=True)
+
+
+@lru_cache(maxsize=16)
+def message_class(schema_name: str, data: bytes) -> "type[Message]":
+    """Return the class that decodes the messages of a protobuf schema.
+
+    It takes as long to build as dozens of messages to decode, so the last few are kept.
+
+    Parameters
+    ----------
+    schema_name : full name of the message type, such as ``rigd.Sample``
+    data : serialised ``FileDescriptorSet``
+
+    Raises
+    ------
+    ValueError
+        If `data` is not a consistent ``FileDescriptorSet`` that holds `schema_name`.
+    """
+    from google.protobuf import descriptor_pool, message_factory
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.message import DecodeError
+
+    shown = repr(schema_name if len(schema_name) <= 40 else schema_name[:40] + "…")
+    if len(data) > MAX_SCHEMA_BYTES:
+        raise ValueError(
+            f"schema {shown} has {len(data)} bytes, more than the {MAX_SCHEMA_BYTES} that are read"
+        )
+    try:
+        remaining = {file.name: file for file in FileDescriptorSet.FromString(data).file}
+        pool = descriptor_pool.DescriptorPool()
+
+        def add(name: str) -> None:
+            # A file goes into the pool after those it imports, in whatever order they stand.
+            file = remaining.pop(name, None)
+            if file is not None:
+                for dependency in file.dependency:
+                    add(dependency)
+                pool.Add(file)
+
+        while remaining:
+            add(next(iter(remaining)))
+        descriptor = pool.FindMessageTypeByName(schema_name)
+    except (DecodeError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"schema {shown} is not a usable protobuf schema") from error
+    return message_factory.GetMessageClass(descriptor)
+
+
+def protected_metadata(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
+    """Return both records as the metadata of the sample channel, where a checksum covers them.
+
+    The format has no checksum of a metadata record, and that of the whole file comes at its end.
+    """
+    return {
+        **{f"session.{key}": value for key, value in session.items()},
+        **{f"segments.{key}": value for key, value in segments.items()},
+    }
+
+
+def unprotected_metadata(channel: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Undo `protected_metadata`: return ``session`` and ``segments``; empty without them."""
+    found: dict[str, dict[str, str]] = {}
+    for key, value in channel.items():
+        record, dot, name = key.partition(".")
+        if dot and record in ("session", "segments"):
+            found.setdefault(record, {})[name] = value
+    return found
+
+
+def event_class() -> "type[Message]":
+    """Return the message class of ``foxglove.Log`` as this package writes it."""
+    return message_class(EVENT_SCHEMA, schema_data(EVENT_SCHEMA))

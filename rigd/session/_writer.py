@@ -1,0 +1,543 @@
+"""Writing a session file."""
+
+import contextlib
+import errno
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+import rigd
+from rigd.session._format import (
+    CONTROL_SIZE,
+    CONTROL_WIRE_DTYPE,
+    SAMPLE_SIZE,
+    SAMPLE_WIRE_DTYPE,
+    TIMING_SIZE,
+    TIMING_WIRE_DTYPE,
+    Buffer,
+    SessionError,
+    SessionExistsError,
+)
+from rigd.session._mcap_writer import INDEX_DTYPE, MESSAGE_HEAD, RECORD_HEAD_SIZE, McapWriter
+from rigd.session._schema import (
+    CONTROL_SCHEMA,
+    CONTROL_TOPIC,
+    EVENT_LEVELS,
+    EVENT_SCHEMA,
+    EVENT_TOPIC,
+    FORMAT_VERSION,
+    SAMPLE_SCHEMA,
+    SAMPLE_TOPIC,
+    TIMING_SCHEMA,
+    TIMING_TOPIC,
+    event_class,
+    protected_metadata,
+    schema_data,
+)
+
+try:
+    import fcntl
+except ImportError:  # sessions are recorded on Linux, but read anywhere
+    fcntl = None  # type: ignore[assignment]
+
+
+_COPY_BYTES: Final = 1 << 20
+
+
+def fsync_directory(path: Path) -> None:
+    """Bring the names in a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def copy_new(descriptor: int, target: Path) -> None:
+    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
+    with target.open("xb") as copy:
+        try:
+            position = 0
+            while data := os.pread(descriptor, _COPY_BYTES, position):
+                copy.write(data)
+                position += len(data)
+            copy.flush()
+            os.fsync(copy.fileno())
+        except OSError:
+            target.unlink()
+            raise
+
+
+def rename_new(source: Path, target: Path) -> None:
+    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
+            raise
+        # A file system without hard links (FAT, some network shares): reserve the name, which
+        # fails if anybody has it, and replace the empty file that then is our own.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        source.replace(target)
+    else:
+        source.unlink()
+
+
+def mark_as_written(descriptor: int) -> None:
+    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
+
+    An advisory lock; a file system without locks goes without it.
+    """
+    if fcntl is not None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_being_written(path: Path) -> bool:
+    """Tell whether a living process holds the mark of `mark_as_written`."""
+    if fcntl is None:
+        return False
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    else:
+        return False
+    finally:
+        os.close(descriptor)
+
+
+PART_SUFFIX: Final = ".part"
+
+CHUNK_SAMPLES: Final = 250
+CHUNK_S: Final = 0.25
+"""Samples to a chunk, and time to a chunk: what a killed recorder loses at most is the lesser."""
+SYNC_INTERVAL_S: Final = 1.0
+"""Wall time between two syncs to the disk: what a dead host loses on top."""
+
+_MESSAGE_HEAD_FIELDS: Final = [
+    ("opcode", "u1"),
+    ("length", "<u8"),
+    ("channel", "<u2"),
+    ("sequence", "<u4"),
+    ("log_time", "<u8"),
+    ("publish_time", "<u8"),
+]
+"""`MESSAGE_HEAD` as numpy has it."""
+
+_CHANNELS: Final = {
+    SAMPLE_TOPIC: (1, SAMPLE_SCHEMA),
+    CONTROL_TOPIC: (2, CONTROL_SCHEMA),
+    TIMING_TOPIC: (3, TIMING_SCHEMA),
+    EVENT_TOPIC: (4, EVENT_SCHEMA),
+}
+"""Topic → the channel's number in the file and the name of its schema."""
+
+_MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
+_URGENT: Final = ("error", "fatal")
+
+
+def _fixed_records(
+    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
+) -> npt.NDArray[np.void]:
+    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
+    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
+    records["opcode"] = Opcode.MESSAGE
+    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
+    records["channel"] = channel
+    records["sequence"] = wire["tick"]
+    records["log_time"] = wire["t_ns"] + start_utc_ns
+    records["publish_time"] = records["log_time"]
+    records["data"] = wire
+    return records
+
+
+def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
+    index = np.empty(records.shape, INDEX_DTYPE)
+    index["log_time"] = records["log_time"]
+    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
+    return index
+
+
+def _event_records(
+    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
+) -> tuple[bytes, npt.NDArray[np.void]]:
+    """Make message records of events (log time, message), and their index."""
+    records = b""
+    index = np.empty(len(events), INDEX_DTYPE)
+    for i, (log_time, data) in enumerate(events):
+        index[i] = (log_time, offset + len(records))
+        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
+        records += MESSAGE_HEAD.pack(
+            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
+        )
+        records += data
+    return records, index
+
+
+def _chunk_samples(metadata: Mapping[str, str]) -> int:
+    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
+    try:
+        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
+    except (ValueError, OverflowError):
+        return CHUNK_SAMPLES
+    return min(max(in_time, 1), CHUNK_SAMPLES)
+
+
+def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
+    """Make the channels of a session; that of the samples repeats what the file says of them."""
+    schemas, channels = [], []
+    for topic, (number, schema_name) in _CHANNELS.items():
+        schemas.append(
+            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
+        )
+        channels.append(
+            Channel(
+                id=number,
+                topic=topic,
+                message_encoding="protobuf",
+                schema_id=number,
+                metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
+            )
+        )
+    return schemas, channels
+
+
+class SessionWriter:
+    """Writes one session, durably, to ``NAME.mcap.part`` and in the end to ``NAME.mcap``.
+
+    After `begin`, messages arrive in blocks; a chunk goes to the file with every 250th sample,
+    and the file to the disk once a second. Whatever happens after that, what was written stays.
+
+    Parameters
+    ----------
+    path : the final name
+
+    Raises
+    ------
+    SessionExistsError
+        If the file or its ``.part`` exists.
+    SessionError
+        If the file cannot be created.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = path = Path(path)
+        self.part = path.with_name(path.name + PART_SUFFIX)
+        self._samples = bytearray()
+        self._controls = bytearray()
+        self._timings = bytearray()
+        self._chunk_samples = CHUNK_SAMPLES
+        self._events: list[tuple[int, bytes]] = []  # log_time, message
+        self._event_count = 0
+        self._start_utc_ns = 0
+        self._mcap: McapWriter | None = None
+        self._synced_at = time.monotonic()
+        self._dirty = False
+        self._failed = False
+        with self._explained():
+            try:
+                descriptor = os.open(self.part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+            except FileExistsError:
+                raise SessionExistsError(
+                    f"{self.part} exists: another session is being recorded to it or was cut off. "
+                    "Choose another name or move that file away; nothing is overwritten."
+                ) from None
+            self._stream = os.fdopen(descriptor, "wb")
+            mark_as_written(descriptor)
+            # Only now, so that a writer that finishes in between is seen.
+            if os.path.lexists(path):
+                self._stream.close()
+                self.part.unlink()
+                raise SessionExistsError(
+                    f"{path} exists. Choose another name or move that file away; "
+                    "nothing is overwritten."
+                )
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._failed = True
+            raise SessionError(
+                f"{self.part} cannot be written: {error.strerror or error}. Check that the folder "
+                "exists, is writable and has space left."
+            ) from error
+
+    def begin(
+        self,
+        start_utc_ns: int,
+        metadata: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]],
+        attachments: Mapping[str, bytes],
+    ) -> None:
+        """Write what is known before the first tick.
+
+        Parameters
+        ----------
+        start_utc_ns : wall clock at tick 0, ns since the Unix epoch
+        metadata : the record ``session``; ``format_version`` and ``start_utc_ns`` are added
+        segments : name → first tick and end (exclusive): the record ``segments``
+        attachments : file name → contents
+        """
+        if self._mcap is not None:
+            raise RuntimeError("begin() was called twice")
+        self._start_utc_ns = start_utc_ns
+        self._chunk_samples = _chunk_samples(metadata)
+        with self._explained():
+            mcap = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
+            session = {
+                **metadata,
+                "format_version": FORMAT_VERSION,
+                "start_utc_ns": str(start_utc_ns),
+            }
+            ticks = {name: f"{first},{end}" for name, (first, end) in segments.items()}
+            mcap.add_metadata("session", session)
+            mcap.add_metadata("segments", ticks)
+            for name, data in attachments.items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                mcap.add_attachment(name, media_type, data, start_utc_ns)
+            mcap.declare(*_session_channels(protected_metadata(session, ticks)))
+            self._mcap = mcap
+            self._sync()
+            fsync_directory(self.part.parent)
+
+    def write_samples(self, block: Buffer) -> None:
+        """Take n × ``SAMPLE_SIZE`` bytes of packed samples (n may be 0)."""
+        arrived = self._checked(block, SAMPLE_SIZE)
+        chunk_size = self._chunk_samples * SAMPLE_SIZE
+        with self._explained():
+            while arrived:
+                taken = chunk_size - len(self._samples)
+                self._samples += arrived[:taken]
+                arrived = arrived[taken:]
+                if len(self._samples) == chunk_size:
+                    self._write_chunk(everything=False)
+            self._sync_when_due()
+
+    def write_controls(self, block: Buffer) -> None:
+        """Take n × ``CONTROL_SIZE`` bytes of packed control messages (n may be 0).
+
+        They share a chunk with the samples of the same time if they are written before these.
+        """
+        self._controls += self._checked(block, CONTROL_SIZE)
+        with self._explained():
+            self._sync_when_due()
+
+    def write_timings(self, block: Buffer) -> None:
+        """Take n × ``TIMING_SIZE`` bytes of packed ages, as `write_controls` does."""
+        self._timings += self._checked(block, TIMING_SIZE)
+        with self._explained():
+            self._sync_when_due()
+
+    def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
+        """Record an event for whoever reads the file.
+
+        It is written with the chunk in progress; an error or a fatal one at once, together with
+        what that chunk has so far.
+
+        Parameters
+        ----------
+        t_ns : ns since the session start
+        level : "debug", "info", "warning", "error" or "fatal"
+        message : text for the operator
+        name : process or part that speaks
+        """
+        self._begun()
+        log_time = self._start_utc_ns + t_ns
+        seconds, nanos = divmod(log_time, 10**9)
+        event = event_class()(
+            timestamp={"seconds": seconds, "nanos": nanos},
+            level=EVENT_LEVELS.index(level),
+            message=message,
+            name=name,
+        )
+        self._events.append((log_time, event.SerializeToString()))
+        if level in _URGENT:
+            with self._explained():
+                self._write_chunk(everything=True)
+
+    def close(self, outcome: Mapping[str, str]) -> Path:
+        """Write the record ``outcome``, complete the file and give it its final name.
+
+        Returns
+        -------
+        The final name.
+
+        Raises
+        ------
+        SessionExistsError
+            If a file of that name has appeared meanwhile; the session then is complete under the
+            name with ``.part``.
+        """
+        mcap = self._begun()
+        with self._explained():
+            self._write_chunk(everything=True)
+            mcap.add_metadata("outcome", outcome)
+            mcap.finish()
+            self._sync()
+            self._check_place()
+            self._stream.close()
+            try:
+                rename_new(self.part, self.path)
+            except FileExistsError:
+                raise SessionExistsError(
+                    f"{self.path} has appeared while the session was recorded and is not "
+                    f"overwritten; the complete session is {self.part}, to be renamed."
+                ) from None
+            fsync_directory(self.path.parent)
+        return self.path
+
+    def abandon(self) -> Path | None:
+        """Write what has arrived and leave the ``.part`` as it is, without an end.
+
+        If it was removed, its contents, which live as long as it is open, are saved to the
+        nearest folder above that takes them.
+
+        Returns
+        -------
+        Where the contents are; None if they could not be saved.
+
+        Raises
+        ------
+        SessionError
+            If what has arrived could not be written; what was written before is kept.
+        """
+        if self._stream.closed:
+            return self.part
+        try:
+            if not self._failed:
+                with self._explained():
+                    if self._mcap is not None:
+                        self._write_chunk(everything=True)
+                    self._stream.flush()
+                    os.fsync(self._stream.fileno())
+        finally:
+            kept = self._kept()
+            with contextlib.suppress(OSError):  # the failure to write was reported already
+                self._stream.close()
+        return kept
+
+    def discard(self) -> None:
+        """Remove the ``.part`` of a session that was never begun."""
+        if self._mcap is not None:
+            raise RuntimeError("a session that was begun is kept")
+        self._stream.close()
+        with self._explained():
+            self.part.unlink(missing_ok=True)
+
+    def _check_place(self) -> None:
+        """Notice that the file has gone from under its name; writing to it would still succeed."""
+        if not self._is_in_place():
+            raise SessionError(
+                f"{self.part} was removed or moved while it was recorded. Leave the folder of a "
+                "running session alone."
+            )
+
+    def _is_in_place(self) -> bool:
+        try:
+            return os.path.samestat(self.part.stat(), os.fstat(self._stream.fileno()))
+        except OSError:
+            return False
+
+    def _kept(self) -> Path | None:
+        """Return where the contents are, saving them to another place if they have none."""
+        descriptor = self._stream.fileno()
+        if self._is_in_place():
+            return self.part
+        if os.fstat(descriptor).st_nlink:
+            with contextlib.suppress(OSError):
+                return Path(f"/proc/self/fd/{descriptor}").readlink()
+            return None
+        for folder in self.part.absolute().parents:
+            with contextlib.suppress(OSError):  # not there, not writable, full, name taken
+                copy = folder / self.part.name
+                copy_new(descriptor, copy)
+                return copy
+        return None
+
+    def _begun(self) -> McapWriter:
+        if self._mcap is None:
+            raise RuntimeError("begin() comes first")
+        if self._failed:
+            # Part of a record may have gone to the file: behind it nothing could be read.
+            raise SessionError(f"{self.part}: writing failed before, the recording ends there.")
+        return self._mcap
+
+    def _checked(self, block: Buffer, size: int) -> memoryview:
+        self._begun()
+        view = memoryview(block).cast("B")
+        if len(view) % size:
+            raise ValueError(
+                f"a block of {len(view)} bytes is not a whole number of {size}-byte messages"
+            )
+        return view
+
+    def _write_chunk(self, *, everything: bool) -> None:
+        """Write the messages at hand as a chunk.
+
+        Messages beside samples that have not arrived wait for them, unless `everything` is to go.
+        """
+        mcap = self._begun()
+        samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
+        controls = np.frombuffer(self._controls, CONTROL_WIRE_DTYPE)
+        timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
+        if not everything:
+            controls, timings = (
+                beside[: np.searchsorted(beside["t_ns"], samples["t_ns"][-1], side="right")]
+                for beside in (controls, timings)
+            )
+        parts: list[bytes] = []
+        indexes: dict[int, npt.NDArray[np.void]] = {}
+        offset = 0
+        for topic, wire in (
+            (SAMPLE_TOPIC, samples),
+            (CONTROL_TOPIC, controls),
+            (TIMING_TOPIC, timings),
+        ):
+            if len(wire):
+                channel, _ = _CHANNELS[topic]
+                records = _fixed_records(wire, channel, self._start_utc_ns)
+                parts.append(records.tobytes())
+                indexes[channel] = _fixed_index(records, offset)
+                offset += records.nbytes
+        if self._events:
+            channel, _ = _CHANNELS[EVENT_TOPIC]
+            events, indexes[channel] = _event_records(
+                self._events, channel, self._event_count, offset
+            )
+            parts.append(events)
+            self._event_count += len(self._events)
+        if indexes:
+            mcap.add_chunk(b"".join(parts), indexes)
+            self._stream.flush()
+            self._dirty = True
+        self._samples = bytearray()
+        self._controls = self._controls[controls.nbytes :]
+        self._timings = self._timings[timings.nbytes :]
+        self._events = []
+
+    def _sync_when_due(self) -> None:
+        if self._dirty and time.monotonic() - self._synced_at >= SYNC_INTERVAL_S:
+            self._sync()
+            self._check_place()
+
+    def _sync(self) -> None:
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._synced_at = time.monotonic()
+        self._dirty = False

@@ -1,0 +1,261 @@
+"""Drive and sensor of the simulated rig: what the plant does, as the devices would show it.
+
+The drive's latch, which comes first in a tick, moves the rig on to it; periods that the loop
+missed pass with the last torque held, as they do on a real rig.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import chain
+from operator import mul
+
+import numpy as np
+
+from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
+from rigd.devices.parameters import RigParameters, Simulation, WrenchSensor
+from rigd.sim._plant import SimulatedPlant
+
+_NAME = "Simulated drive"
+_NOISE_BLOCK = 128
+"""Readings drawn at a time, 50 µs of work in one tick; thousands would take a whole period."""
+
+
+def open_simulated_rig(rig: RigParameters) -> Devices:
+    """Make the devices of a simulated rig; a seed gives the same noise again."""
+    simulated = SimulatedRig(rig)
+    return Devices(
+        drive=SimulatedDrive(simulated, rig.rate_hz), sensor=simulated.sensor, simulated=True
+    )
+
+
+class SimulatedRig:
+    """Plant, encoder and sensor, moved on period by period.
+
+    A sensor that streams is sampled several times a period; then the plant goes in steps of its
+    records.
+
+    Parameters
+    ----------
+    rig
+        With a section ``simulation``; its delays are those of the plant and of the readings.
+
+    Attributes
+    ----------
+    plant, sensor
+        What moves, and what measures it.
+    records_per_period : int
+        Readings of the sensor in one period.
+    """
+
+    def __init__(self, rig: RigParameters) -> None:
+        if rig.simulation is None:
+            raise DeviceError(
+                "The profile has no section [simulation], which a simulated rig needs; copy it "
+                "from hw_profiles/sim.toml."
+            )
+        weights: tuple[float, ...] = (1.0,)
+        self.records_per_period = 1
+        if rig.ati_serial is not None:
+            weights = rig.ati_serial.weights(rig.rate_hz)
+            self.records_per_period = rig.ati_serial.records_per_tick(rig.rate_hz)
+            # The filter's own delay is part of what the profile states; the rest is the sensor's.
+            rest_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)
+            rig = replace(rig, sensor=replace(rig.sensor, delay_s=max(0.0, rest_s)))
+        rig = replace(rig, rate_hz=rig.rate_hz * self.records_per_period)
+        assert rig.simulation is not None
+        self.plant = SimulatedPlant(rig)
+        self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, weights)
+        self._resolution_rad = rig.encoder.resolution_rad
+
+    def advance(self, n_periods: int) -> None:
+        """Move on by whole periods, the torque held."""
+        if self.records_per_period == 1:
+            self.plant.advance(n_periods)
+            return
+        for _ in range(n_periods * self.records_per_period):
+            self.plant.advance(1)
+            self.sensor.sample()
+
+    def read_angle(self) -> float:
+        """Return the angle in whole encoder steps, in rad."""
+        angle_rad = self.plant.sensed_angle_rad
+        step_rad = self._resolution_rad
+        return round(angle_rad / step_rad) * step_rad if step_rad else angle_rad
+
+
+class SimulatedDrive:
+    """Torque-controlled drive with an incremental encoder."""
+
+    def __init__(self, rig: SimulatedRig, rate_hz: float) -> None:
+        self._rig = rig
+        self._plant = rig.plant
+        self._period_ns = 1e9 / rate_hz
+        self._due_ns: int | None = None
+        self._sto_dropped = False
+        self.read_angle = rig.read_angle
+        self.angle_stale = False
+        self.angle_time_ns = 0
+        self.off_doubt = ""
+
+    def connect(self) -> None:
+        """Nothing to connect to."""
+
+    def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
+        """Let commands through."""
+        if self._sto_dropped:
+            raise wired_stop_dropped(_NAME)
+        self._plant.enable()
+
+    def latch(self, due_ns: int) -> None:
+        """Move the rig on to the tick at ``due_ns``."""
+        if self._due_ns is not None:
+            self._rig.advance(round((due_ns - self._due_ns) / self._period_ns))
+        self._due_ns = self.angle_time_ns = due_ns
+
+    def command(self, torque_nm: float) -> float:
+        """Set the torque in N·m; a drive that is not enabled exerts none."""
+        self._plant.command(torque_nm)
+        return torque_nm
+
+    def health(self) -> LineHealth:
+        """Tell that there is no line."""
+        return LineHealth()
+
+    def disable(self) -> None:
+        """Zero the torque, and let no command through."""
+        self._plant.disable()
+        self.read_angle = self._rig.read_angle
+
+    @property
+    def sto_dropped(self) -> bool:
+        """Whether the wired stop is pressed; it may be set, and takes the torque away at once."""
+        return self._sto_dropped
+
+    @sto_dropped.setter
+    def sto_dropped(self, dropped: bool) -> None:
+        self._sto_dropped = dropped
+        if dropped and self._plant.enabled:
+            self._plant.disable()
+            self.read_angle = self._refuse
+
+    def _refuse(self) -> float:
+        raise wired_stop_dropped(_NAME)
+
+    def close(self) -> None:
+        """Disable."""
+        self.disable()
+
+
+class SimulatedSensor:
+    """Six-axis sensor with white noise, offset, limited resolution and range.
+
+    The coupling torque appears as the smallest wrench whose projection it is. Where the readings
+    are streamed, what is read is the last of them through the decimating filter.
+
+    Parameters
+    ----------
+    plant, sensor, simulation
+        What is measured, and how well.
+    weights
+        Of the last readings in what is read, oldest first; one weight: each reading is taken when
+        it is asked for.
+    """
+
+    def __init__(
+        self,
+        plant: SimulatedPlant,
+        sensor: WrenchSensor,
+        simulation: Simulation,
+        weights: tuple[float, ...] = (1.0,),
+    ) -> None:
+        self._plant = plant
+        self._weights = weights
+        self.records: deque[Wrench] = deque(maxlen=len(weights))
+        self._sensor = sensor
+        self._simulation = simulation
+        projection = np.array(sensor.projection)
+        per_torque = (projection / (projection @ projection)).tolist()
+        # Axes that the coupling torque does not reach show noise only, which is drawn, limited
+        # and quantised by the block; the others are finished tick by tick.
+        self._active = [
+            (axis, per_torque[axis], sensor.range[axis], sensor.resolution[axis])
+            for axis in range(6)
+            if per_torque[axis] != 0.0
+        ]
+        self._rows = chain.from_iterable(self._noise())
+        self._saturated = False  # since the last that was read
+        self.wrench_stale = False
+        self.wrench_time_ns = 0
+        self.wrench_saturated = False
+
+    def connect(self) -> None:
+        """Nothing to connect to."""
+
+    def calibration(self) -> dict[str, object]:
+        """Return what a real sensor would say of itself."""
+        return {
+            "device": "simulated force-torque sensor",
+            "axes": ["fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"],
+            "range": list(self._sensor.range),
+            "resolution": list(self._sensor.resolution),
+        }
+
+    def request(self, due_ns: int) -> None:
+        """Note the time; the drive's latch has moved the plant on."""
+        self.wrench_time_ns = due_ns
+
+    def read_wrench(self) -> Wrench:
+        """Return the wrench of this tick."""
+        if len(self._weights) == 1:
+            return self.measure()
+        while len(self.records) < len(self._weights):  # before the first period
+            self.sample()
+        self.wrench_saturated, self._saturated = self._saturated, False
+        fx, fy, fz, tx, ty, tz = (
+            sum(map(mul, self._weights, axis)) for axis in zip(*self.records, strict=True)
+        )
+        return fx, fy, fz, tx, ty, tz
+
+    def health(self) -> LineHealth:
+        """Tell that there is no line, and that all is well."""
+        return LineHealth(status=0)
+
+    def sample(self) -> None:
+        """Take a reading into the filter."""
+        self.records.append(self.measure())
+        self._saturated |= self.wrench_saturated
+
+    def measure(self) -> Wrench:
+        """Return a reading of this instant."""
+        row = next(self._rows)
+        torque_nm = self._plant.sensed_torque_nm
+        saturated = False
+        for axis, per_torque, limit, step in self._active:
+            value = row[axis] + per_torque * torque_nm
+            if not -limit < value < limit:
+                value = limit if value > 0 else -limit
+                saturated = True
+            row[axis] = round(value / step) * step if step else value
+        self.wrench_saturated = saturated
+        fx, fy, fz, tx, ty, tz = row
+        return fx, fy, fz, tx, ty, tz
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _noise(self) -> Iterator[list[list[float]]]:
+        """Yield blocks of rows, each an unloaded wrench."""
+        simulation = self._simulation
+        generator = np.random.default_rng(simulation.seed)
+        scale = np.array([simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3)
+        offset = np.array(simulation.offset)
+        limit = np.array(self._sensor.range)
+        step = np.array(self._sensor.resolution)
+        passive = [axis for axis in range(6) if axis not in {active[0] for active in self._active}]
+        quantised = [axis for axis in passive if step[axis] > 0]
+        while True:
+            block = offset + generator.standard_normal((_NOISE_BLOCK, 6)) * scale
+            block[:, passive] = np.clip(block[:, passive], -limit[passive], limit[passive])
+            block[:, quantised] = np.round(block[:, quantised] / step[quantised]) * step[quantised]
+            yield block.tolist()

@@ -1,0 +1,449 @@
+"""Physics of the simulated rig: motor, clamp and beam between two ticks.
+
+Motor and beam are one linear model, stepped exactly for torques that are constant between the
+instants at which commands arrive. Coulomb friction, saturation and delays stand round it. Nothing
+here quantises or adds noise: that is what the simulated devices do with the values at a tick.
+"""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam import (
+    CoupledModel,
+    Realisation,
+    couple,
+    held_inputs,
+    propagator,
+    realise,
+    with_filter,
+)
+from rigd.devices.parameters import RigParameters, Simulation
+from rigd.sim._air_brake import AirBrake
+
+Real = NDArray[np.float64]
+
+_OUTPUTS = 6
+"""Rows of a step beyond the state: angle, velocity, sensor torque, the same if the shaft did not
+accelerate, sensed angle, sensed torque."""
+
+_SAME_INSTANT_PERIODS = 1e-9
+
+_STENCIL = 4
+"""Readings through which the value between two of them is taken."""
+
+
+class SimulatedPlant:
+    """The rig that `parameters` describes, at rest at angle zero, drive off.
+
+    At tick k the caller reads the attributes, gives the torque of that tick to `command`, and calls
+    `advance` to be at the next tick.
+
+    Parameters
+    ----------
+    parameters
+        Of the rig. Delays may be any non-negative times, fractions of a period included.
+
+    Attributes
+    ----------
+    angle_rad, velocity_rad_s : float
+        Of the output shaft at this instant.
+    coupling_torque_nm : float
+        What an ideal sensor between motor and clamp measures at this instant, ``Γ + J_tool θ''``.
+        It jumps with the motor's torque. At a jump the mean of both sides is given, which is where
+        a band-limited signal passes, if the torque after it is known by now (an actuation delay of
+        at least one period); else the value just before it.
+    sensed_angle_rad, sensed_torque_nm : float
+        The same angle and torque `encoder.delay_s` and `sensor.delay_s` ago: what the devices have
+        to show at this tick.
+    enabled : bool
+        Whether the drive is on.
+
+    Raises
+    ------
+    RealisationError
+        If the beam's damping cannot be realised.
+
+    Notes
+    -----
+    Coulomb friction is constant over a period and implicit: the torque, of at most T_c, that takes
+    the shaft's speed at the period's end nearest to zero. A shaft so brought to rest is locked, and
+    the beam vibrates on a fixed root, until at the start of a period the torques on it exceed T_c.
+    """
+
+    __slots__ = (
+        "_air",
+        "_coulomb_nm",
+        "_direct_nm",
+        "_direct_share",
+        "_free",
+        "_friction_effects",
+        "_friction_nm",
+        "_friction_speed",
+        "_holding_beam_nm",
+        "_jump_gain",
+        "_locked",
+        "_peak_nm",
+        "_sensed_angles",
+        "_sensed_jump_gain",
+        "_sensed_torques",
+        "_share_before_switch",
+        "_states",
+        "_stuck",
+        "_torque_instant_share",
+        "_torque_nm",
+        "_torques",
+        "_vectors",
+        "angle_rad",
+        "coupling_torque_nm",
+        "enabled",
+        "sensed_angle_rad",
+        "sensed_torque_nm",
+        "velocity_rad_s",
+    )
+
+    def __init__(self, parameters: RigParameters) -> None:
+        period = 1 / parameters.rate_hz
+        periods, switch = _split(parameters.actuation.delay_s, period)
+        angle_periods, angle_age = _split(parameters.encoder.delay_s, period)
+        torque_periods, torque_age = _split(parameters.sensor.delay_s, period)
+        instants = (switch, period - angle_age, period - torque_age)
+
+        simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
+        beam = realise(
+            parameters.beam,
+            parameters.damping,
+            tip_mass_kg=simulation.tip_mass_kg,
+            root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
+        )
+        tool_inertia = parameters.sensor.tool_inertia_kg_m2
+        free = couple(
+            beam,
+            motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
+            viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
+            tool_inertia_kg_m2=tool_inertia,
+        )
+        # No torque turns an infinite inertia: the beam on a locked shaft.
+        locked = couple(beam, motor_inertia_kg_m2=np.inf, tool_inertia_kg_m2=tool_inertia)
+        filtered = simulation.torque_filter_hz > 0
+        if filtered:
+            free, locked = (
+                with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
+                for model in (free, locked)
+            )
+        self._air = _air(parameters, beam)
+        if self._air is not None:
+            (free, on_free), (locked, on_locked) = map(self._air.attached, (free, locked))
+        n = free.b.size
+        step = _step(free, locked.sensor_torque, period, *instants)
+        locked_step = _step(locked, locked.sensor_torque, period, *instants)
+
+        # A period's friction is known only after its step, from the speed reached without it. The
+        # outputs are then corrected at once, the state by a last column of the next step.
+        friction = -(step[:, n] + step[:, n + 1])
+        self._friction_effects: list[float] = friction[n:].tolist()
+        # A bound method of a matrix in column order: the quickest product of this size in numpy.
+        step = np.column_stack([step, step[:, :n] @ friction[:n]])
+        locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
+        points = 0
+        if self._air is not None:
+            points = len(self._air.speed)
+            held = _held(free, on_free, locked.sensor_torque, period, *instants[1:])
+            locked_held = _held(locked, on_locked, locked.sensor_torque, period, *instants[1:])
+            step, locked_step = (
+                np.vstack([whole := np.column_stack(parts), self._air.speed @ whole[:n]])
+                for parts in ((step, held), (locked_step, locked_held))
+            )
+            self._friction_speed = self._air.speed @ friction[:n]
+            self._direct_nm = 0.0
+            self._direct_share = 1 - free.sensor_torque_per_torque
+            self._torque_instant_share = 1 - torque_age / period
+        self._free = np.asfortranarray(step).dot
+        self._locked = np.asfortranarray(locked_step).dot
+
+        # Two vectors, in turn the input [state, torque before and after the switch, friction, force
+        # of the air] and the output [state, outputs, speeds in the air] of a step; each with the
+        # views a step needs.
+        here, there = np.zeros((2, n + _OUTPUTS + points))
+        self._vectors = tuple(
+            (vector, vector[: n + 3 + points], vector[n : n + _OUTPUTS]) for vector in (here, there)
+        )
+        self._states = n
+
+        self._coulomb_nm = parameters.motor.coulomb_nm
+        self._peak_nm = parameters.motor.peak_torque_nm
+        self._friction_nm = 0.0
+        self._stuck = self._coulomb_nm > 0
+        self._holding_beam_nm = 0.0
+        self._share_before_switch = switch / period
+        next_is_known = switch == 0 and periods > 0
+        self._jump_gain = 0.5 * free.sensor_torque_per_torque if next_is_known else 0.0
+        self._sensed_jump_gain = self._jump_gain if torque_age == 0 and not filtered else 0.0
+
+        self._torque_nm = 0.0
+        self._torques = deque([0.0] * (periods + 2), maxlen=periods + 2)
+        self._sensed_angles = deque([0.0] * (angle_periods + 1), maxlen=angle_periods + 1)
+        difference = simulation.clock_rate_difference
+        self._sensed_torques: deque[float] | OtherClock = (
+            OtherClock(torque_periods, -difference)
+            if difference
+            else deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
+        )
+        self.enabled = False
+        self.angle_rad = 0.0
+        self.velocity_rad_s = 0.0
+        self.coupling_torque_nm = 0.0
+        self.sensed_angle_rad = 0.0
+        self.sensed_torque_nm = 0.0
+
+    def enable(self) -> None:
+        """Switch the drive on; its torque is zero until the next command takes effect."""
+        self.enabled = True
+
+    def disable(self) -> None:
+        """Switch the drive off: no torque from this instant, commands on their way included."""
+        self.enabled = False
+        self._torque_nm = 0.0
+        self._torques.extend([0.0] * len(self._torques))
+
+    def command(self, torque_nm: float) -> None:
+        """Torque to exert from this tick on, after the actuation delay; limited to the peak.
+
+        Without effect while the drive is off.
+        """
+        if not self.enabled:
+            return
+        if torque_nm > self._peak_nm:
+            torque_nm = self._peak_nm
+        elif torque_nm < -self._peak_nm:
+            torque_nm = -self._peak_nm
+        self._torque_nm = torque_nm
+
+    def advance(self, n_periods: int = 1) -> None:
+        """Go to the tick `n_periods` from here, with the last command repeated at those between."""
+        n = self._states
+        torques = self._torques
+        for _ in range(n_periods):
+            torques.append(self._torque_nm)
+            before, after = torques[0], torques[1]
+            (vector, input_, _), (output, _, results) = self._vectors
+            vector[n] = before
+            vector[n + 1] = after
+            vector[n + 2] = self._friction_nm
+            self._vectors = self._vectors[1], self._vectors[0]
+            if self._air is not None:
+                self._air.hold(input_[n + 3 :])
+
+            share = self._share_before_switch
+            load = share * before + (1 - share) * after - self._holding_beam_nm
+            if self._stuck and abs(load) <= self._coulomb_nm:
+                self._locked(input_, output)
+                angle, _, torque, holding, sensed_angle, sensed_torque = results.tolist()
+                self._friction_nm = velocity = 0.0
+                free = False
+            else:
+                free = True
+                self._free(input_, output)
+                angle, velocity, torque, holding, sensed_angle, sensed_torque = results.tolist()
+                if self._jump_gain:
+                    jump = torques[2] - after
+                    torque += self._jump_gain * jump
+                    sensed_torque += self._sensed_jump_gain * jump
+                if self._coulomb_nm:
+                    effects = self._friction_effects
+                    friction = -velocity / effects[1]
+                    self._stuck = abs(friction) <= self._coulomb_nm
+                    if self._stuck:
+                        velocity = 0.0
+                    else:
+                        friction = self._coulomb_nm if friction > 0 else -self._coulomb_nm
+                        velocity += effects[1] * friction
+                    self._friction_nm = friction
+                    angle += effects[0] * friction
+                    torque += effects[2] * friction
+                    holding += effects[3] * friction
+                    sensed_angle += effects[4] * friction
+                    sensed_torque += effects[5] * friction
+            if self._air is not None:
+                torque, holding, sensed_torque = self._braked(
+                    output, free, torque, holding, sensed_torque
+                )
+            self._holding_beam_nm = holding
+            self._sensed_angles.append(sensed_angle)
+            self._sensed_torques.append(sensed_torque)
+        if n_periods > 0:
+            self.angle_rad = angle
+            self.velocity_rad_s = velocity
+            self.coupling_torque_nm = torque
+            self.sensed_angle_rad = self._sensed_angles[0]
+            self.sensed_torque_nm = self._sensed_torques[0]
+
+    def _braked(
+        self, output: Real, free: bool, torque: float, holding: float, sensed_torque: float
+    ) -> tuple[float, float, float]:
+        """Add what the force of the air does at once to the torques at the end of a step."""
+        assert self._air is not None
+        speed_m_s = output[self._states + _OUTPUTS :]
+        if free and self._friction_nm:
+            speed_m_s += self._friction_nm * self._friction_speed
+        before_nm = self._direct_nm
+        self._direct_nm = now_nm = self._air.feel(speed_m_s)
+        share = self._direct_share if free else 1.0
+        then_nm = before_nm + self._torque_instant_share * (now_nm - before_nm)
+        return torque + share * now_nm, holding + now_nm, sensed_torque + share * then_nm
+
+
+def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
+    simulation = parameters.simulation
+    if simulation is None or not simulation.air_drag_m:
+        return None
+    return AirBrake(parameters.beam, parameters.damping, beam, simulation.air_drag_m)
+
+
+def _split(delay_s: float, period_s: float) -> tuple[int, float]:
+    """Whole periods in a delay, and what is left of it in seconds."""
+    periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
+    rest = delay_s - periods * period_s
+    return periods, rest if rest > _SAME_INSTANT_PERIODS * period_s else 0.0
+
+
+def _step(
+    model: CoupledModel,
+    holding_torque: Real,
+    period_s: float,
+    switch_s: float,
+    angle_instant_s: float,
+    torque_instant_s: float,
+) -> Real:
+    """One period: from [state, torque before and after the switch] to [next state, outputs].
+
+    Parameters
+    ----------
+    model
+        Motor and beam.
+    holding_torque
+        (n,) row: sensor torque on a shaft that does not accelerate.
+    period_s
+        Length of the step.
+    switch_s
+        When the motor's torque changes, from the step's start.
+    angle_instant_s, torque_instant_s
+        Of which instants the sensed values are, from the step's start.
+
+    Returns
+    -------
+    (n + 6, n + 2)
+    """
+
+    def state_at(instant_s: float) -> Real:
+        phi, whole = propagator(model, instant_s)
+        after = propagator(model, max(instant_s - switch_s, 0.0))[1]
+        return np.column_stack([phi, whole - after, after])
+
+    def torque_at(instant_s: float) -> Real:
+        row = model.sensor_torque @ state_at(instant_s)
+        apart_s = instant_s - switch_s
+        if abs(apart_s) <= _SAME_INSTANT_PERIODS * period_s:
+            share_after = 0.5
+        else:
+            share_after = 1.0 if apart_s > 0 else 0.0
+        row[-2:] += model.sensor_torque_per_torque * np.array([1 - share_after, share_after])
+        return row
+
+    end = state_at(period_s)
+    return np.vstack(
+        [
+            *_told(model, end, torque_at(period_s), holding_torque),
+            model.angle @ state_at(angle_instant_s),
+            torque_at(torque_instant_s)
+            if model.sensed_torque is None
+            else model.sensed_torque @ state_at(torque_instant_s),
+        ]
+    )
+
+
+def _told(model: CoupledModel, end: Real, torque: Real, holding_torque: Real) -> tuple[Real, ...]:
+    """Rows of the state at a period's end, and of what is told of it beside the sensors."""
+    return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
+
+
+def _held(
+    model: CoupledModel,
+    of_force: Real,
+    holding_torque: Real,
+    period_s: float,
+    angle_instant_s: float,
+    torque_instant_s: float,
+) -> Real:
+    """One period under a held force of the air: what it adds to [next state, outputs].
+
+    Parameters
+    ----------
+    model
+        Motor and beam.
+    of_force
+        What the force adds to the state's derivative, (n, points).
+    holding_torque, period_s, angle_instant_s, torque_instant_s
+        As for `_step`.
+
+    Returns
+    -------
+    (n + 6, points)
+    """
+
+    def state_at(instant_s: float) -> Real:
+        return held_inputs(model, of_force, instant_s)
+
+    end = state_at(period_s)
+    return np.vstack(
+        [
+            *_told(model, end, model.sensor_torque @ end, holding_torque),
+            model.angle @ state_at(angle_instant_s),
+            model.sensor_torque @ state_at(torque_instant_s),
+        ]
+    )
+
+
+class OtherClock:
+    """Line of readings, appended at each tick, of which the first is the one to be seen.
+
+    Between ticks a cubic through the nearest four is taken.
+
+    Parameters
+    ----------
+    periods
+        Age of the first reading, in ticks.
+    growth
+        By which the age grows each tick, in ticks; not negative.
+    """
+
+    __slots__ = ("_age", "_growth", "_readings")
+
+    def __init__(self, periods: int, growth: float) -> None:
+        self._age = float(periods)
+        self._growth = growth
+        self._readings = [0.0] * (periods + _STENCIL)
+
+    def append(self, value: float) -> None:
+        """Take the reading of the next tick."""
+        self._age += self._growth
+        readings = self._readings
+        readings.append(value)
+        if len(readings) > self._age + _STENCIL:
+            del readings[0]
+
+    def __getitem__(self, index: int) -> float:
+        """Return the reading that is as old as the first has come to be (`index` 0)."""
+        assert index == 0
+        readings = self._readings
+        place = len(readings) - 1 - self._age
+        first = min(max(int(place) - 1, 0), len(readings) - _STENCIL)
+        x = place - first
+        a, b, c, d = readings[first : first + _STENCIL]
+        return (
+            -a * (x - 1) * (x - 2) * (x - 3) / 6
+            + b * x * (x - 2) * (x - 3) / 2
+            - c * x * (x - 1) * (x - 3) / 2
+            + d * x * (x - 1) * (x - 2) / 6
+        )

@@ -1,0 +1,519 @@
+"""``rigd simulate``: a simulated rig as a process of its own, on the wire.
+
+One thread, one loop: it waits for frames, for bytes of the serial line, and for the time to pass.
+The operator's commands come over the control socket.
+"""
+
+import fcntl
+import gc
+import json
+import math
+import os
+import select
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rigd.devices import SimulatorAddress, announce, described, find_simulator, forget
+from rigd.devices.contracts import DeviceError
+from rigd.devices.parameters import RigParameters
+from rigd.runtime import runtime_folder
+from rigd.sim import SimulatedRig
+from rigd.sim.wire._bus_simulation import World
+from rigd.sim.wire._faults import EventLog, Fault, FaultError, WrongUseError, parse_fault
+from rigd.sim.wire._links import (
+    Handlers,
+    Hub,
+    PtyLine,
+    VirtualCan,
+    is_virtual,
+    listen,
+    without_transport,
+)
+
+if TYPE_CHECKING:
+    from rigd.sim.wire._object_dictionary import DeviceFile
+
+__all__ = [
+    "DeviceError",
+    "SimulatorOptions",
+    "WrongUseError",
+    "check_on_wire",
+    "inject",
+    "parse_fault",
+    "run_simulator",
+]
+
+_LONGEST_SOCKET_NAME = 107
+_STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def only_one(rig_name: str) -> Iterator[None]:
+    """Refuse to start beside another simulated rig of the same name."""
+    folder = runtime_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock = (folder / f"{rig_name}.lock").open("w")
+    except OSError as error:
+        raise DeviceError(
+            f"The simulated rig cannot use the folder {folder} ({error.strerror}); set "
+            "XDG_RUNTIME_DIR to one that is yours."
+        ) from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            running = find_simulator(rig_name)
+            who = "" if running is None else f" (process {running.pid})"
+            raise DeviceError(
+                f"A simulated rig of the profile {rig_name} runs already{who}; end it first, or "
+                "use that one."
+            ) from None
+        # What a dead one left must go first: it names the sockets that are about to live again.
+        forget(rig_name)
+        yield
+
+
+@contextmanager
+def socket_folder(rig_name: str) -> Iterator[Path]:
+    """Make room for the sockets, whose names must be short."""
+    folder = runtime_folder()
+    if len(os.fsencode(folder / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short:
+        yield Path(short)
+
+
+@contextmanager
+def stop_requested() -> Iterator[Callable[[], bool]]:
+    """Say whether one of the signals that end the process has come; one ignored before stays so."""
+    requested: list[int] = []
+    before = {number: signal.getsignal(number) for number in _STOPPING}
+    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    for number in caught:
+        signal.signal(number, lambda got, _: requested.append(got))
+    try:
+        yield lambda: bool(requested)
+    finally:
+        for number in caught:
+            signal.signal(number, before[number])
+
+
+Answer = Callable[[dict[str, Any]], dict[str, Any]]
+"""Answers a request."""
+
+_LONGEST_LINE = 65_536
+_TIMEOUT_S = 2.0
+
+
+class ControlSocket:
+    """Answers requests of other processes, within the event loop.
+
+    Parameters
+    ----------
+    path
+        Of the Unix socket.
+    handlers
+        Of the event loop; kept up to date.
+    answer
+        Takes a request, returns the reply.
+    """
+
+    def __init__(self, path: Path, handlers: Handlers, answer: Answer) -> None:
+        self._handlers = handlers
+        self._answer = answer
+        self._links: dict[socket.socket, bytes] = {}
+        self._path = path
+        self._listener = listen(path)
+        handlers[self._listener.fileno()] = self._accept
+
+    def close(self) -> None:
+        """Answer no more."""
+        for link in list(self._links):
+            self._drop(link)
+        del self._handlers[self._listener.fileno()]
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            link, _ = self._listener.accept()
+            link.setblocking(False)
+            self._links[link] = b""
+            self._handlers[link.fileno()] = lambda: self._receive(link)
+
+    def _receive(self, link: socket.socket) -> None:
+        try:
+            fresh = link.recv(_LONGEST_LINE)
+        except BlockingIOError:
+            return
+        except OSError:
+            fresh = b""
+        *lines, rest = (self._links[link] + fresh).split(b"\n")
+        if not fresh or len(rest) > _LONGEST_LINE:
+            self._drop(link)
+            return
+        self._links[link] = rest
+        for line in lines:
+            with suppress(OSError):  # who asks and does not read gets no answer
+                link.send(json.dumps(self._reply(line)).encode() + b"\n")
+
+    def _reply(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+        except ValueError:
+            request = None
+        if not isinstance(request, dict):
+            return {"error": "A request is one line with one JSON object."}
+        return self._answer(request)
+
+    def _drop(self, link: socket.socket) -> None:
+        del self._links[link]
+        del self._handlers[link.fileno()]
+        link.close()
+
+
+def ask(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
+    """Ask a running simulator, and return its reply.
+
+    Raises
+    ------
+    DeviceError
+        If it does not answer, or refuses; then with its own words.
+    """
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
+            link.settimeout(_TIMEOUT_S)
+            link.connect(address.control_socket)
+            link.sendall(json.dumps(request).encode() + b"\n")
+            with link.makefile("rb") as lines:
+                reply = json.loads(lines.readline(_LONGEST_LINE))
+    except (OSError, ValueError) as error:
+        raise DeviceError(
+            f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."
+        ) from None
+    if not isinstance(reply, dict) or "error" in reply:
+        raise DeviceError(str(reply["error"] if isinstance(reply, dict) else reply))
+    return reply
+
+
+_IDLE_S = 0.01
+"""How often the loop looks up while nothing hurries."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorOptions:
+    """How a simulated rig is run."""
+
+    lock_step: bool = False
+    """Move on by one period a SYNC instead of by wall time."""
+    log: Path | None = None
+    """File of JSON lines, one an event; a new one."""
+    faults: tuple[Fault, ...] = ()
+    quiet: bool = False
+    """Tell nothing on the terminal."""
+    eds: Path | None = None
+    """The manufacturer's file of the drive that is simulated; by default the profile's, if any."""
+
+
+def check_on_wire(rig: RigParameters) -> None:
+    """Refuse a rig of which there is nothing to put on the wire.
+
+    Raises
+    ------
+    WrongUseError
+        If it has no drive on a bus.
+    """
+    if rig.cia402 is None or rig.can is None:
+        raise WrongUseError(
+            f"The profile {rig.name} has no drive on a bus (sections [can] and [cia402]): its "
+            "devices are simulated within a session, so there is nothing to put on the wire and "
+            "no fault to inject there. Take a profile of a rig with a bus, such as antenna_can."
+        )
+
+
+def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
+    """Run the simulated rig that stands in for a profile's, until a signal ends it.
+
+    Returns
+    -------
+    int
+        Exit code.
+
+    Raises
+    ------
+    WrongUseError
+        If the profile cannot be simulated on the wire, a fault is none that this rig can have, or
+        the log's name is taken.
+    DeviceError
+        If its simulated rig runs already, or if sockets or files cannot be made.
+    """
+    check_on_wire(rig)
+    if rig.devices.sensor != "ati_serial":
+        rig = replace(rig, ati_serial=None)  # a profile may describe more than it uses
+    with ExitStack() as stack:
+        stack.enter_context(only_one(rig.name))
+        log = EventLog(options.log, quiet=options.quiet)
+        stack.callback(log.close)
+        starting = stack.enter_context(ExitStack())
+        starting.callback(log.discard)
+        process = _Process(rig, options, log, stack)
+        stop = stack.enter_context(stop_requested())
+        process.start()
+        starting.pop_all()
+        process.serve(stop)
+    return 0
+
+
+def inject(rig_name: str, specs: list[str]) -> list[str]:
+    """Inject faults into the running simulated rig of a profile.
+
+    Returns
+    -------
+    list of str
+        The faults as it understood them; without any, lines on how it stands.
+
+    Raises
+    ------
+    DeviceError
+        If no simulated rig of that name runs, or it refuses.
+    WrongUseError
+        If a fault is not written as it should be; then none is injected.
+    """
+    address = find_simulator(rig_name)
+    if address is None:
+        raise DeviceError(
+            f"No simulated rig of the profile {rig_name} runs; start it with: rigd simulate "
+            f"--profile {rig_name}"
+        )
+    for spec in specs:
+        parse_fault(spec)  # all of them, before the first one happens
+    if not specs:
+        return [f"{name}: {value}" for name, value in ask(address, {"status": True}).items()]
+    return [str(ask(address, {"inject": spec})["injected"]) for spec in specs]
+
+
+class _Process:
+    """The lines to the outside, and the loop that serves them."""
+
+    def __init__(
+        self, rig: RigParameters, options: SimulatorOptions, log: EventLog, stack: ExitStack
+    ) -> None:
+        assert rig.can is not None
+        self._rig = rig
+        self._options = options
+        self._log = log
+        self._stack = stack
+        self._handlers: Handlers = {}
+        self._file: DeviceFile | None = None
+        assert rig.cia402 is not None
+        eds = options.eds or (Path(rig.cia402.eds) if rig.cia402.eds else None)
+        if eds is not None:
+            from rigd.sim.wire._object_dictionary import read_device
+
+            self._file = read_device(eds, rig.cia402.node_id)
+        folder = stack.enter_context(socket_folder(rig.name))
+        self._bus: Hub | VirtualCan
+        can_socket = ""
+        if rig.can.interface == "socketcan" and is_virtual(rig.can.channel):
+            self._bus = VirtualCan(rig.can.channel, self._handlers, self._on_frames)
+        else:
+            can_socket = str(folder / f"{rig.name}.can")
+            self._bus = Hub(Path(can_socket), self._handlers, self._on_frames, self._on_clients)
+        stack.callback(self._bus.close)
+        self._line: PtyLine | None = None
+        if rig.ati_serial is not None:
+            self._line = PtyLine(self._handlers, self._on_bytes, self._on_port)
+            stack.callback(self._line.close)
+        self._world = self._make_world()
+        control = ControlSocket(folder / f"{rig.name}.control", self._handlers, self._answer)
+        stack.callback(control.close)
+        self._address = SimulatorAddress(
+            pid=os.getpid(),
+            control_socket=str(folder / f"{rig.name}.control"),
+            can_socket=can_socket,
+            serial_port=self._port,
+            lock_step=options.lock_step,
+            rig=described(rig),
+        )
+
+    def start(self) -> None:
+        """Let the faults in that are there from the start, and say where the rig is."""
+        for fault in self._options.faults:
+            self._world.inject(fault)
+        started = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
+        self._log(
+            "simulator",
+            "started",
+            rig=self._rig.name,
+            lock_step=self._options.lock_step,
+            **({} if self._file is None else {"eds": self._file.name}),
+            **started,
+        )
+        for line in self._invitation():
+            self._log.tell(line)
+        announce(self._rig.name, self._address)
+        self._stack.callback(forget, self._rig.name)
+        # Set-up leaves objects that never go: no need to look through them again and again.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self._stack.callback(gc.enable)
+        if not self._options.lock_step:
+            # Replies in time while other processes work too; below every real-time loop. Of 2500
+            # replies on two busy cores 7 were late with it and 95 without.
+            with suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+
+    def serve(self, stop: Callable[[], bool]) -> None:
+        """Serve until a stop is asked for."""
+        handlers, world, line, log = self._handlers, self._world, self._line, self._log
+        now_ns = time.monotonic_ns
+        look_ns = 0
+        while not stop():
+            ready, _, _ = select.select(handlers, (), (), world.wait_s(now_ns(), _IDLE_S))
+            for descriptor in ready:
+                handler = handlers.get(descriptor)
+                if handler is not None:  # not closed by one of the others
+                    handler()
+            now = now_ns()
+            world.elapse(now)
+            if now > look_ns:
+                look_ns = now + round(_IDLE_S * 1e9)
+                log.flush()
+                if line is not None:
+                    line.look()
+        self._log("simulator", "ended")
+
+    def _make_world(self) -> World:
+        # Late: a process that only injects a fault needs none of it.
+        from rigd.sim.wire._drive_node import DriveNode
+
+        rig = self._rig
+        simulated = SimulatedRig(without_transport(rig))
+        line = self._line
+        world = World(
+            rig,
+            simulated,
+            lock_step=self._options.lock_step,
+            now_ns=time.monotonic_ns(),
+            send=self._bus.send,
+            write=_nowhere if line is None else line.write,
+            cut=self._cut,
+            mend=self._mend,
+            log=self._log,
+        )
+        assert rig.cia402 is not None
+        drive = DriveNode(
+            rig,
+            simulated,
+            world.step,
+            world.can_port("drive"),
+            self._log,
+            sync_timeout_s=self._sync_timeout_s(),
+            file=self._file,
+        )
+        world.join("drive", drive)
+        if rig.ati_serial is not None:
+            from rigd.sim.wire._ati_serial_device import AtiSerialDevice
+
+            world.join_serial(AtiSerialDevice(rig, simulated, world.serial_port(), self._log))
+        elif rig.ati_can is not None:
+            from rigd.sim.wire._ati_can_node import AtiCanNode
+
+            world.join("sensor", AtiCanNode(rig, simulated, world.can_port("sensor"), self._log))
+        return world
+
+    def _sync_timeout_s(self) -> float:
+        """How long the drive bears that no SYNC comes."""
+        drive = self._rig.cia402
+        assert drive is not None
+        if drive.own_watchdog_s:
+            return drive.own_watchdog_s
+        if self._file is not None and (0x1006, 0) not in self._file.entries:
+            return math.inf  # it is not told when to expect one
+        # How long others bear it is not known: as long as its heartbeat may stay away.
+        return drive.heartbeat_timeout_s
+
+    def _invitation(self) -> Iterator[str]:
+        address, rig = self._address, self._rig
+        assert rig.can is not None
+        mode = "one period a SYNC (lock-step)" if address.lock_step else "by wall time"
+        yield f"Simulated rig {rig.name}, {rig.rate_hz:g} Hz, {mode}; Ctrl-C ends it."
+        yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
+        if address.serial_port:
+            yield f"  serial   {address.serial_port}"
+        if self._file is not None:
+            objects = len({index for index, _ in self._file.entries})
+            yield f"  drive    as {self._file.name} has it, {objects} objects"
+        fast = " --fast" if address.lock_step else ""
+        yield f"  session  rigd run chirp --profile {rig.name}{fast}"
+        yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
+
+    def _on_frames(self, frames: list[bytes], origin: object) -> None:
+        self._world.hear(frames, origin, time.monotonic_ns())
+
+    def _on_bytes(self, data: bytes) -> None:
+        self._world.hear_serial(data)
+
+    def _on_clients(self, what: str, count: int) -> None:
+        self._log("bus", what, clients=count)
+        if count == 0:
+            self._world.left_alone(time.monotonic_ns())
+
+    def _on_port(self, is_open: bool) -> None:
+        self._log("line", "port opened" if is_open else "port closed")
+
+    def _cut(self, device: str) -> None:
+        if device == "bus":
+            self._bus.close()
+        elif self._line is not None:
+            self._line.close()
+
+    def _mend(self, device: str) -> None:
+        if device == "bus":
+            self._bus.open()
+        elif self._line is not None:
+            self._line.open()
+            # The line may be another one now: whoever comes has to find it.
+            self._address = replace(self._address, serial_port=self._port)
+            announce(self._rig.name, self._address)
+
+    @property
+    def _port(self) -> str:
+        return "" if self._line is None else self._line.port
+
+    def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        if "inject" in request:
+            try:
+                fault = parse_fault(str(request["inject"]))
+                self._world.inject(fault)
+            except (FaultError, DeviceError) as error:
+                return {"error": str(error)}
+            return {"injected": str(fault)}
+        if "status" in request:
+            return {
+                "rig": self._rig.name,
+                "drive": "default" if self._file is None else self._file.name,
+                "time_s": round(self._world.now_s, 6),
+                "lock_step": self._options.lock_step,
+                "moved_periods": self._world.moved,
+                "syncs": self._world.syncs,
+                "clients": self._bus.clients,
+                "lost_frames": self._bus.lost,
+                "lost_bytes": 0 if self._line is None else self._line.lost,
+                "disturbed": self._world.disturbed,
+            }
+        return {"error": "A request has to be 'inject' or 'status'."}
+
+
+def _nowhere(data: bytes) -> None:
+    """Take what a rig without a serial line never writes."""

@@ -1,0 +1,296 @@
+"""The antenna in 3D: its motor, and the beam as it turns and bends, seen from behind the motor.
+
+The bend is computed, from the measured angle and the exact model; no sensor sees it.
+
+Lengths are drawn in beam lengths, so that every antenna fills the same picture. The beam points
+along x and the motor turns it about z. What moves it across is drawn larger than it is, angle and
+bend by the same factor: so nodes stay where they are, and a tip that rests is drawn at rest.
+"""
+
+import collections
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.beam import Beam, Damping, DeflectionFilter, undamped_frequencies_rad_s
+from rigd.view._plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Color
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+    from rerun import RecordingStream
+
+    from rigd.view._scene import Drawing
+    from rigd.view._session_info import Subject
+
+Records = npt.NDArray[Any]
+Real = npt.NDArray[np.float64]
+_Moment = tuple[int, npt.NDArray[np.float32]]
+"""Time since the start of the session in ns, and lines (n, points, 3) as they are drawn then."""
+
+ANTENNA: Final = "/antenna"
+BEAM: Final = f"{ANTENNA}/beam"
+TRAIL: Final = f"{ANTENNA}/trail"
+LABEL: Final = f"{ANTENNA}/label"
+
+FACTOR: Final = 2.0
+"""How many times larger than it is motion across the beam is drawn.
+
+The paper's chirp turns the motor by 25 mrad, and when it passes the first resonance the tip swings
+by a third of the beam's length: the one is still seen, the other still in the picture.
+"""
+TITLE: Final = f"Antenna, its motion drawn × {FACTOR:g}"
+
+DRAWN_HZ: Final = 20.0
+TRAIL_S: Final = 0.5
+"""For this long each drawn shape stays in the picture: they show where it swings and where not."""
+
+_LOOKS_HZ: Final = 100.0
+"""How often the tip is looked at for its largest deflection."""
+_SELDOM_HZ: Final = 4.0
+"""How often what is not looked at that closely is sent: the label, and the trail."""
+_LONGEST_GAP_S: Final = 10.0
+"""Of samples that are missing, no more than this is made up."""
+_ASSUMED_DAMPING_RATIO: Final = 2e-3
+"""Of the first mode, where the profile tells no damping; the least of the paper's fits has half."""
+
+_HOUSING: Color = (105, 110, 120)
+_METAL: Color = (140, 145, 155)
+_PAST: Color = (70, 115, 145)
+
+
+class Antenna:
+    """Follows the beam of one session and draws it.
+
+    Parameters
+    ----------
+    subject
+        The session.
+    """
+
+    def __init__(self, subject: "Subject") -> None:
+        damping = subject.damping or _small_damping(subject.beam)
+        self._filter = DeflectionFilter(subject.beam, damping, subject.rate_hz)
+        self._rate_hz = subject.rate_hz
+        self._length_m = subject.beam.length_m
+        self._look_ticks = max(1, round(subject.rate_hz / _LOOKS_HZ))
+        looks_hz = subject.rate_hz / self._look_ticks
+        self._looks_a_drawing = math.ceil(looks_hz / DRAWN_HZ)
+        self._seldom_looks = math.ceil(looks_hz / _SELDOM_HZ)
+        self._looks = 0
+        lately = max(1, round(looks_hz * TRAIL_S))
+        self._tips_m: collections.deque[float] = collections.deque(maxlen=lately)
+        self._newest: tuple[int, Real] | None = None  # tick; time and angle
+        self._waiting: Real = np.zeros((0, 2))  # times and angles since the last look
+        self._trail: list[_Moment] = []  # not yet sent
+
+    def frame(self) -> list["Drawing"]:
+        """Return what stays as it is."""
+        return static_drawings()
+
+    def samples(self, samples: Records) -> list["Drawing"]:
+        """Take samples (n,) of ``SAMPLE_DTYPE``, in order; across gaps the angle is interpolated.
+
+        What comes back draws the beam at 20 moments a second.
+        """
+        if len(samples) == 0:
+            return []
+        samples = np.concatenate([self._waiting, self._at_every_tick(samples)])
+        looks = len(samples) // self._look_ticks
+        self._waiting = samples[looks * self._look_ticks :]
+        moments: list[_Moment] = []
+        labels: list[Drawing] = []
+        for look in samples[: looks * self._look_ticks].reshape(looks, self._look_ticks, 2):
+            deflection_m = self._filter.feed(look[:, 1])
+            self._tips_m.append(abs(float(deflection_m[-1])))
+            self._looks += 1
+            t_ns, angle_rad = int(look[-1, 0]), float(look[-1, 1])
+            if self._looks % self._looks_a_drawing == 0:
+                moments.append((t_ns, lines(angle_rad, deflection_m / self._length_m)))
+            if self._looks % self._seldom_looks == 0:
+                labels.append(partial(_draw_label, t_ns=t_ns, tip_m=max(self._tips_m)))
+        self._trail += [(t_ns, beam_and_line[1:]) for t_ns, beam_and_line in moments]
+        drawings: list[Drawing] = []
+        if moments:
+            drawings.append(partial(_draw_lines, entity=BEAM, moments=moments))
+        if labels and self._trail:
+            drawings.append(partial(_draw_lines, entity=TRAIL, moments=self._trail))
+            self._trail = []
+        return drawings + labels
+
+    def _at_every_tick(self, samples: Records) -> Real:
+        """Fill gaps; return times in ns and angles in rad since the sample before, (n, 2)."""
+        ticks = samples["tick"].astype(np.int64)
+        values = np.column_stack([samples["t_ns"], samples["angle_rad"]])
+        tick, value = self._newest or (int(ticks[0]) - 1, values[0])
+        self._newest = int(ticks[-1]), values[-1]
+        steps = np.minimum(np.diff(ticks, prepend=tick), round(_LONGEST_GAP_S * self._rate_hz))
+        if np.all(steps == 1):
+            return values
+        places, values = np.cumsum(np.append(0, steps)), np.vstack([value, values])
+        every = np.arange(1, places[-1] + 1)
+        return np.column_stack([np.interp(every, places, column) for column in values.T])
+
+
+def view() -> "rrb.Spatial3DView":
+    """Return the view, for the layout."""
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial3DView(
+        name=TITLE,
+        origin=ANTENNA,
+        line_grid=rrb.LineGrid3D(spacing=0.1, color=(*GREY, 16)),
+        # From above and behind the motor: positive angles turn to the left.
+        eye_controls=rrb.EyeControls3D(
+            position=(-0.30, 0.0, 1.05), look_target=(0.45, 0.0, -0.03), eye_up=(0.0, 0.0, 1.0)
+        ),
+        overrides={
+            TRAIL: rrb.VisibleTimeRanges(
+                timeline=TIMELINE,
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
+                end=rrb.TimeRangeBoundary.cursor_relative(),
+            )
+        },
+    )
+
+
+def static_drawings() -> list["Drawing"]:
+    """Return what stays as it is: the motor, and how that looks which moves."""
+    return [_draw_motor, _draw_direction, _draw_styles]
+
+
+def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
+    """Return the undeformed line and the beam as they are drawn, in beam lengths.
+
+    Parameters
+    ----------
+    angle_rad
+        Of the motor.
+    deflection
+        Shape (points,), evenly along the beam, relative to the line that its root points along; in
+        beam lengths.
+
+    Returns
+    -------
+    lines
+        Shape (2, points, 3): the line, the beam; x, y, z of their points.
+    """
+    x = np.linspace(0.0, 1.0, deflection.size)
+    drawn = np.zeros((2, x.size, 3), dtype=np.float32)
+    drawn[:, :, 0] = x
+    drawn[0, :, 1] = FACTOR * angle_rad * x
+    drawn[1, :, 1] = FACTOR * (angle_rad * x + deflection)
+    return drawn
+
+
+def label(tip_m: float) -> str:
+    """Return what is said of the tip's deflection, to two figures or 0.1 mm."""
+    tip_mm = 1e3 * tip_m
+    text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
+    return f"tip bends ± {text} mm, drawn × {FACTOR:g}"
+
+
+def _small_damping(beam: Beam) -> Damping:
+    first_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
+    return Damping(zeta=2 * _ASSUMED_DAMPING_RATIO / first_rad_s)
+
+
+def _draw_motor(stream: "RecordingStream") -> None:
+    """Draw, from below, the mount, the housing, the shaft and the hub that clamps the beam."""
+    import rerun as rr
+
+    stream.log(
+        f"{ANTENNA}/mount",
+        rr.Boxes3D(
+            centers=[(0, 0, -0.2)],
+            half_sizes=[(0.1, 0.1, 0.01)],
+            colors=[_METAL],
+            fill_mode="solid",
+        ),
+        static=True,
+    )
+    stream.log(
+        f"{ANTENNA}/motor",
+        rr.Cylinders3D(
+            centers=[(0, 0, -0.12), (0, 0, -0.035), (0, 0, 0)],
+            lengths=[0.14, 0.05, 0.03],
+            radii=[0.075, 0.025, 0.04],
+            colors=[_HOUSING, _METAL, ORANGE],
+            fill_mode="solid",
+        ),
+        static=True,
+    )
+    axis = [(0, 0, -0.3), (0, 0, 0.2)]
+    stream.log(
+        f"{ANTENNA}/axis",
+        rr.LineStrips3D([axis], colors=[GREY], radii=rr.Radius.ui_points(0.5)),
+        static=True,
+    )
+
+
+def _draw_direction(stream: "RecordingStream") -> None:
+    """Draw an arrow that turns as positive angles do."""
+    import rerun as rr
+
+    angle = np.linspace(0.35, 1.05, 15)
+    arc = 0.2 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(angle.size)])
+    end = arc[-1]
+    back, out = 0.15 * np.array([end[1], -end[0], 0.0]), 0.075 * end
+    stream.log(
+        f"{ANTENNA}/positive",
+        rr.LineStrips3D(
+            [arc, [end + back + out, end, end + back - out]],
+            colors=[GREY],
+            radii=rr.Radius.ui_points(0.75),
+        ),
+        static=True,
+    )
+    stream.log(
+        f"{ANTENNA}/positive/sign",
+        rr.Points3D([1.25 * end], radii=[0.0], colors=[GREY], labels=["+"], show_labels=True),
+        static=True,
+    )
+
+
+def _draw_styles(stream: "RecordingStream") -> None:
+    """Send once what is the same at all moments: colours, widths, where the label stands."""
+    import rerun as rr
+
+    for entity, colors, widths in ((BEAM, [GREY, SKY_BLUE], [1.0, 2.5]), (TRAIL, [_PAST], [0.6])):
+        style = rr.LineStrips3D.from_fields(colors=colors, radii=rr.Radius.ui_points(widths))
+        stream.log(entity, style, static=True)
+    beyond_the_tip = [(1.25, 0.0, 0.0)]
+    stream.log(
+        LABEL,
+        rr.Points3D.from_fields(
+            positions=beyond_the_tip, radii=[0.0], colors=[SKY_BLUE], show_labels=True
+        ),
+        static=True,
+    )
+
+
+def _draw_lines(stream: "RecordingStream", entity: str, moments: Sequence[_Moment]) -> None:
+    import rerun as rr
+
+    t_ns = np.array([t_ns for t_ns, _ in moments])
+    strips = np.concatenate([strips for _, strips in moments])
+    count = len(strips) // len(moments)
+    # Put together by hand: Rerun's own way of making columns takes three times as long.
+    column = rr.ComponentColumn(
+        rr.LineStrips3D.descriptor_strips(),
+        rr.components.LineStrip3DBatch(strips),
+        offsets=np.arange(0, len(strips) + 1, count, dtype=np.int32),
+    )
+    time = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
+    stream.send_columns(entity, [time], [column], strict=True)
+
+
+def _draw_label(stream: "RecordingStream", t_ns: int, tip_m: float) -> None:
+    """Say how far the tip really bends."""
+    import rerun as rr
+
+    stream.set_time(TIMELINE, duration=1e-9 * t_ns)
+    stream.log(LABEL, rr.Points3D.from_fields(labels=[label(tip_m)]))

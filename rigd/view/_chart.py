@@ -1,0 +1,412 @@
+"""Fewer points of a curve without losing a peak of it.
+
+Charts whose horizontal axis is not time, drawn on a canvas.
+
+Rerun plots over time only. A view of two-dimensional things shows a canvas of any size, and keeps
+its aspect; so each chart has the size in points that its view has in a window of 1280 × 800, and
+is scaled with it from there. Text keeps its size whatever the scale.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.view._plots import GREY, Color
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+Real = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinning:
+    """Points of a grid, gathered in groups of which the extremes are kept.
+
+    Attributes
+    ----------
+    grid
+        (n,) of increasing values.
+    groups
+        (k, m) indices into the grid, each group filled up with its first one.
+    """
+
+    grid: Real
+    groups: npt.NDArray[np.intp]
+
+    @classmethod
+    def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
+        """Gather points from `first` to `last` in groups of equal ratio, leaving out empty ones."""
+        edges = np.geomspace(first, last, groups + 1)
+        # A point at the very end belongs to the last group.
+        edges[-1] = np.nextafter(last, np.inf)
+        bounds = np.unique(np.searchsorted(grid, edges))
+        starts, sizes = bounds[:-1], np.diff(bounds)
+        offsets = np.arange(sizes.max(initial=0))
+        return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
+
+    def strips(self, values: Real) -> list[Real]:
+        """Return the curve as strips (p, 2) of grid point and value, broken where values are NaN.
+
+        Of every group the least and the greatest value are kept, where they are.
+
+        Parameters
+        ----------
+        values
+            (n,) on the grid.
+        """
+        grouped = values[self.groups]
+        unknown = np.isnan(grouped)
+        rows = np.flatnonzero(~unknown.all(axis=1))
+        if rows.size == 0:
+            return []
+        grouped, unknown = grouped[rows], unknown[rows]
+        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
+        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
+        pair = np.sort(np.stack([least, greatest], axis=1), axis=1)
+        kept = np.take_along_axis(self.groups[rows], pair, axis=1)
+        breaks = np.flatnonzero(np.diff(rows) > 1) + 1
+        return [
+            np.column_stack([self.grid[part], values[part]])
+            for part in (_without_repeats(piece.ravel()) for piece in np.split(kept, breaks))
+        ]
+
+
+def _without_repeats(indices: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Leave out what follows itself: where a group has but one point."""
+    kept: npt.NDArray[np.intp] = indices[np.insert(np.diff(indices) != 0, 0, True)]
+    return kept
+
+
+_LEFT, _TOP, _BOTTOM = 62.0, 44.0, 54.0
+"""Room for the tick labels and titles beside the frame, in points."""
+_RIGHT = 24.0
+_TITLE_RISE = 27.0
+"""Of the middle of titles and legend above the frame, in points."""
+
+_LABEL_DROP = 12.0
+"""How far Rerun puts the middle of a label under its point, in points."""
+_CHARACTER = 6.7
+"""Mean width of a character of a label, in points."""
+_DOT_SPACING = 6.0
+_SHADE_OPACITY = 0.18
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """What runs along one side of a chart.
+
+    Attributes
+    ----------
+    title
+        With its unit.
+    first, last
+        Values at its ends.
+    ticks
+        Values that have a label.
+    lines
+        Values that have a line of the grid only.
+    logarithmic
+        Whether equal ratios are equally long.
+    """
+
+    title: str
+    first: float
+    last: float
+    ticks: tuple[float, ...]
+    lines: tuple[float, ...] = ()
+    logarithmic: bool = False
+
+    def fraction(self, values: npt.ArrayLike) -> Real:
+        """Return where values are along the axis: 0 at its first, 1 at its last, never beyond."""
+        found, first, last = np.asarray(values, dtype=np.float64), self.first, self.last
+        if self.logarithmic:
+            found, first, last = np.log(np.maximum(found, first)), np.log(first), np.log(last)
+        return np.clip((found - first) / (last - first), 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """An entry of a chart's legend.
+
+    Attributes
+    ----------
+    label
+        What it stands for.
+    color, width
+        Of the line, the width in points.
+    is_area
+        Whether it is a shade and no line.
+    """
+
+    label: str
+    color: Color
+    width: float = 1.5
+    is_area: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A frame with two axes on a canvas.
+
+    Attributes
+    ----------
+    entity
+        Where Rerun keeps it.
+    width, height
+        Of the canvas, in points.
+    x, y
+        Its axes.
+    legend
+        In the order it is read.
+    left, right
+        Room beside the frame, in points.
+    """
+
+    entity: str
+    width: float
+    height: float
+    x: Axis
+    y: Axis
+    legend: tuple[Key, ...] = ()
+    left: float = _LEFT
+    right: float = _RIGHT
+
+    @property
+    def frame(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom of the frame on the canvas, which counts down from the top.
+
+        Rerun's canvases do.
+        """
+        return self.left, _TOP, self.width - self.right, self.height - _BOTTOM
+
+    def place(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Real:
+        """Return where points are on the canvas, (n, 2), from values (n,) of either axis.
+
+        What lies beyond an axis is put at its end.
+        """
+        left, top, right, bottom = self.frame
+        across, up = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
+        return np.stack([left + (right - left) * across, bottom - (bottom - top) * up], axis=-1)
+
+    def draw_frame(self, stream: "RecordingStream") -> None:
+        """Draw frame, grid, tick labels, titles and legend, which stay as they are."""
+        import rerun as rr
+
+        left, top, right, bottom = self.frame
+        corners = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
+        stream.log(
+            f"{self.entity}/frame",
+            rr.LineStrips2D(
+                [corners], colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=1.0
+            ),
+            static=True,
+        )
+        self._draw_grid(stream)
+        self._draw_labels(stream)
+        self._draw_legend(stream)
+
+    def tick_labels(self) -> list[tuple[str, float, float]]:
+        """Return text and place of the middle of every tick's label on the canvas."""
+        left, _, _, bottom = self.frame
+        return [
+            (number(tick), float(self.place(tick, self.y.first)[0]), bottom + 14.0)
+            for tick in self.x.ticks
+        ] + [
+            (number(tick), left - 26.0, float(self.place(self.x.first, tick)[1]))
+            for tick in self.y.ticks
+        ]
+
+    def draw_curve(
+        self,
+        stream: "RecordingStream",
+        name: str,
+        strips: Sequence[Real],
+        key: Key,
+        *,
+        static: bool = False,
+    ) -> None:
+        """Draw lines through points (n, 2) of the two axes, each strip by itself."""
+        import rerun as rr
+
+        stream.log(
+            f"{self.entity}/{name}",
+            rr.LineStrips2D(
+                [self.place(strip[:, 0], strip[:, 1]) for strip in strips],
+                colors=[key.color],
+                radii=rr.Radius.ui_points(key.width / 2),
+                # Beneath whatever is drawn as it comes.
+                draw_order=20.0 if static else 30.0,
+            ),
+            static=static,
+        )
+
+    def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
+        """Write a text into the middle of the frame; an empty one takes it away."""
+        import rerun as rr
+
+        left, top, right, bottom = self.frame
+        middle = [(left + right) / 2, (top + bottom) / 2 - _LABEL_DROP]
+        stream.log(
+            f"{self.entity}/note",
+            rr.Points2D(
+                [middle] if text else [],
+                labels=[text] if text else [],
+                colors=[color],
+                radii=0.0,
+                show_labels=True,
+                draw_order=40.0,
+            ),
+        )
+
+    def draw_shade(self, stream: "RecordingStream", name: str) -> None:
+        """Draw what `move_shade` moves: two-dimensional views fill nothing but images."""
+        import rerun as rr
+
+        pixel = np.array([[GREY]], dtype=np.uint8)
+        stream.log(
+            f"{self.entity}/{name}",
+            # Of all there is, images alone are shown as transparent as they are said to be.
+            rr.Image(
+                bytes=pixel.tobytes(),
+                width=1,
+                height=1,
+                color_model="RGB",
+                datatype=np.uint8,
+                opacity=_SHADE_OPACITY,
+            ),
+            static=True,
+        )
+
+    def move_shade(self, stream: "RecordingStream", name: str, first: float, last: float) -> None:
+        """Shade the chart between two values of its horizontal axis, and nowhere else."""
+        _, top, _, bottom = self.frame
+        left, right = self.place([first, last], self.y.first)[:, 0]
+        self._put_shade(stream, name, (left, top, right, bottom))
+
+    def _draw_labels(self, stream: "RecordingStream") -> None:
+        import rerun as rr
+
+        left, top, right, bottom = self.frame
+        middle = (left + right) / 2
+        labels = [
+            *self.tick_labels(),
+            (self.y.title, left - 44.0 + _width(self.y.title) / 2, top - _TITLE_RISE),
+        ]
+        if self.x.title:
+            labels.append((self.x.title, middle, bottom + 40.0))
+        labels += [(key.label, x + _width(key.label) / 2, y) for key, x, y in self._legend()]
+        stream.log(
+            f"{self.entity}/labels",
+            rr.Points2D(
+                [[x, y - _LABEL_DROP] for _, x, y in labels],
+                labels=[text for text, _, _ in labels],
+                colors=[GREY] * (len(labels) - len(self.legend))
+                + [key.color for key in self.legend],
+                radii=0.0,
+                show_labels=True,
+            ),
+            static=True,
+        )
+
+    def _draw_grid(self, stream: "RecordingStream") -> None:
+        """Draw dotted lines: lines are opaque, and whole ones too strong beside the curves."""
+        import rerun as rr
+
+        left, top, right, bottom = self.frame
+        verticals = self.place([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
+        horizontals = self.place(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
+        dots = [
+            *([x, y] for x in verticals for y in np.arange(bottom, top, -_DOT_SPACING)),
+            *([x, y] for y in horizontals for x in np.arange(left, right, _DOT_SPACING)),
+        ]
+        stream.log(
+            f"{self.entity}/grid",
+            rr.Points2D(dots, colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=0.5),
+            static=True,
+        )
+
+    def _draw_legend(self, stream: "RecordingStream") -> None:
+        import rerun as rr
+
+        lines = [entry for entry in self._legend() if not entry[0].is_area]
+        if lines:
+            stream.log(
+                f"{self.entity}/legend",
+                rr.LineStrips2D(
+                    [[[x - 28.0, y], [x - 10.0, y]] for _, x, y in lines],
+                    colors=[key.color for key, _, _ in lines],
+                    radii=rr.Radius.ui_points([key.width / 2 for key, _, _ in lines]),
+                ),
+                static=True,
+            )
+        for key, x, y in self._legend():
+            if key.is_area:
+                name = f"legend/{key.label.replace(' ', '_')}"
+                self.draw_shade(stream, name)
+                self._put_shade(stream, name, (x - 28.0, y - 7.0, x - 10.0, y + 7.0), static=True)
+
+    def _put_shade(
+        self,
+        stream: "RecordingStream",
+        name: str,
+        corners: tuple[float, float, float, float],
+        *,
+        static: bool = False,
+    ) -> None:
+        """Put a shade between left, top, right and bottom of the canvas."""
+        import rerun as rr
+
+        left, top, right, bottom = corners
+        stream.log(
+            f"{self.entity}/{name}",
+            rr.Transform3D.from_fields(
+                translation=[left, top, 0.0], scale=[right - left, bottom - top, 1.0]
+            ),
+            static=static,
+        )
+
+    def _legend(self) -> list[tuple[Key, float, float]]:
+        """Return the entries and where their texts begin: above the frame, up to its right end."""
+        _, top, right, _ = self.frame
+        entries = []
+        x = right
+        for key in reversed(self.legend):
+            x -= _width(key.label)
+            entries.append((key, x, top - _TITLE_RISE))
+            x -= 46.0
+        return entries[::-1]
+
+
+def number(value: float) -> str:
+    """Return a number as a tick label has it."""
+    return f"{value + 0.0:.9g}".replace("-", "−")  # adding makes −0 to 0
+
+
+def _width(text: str) -> float:
+    return _CHARACTER * len(text)
+
+
+def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return ticks and grid lines of a logarithmic axis: at 1, 2 and 5 of each decade, at all."""
+    exponents = range(int(np.floor(np.log10(first))), int(np.ceil(np.log10(last))) + 1)
+    found = [
+        (digit, float(f"{digit}e{exponent}")) for exponent in exponents for digit in range(1, 10)
+    ]
+    inside = [(digit, value) for digit, value in found if first <= value <= last]
+    return (
+        tuple(value for digit, value in inside if digit in (1, 2, 5)),
+        tuple(value for digit, value in inside if digit not in (1, 2, 5)),
+    )
+
+
+def steps(first: float, last: float, most: int) -> tuple[float, ...]:
+    """Return round values from `first` to `last`, `most` of them at the most."""
+    least = (last - first) / most
+    scale = 10.0 ** np.floor(np.log10(least))
+    step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least)
+    begin, end = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
+    return tuple(float(f"{value:.9g}") for value in step * np.arange(begin, end + 1))

@@ -1,0 +1,408 @@
+"""Frequency response and spectrogram as they grow, with the nominal model."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.beam import Damping, transfer
+from rigd.session import Status
+from rigd.spectral import RunningEstimate, RunningResponse
+from rigd.view._chart import Axis, Chart, Key, Thinning, decades, steps
+from rigd.view._plots import GREEN, GREY, ORANGE, SKY_BLUE, TIMELINE
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+    from rigd.spectral import FrequencyResponse, RunningEstimate
+    from rigd.view._session_info import Subject
+
+_HELD: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
+
+
+class SweepResponse:
+    """Estimate of torque over angle: Welch's, with the segments that `analyze` takes by default.
+
+    Parameters
+    ----------
+    subject
+        The session.
+    last_hz
+        Up to where the response is wanted.
+    """
+
+    def __init__(self, subject: "Subject", last_hz: float) -> None:
+        self._first, end = subject.sweep
+        self._running = RunningResponse(subject.rate_hz, end - self._first, last_hz=last_hz)
+        self._at_rest: list[npt.NDArray[np.float64]] = []
+        self._rest_rad: float | None = None
+
+    def feed(self, samples: npt.NDArray[Any]) -> None:
+        """Take samples (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps."""
+        ticks = samples["tick"].astype(np.int64) - self._first
+        before = int(np.searchsorted(ticks, 0))
+        if before:
+            self._at_rest.append(samples["angle_rad"][:before].copy())
+        if before == len(samples):
+            return
+        # A constant angle asks no torque of the beam, but would leak into the lowest bins.
+        if self._rest_rad is None:
+            self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
+            self._at_rest = []
+        swept = samples[before:]
+        # What is held from an earlier tick is no measurement: the gap is filled like any other.
+        known = np.where(swept["status"] & _HELD, np.nan, 1.0)
+        self._running.feed(
+            ticks[before:],
+            swept["angle_reference_rad"] - self._rest_rad,
+            (swept["angle_rad"] - self._rest_rad) * known,
+            swept["coupling_torque_nm"],
+        )
+
+    def estimate(self) -> RunningEstimate | None:
+        """Return what is known so far, None as long as that is too little."""
+        return self._running.estimate()
+
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+FIRST_HZ: Final = 0.5
+"""Below, the torque that moves an antenna is lost in the sensor's noise."""
+LAST_HZ: Final = 60.0
+"""Beyond what the paper's chirp excites, and its third mode."""
+
+OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
+MAGNITUDE: Final = "/frequency_response/magnitude"
+PHASE: Final = "/frequency_response/phase"
+COHERENCE: Final = "/frequency_response/coherence"
+SIZES: Final = {
+    OVERVIEW_MAGNITUDE: (690.0, 340.0),
+    MAGNITUDE: (1280.0, 374.0),
+    PHASE: (640.0, 274.0),
+    COHERENCE: (640.0, 274.0),
+}
+"""Width and height of the canvases, in points."""
+
+MEASURED_KEY: Final = Key("measured", SKY_BLUE)
+MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
+COHERENCE_KEY: Final = Key("coherence", GREEN)
+NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
+"""Where the reference has not been, as far as the estimate has used it."""
+
+NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
+NO_COHERENCE: Final = "Of a single segment there is no coherence"
+
+_SHADES: Final = ("not_estimated_below", "not_estimated_above")
+_GROUPS: Final = 200
+"""Of points along the axis, two kept of each: enough for the pixels of a view."""
+_PHASE_FROM_DEG: Final = -90.0
+"""Phases lie about 0 and 180 degrees; cut here, they do not jump from end to end."""
+_MODEL_STEP_HZ: Final = 0.01
+_FAINT: Final = Damping(zeta=3e-4)
+"""To know how high a magnitude may rise where the damping is not known."""
+_DEEPEST_DB: Final = 140.0
+"""Below the highest magnitude, what an axis shows at the most."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Graph:
+    chart: Chart
+    key: Key
+    values: Callable[["FrequencyResponse"], Real]
+
+
+class ResponseCharts:
+    """The charts of one session's frequency response.
+
+    Parameters
+    ----------
+    subject
+        The session.
+    """
+
+    def __init__(self, subject: "Subject") -> None:
+        frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
+        model = _measured_model(subject, frequency_hz, subject.damping or _FAINT)
+        magnitude = _magnitude_axis(magnitude_db(model))
+        phase = Axis(
+            "Phase (degrees)",
+            _PHASE_FROM_DEG,
+            _PHASE_FROM_DEG + 360.0,
+            (-90.0, 0.0, 90.0, 180.0, 270.0),
+        )
+        coherence = Axis("Coherence (1)", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0))
+        known = subject.damping is not None
+        of_model = (MODEL_KEY,) if known else ()
+        self._graphs = (
+            *(
+                _Graph(
+                    _chart(entity, magnitude, MEASURED_KEY, *of_model), MEASURED_KEY, _magnitude_db
+                )
+                for entity in (OVERVIEW_MAGNITUDE, MAGNITUDE)
+            ),
+            _Graph(_chart(PHASE, phase, MEASURED_KEY, *of_model), MEASURED_KEY, _phase_deg),
+            _Graph(_chart(COHERENCE, coherence, COHERENCE_KEY), COHERENCE_KEY, _coherence),
+        )
+        self._delays_s = {
+            "input_delay_s": subject.angle_delay_s,
+            "output_delay_s": subject.torque_delay_s,
+        }
+        thinning = Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
+        of_magnitude = thinning.strips(magnitude_db(model))
+        self._models = (
+            {
+                OVERVIEW_MAGNITUDE: of_magnitude,
+                MAGNITUDE: of_magnitude,
+                PHASE: thinning.strips(phase_deg(model)),
+            }
+            if known
+            else {}
+        )
+        self._thinning: Thinning | None = None
+        self._t_ns = 0
+        self._curves: dict[str, Sequence[Real]] = {}
+        self._excited_hz = (LAST_HZ, LAST_HZ)
+        self._note = NO_COHERENCE_YET
+
+    def chart(self, entity: str) -> Chart:
+        """Return the chart that Rerun keeps at a place."""
+        return next(graph.chart for graph in self._graphs if graph.chart.entity == entity)
+
+    def draw_frames(self, stream: "RecordingStream") -> None:
+        """Draw what stays as it is."""
+        for graph in self._graphs:
+            graph.chart.draw_frame(stream)
+            for name in _SHADES:
+                graph.chart.draw_shade(stream, name)
+            if graph.chart.entity in self._models:
+                graph.chart.draw_curve(
+                    stream, "model", self._models[graph.chart.entity], MODEL_KEY, static=True
+                )
+
+    def update(self, t_ns: int, estimate: "RunningEstimate") -> None:
+        """Take what is known of the response at a time of the session."""
+        response = estimate.response.without_delays(**self._delays_s)
+        grid = response.frequency_hz
+        if self._thinning is None or self._thinning.grid.size != grid.size:
+            self._thinning = Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS)
+        excited = estimate.excited
+        self._t_ns = t_ns
+        self._curves = {
+            graph.chart.entity: self._thinning.strips(
+                np.where(excited, graph.values(response), np.nan)
+            )
+            for graph in self._graphs
+        }
+        ends = grid[excited][[0, -1]] if excited.any() else (LAST_HZ, LAST_HZ)
+        self._excited_hz = float(ends[0]), float(ends[1])
+        missing = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
+        self._note = missing if response.coherence is None else ""
+
+    def draw(self, stream: "RecordingStream") -> None:
+        """Draw what was last taken, at its time."""
+        stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
+        for graph in self._graphs:
+            chart = graph.chart
+            chart.draw_curve(stream, "measured", self._curves.get(chart.entity, ()), graph.key)
+            ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
+            for name, first_hz, last_hz in zip(_SHADES, ends_hz[::2], ends_hz[1::2], strict=True):
+                chart.move_shade(stream, name, first_hz, last_hz)
+        self.chart(COHERENCE).draw_note(stream, self._note, COHERENCE_KEY.color)
+
+
+def magnitude_db(response: Complex) -> Real:
+    """Magnitude in dB re 1 N·m/rad."""
+    with np.errstate(divide="ignore"):
+        magnitude: Real = 20.0 * np.log10(np.abs(response))
+    return magnitude
+
+
+def phase_deg(response: Complex) -> Real:
+    """Phase in degrees, from −90 to below 270."""
+    turned: Real = np.mod(np.degrees(np.angle(response)) - _PHASE_FROM_DEG, 360.0)
+    return turned + _PHASE_FROM_DEG
+
+
+def _magnitude_db(response: "FrequencyResponse") -> Real:
+    return magnitude_db(response.response)
+
+
+def _phase_deg(response: "FrequencyResponse") -> Real:
+    return phase_deg(response.response)
+
+
+def _coherence(response: "FrequencyResponse") -> Real:
+    if response.coherence is None:
+        return np.full(response.frequency_hz.shape, np.nan)
+    return response.coherence
+
+
+def _measured_model(subject: "Subject", frequency_hz: Real, damping: Damping) -> Complex:
+    """Return what the sensor measures per angle of a beam so damped, in N·m/rad, (n,)."""
+    s = 2j * np.pi * frequency_hz
+    model: Complex = transfer(s, subject.beam, damping) + subject.tool_inertia_kg_m2 * s * s
+    return model
+
+
+def _magnitude_axis(model_db: Real) -> Axis:
+    step_db = 20.0
+    last = step_db * np.ceil((model_db.max() + 6.0) / step_db)
+    first = step_db * np.floor((model_db.min() - 3.0) / step_db)
+    first = max(first, last - _DEEPEST_DB)
+    ticks = steps(first, last, round((last - first) / step_db))
+    return Axis("Magnitude (dB re 1 N·m/rad)", float(first), float(last), ticks)
+
+
+def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
+    ticks, lines = decades(FIRST_HZ, LAST_HZ)
+    frequency = Axis("Frequency (Hz)", FIRST_HZ, LAST_HZ, ticks, lines, logarithmic=True)
+    width, height = SIZES[entity]
+    return Chart(entity, width, height, frequency, y, (*keys, NOT_ESTIMATED_KEY))
+
+
+SPECTROGRAM: Final = "/spectrogram"
+SIZE: Final = (1280.0, 677.0)
+"""Width and height of the canvas, in points."""
+
+LOWEST_DB, HIGHEST_DB = -80.0, 0.0
+"""Levels, in dB re 1 N·m, at the two ends of the colours."""
+MOST_COLUMNS: Final = 300
+"""Of the image: more than that many columns are merged, the highest level kept."""
+
+_BAR = 28.0
+"""Width of the bar of colours, in points."""
+_BESIDE = 120.0
+"""Room for the bar and its labels."""
+
+
+class SpectrogramChart:
+    """The chart of one session's spectrogram.
+
+    Parameters
+    ----------
+    subject
+        The session.
+    frequency_hz
+        (m,) of the columns' levels, evenly spaced from 0.
+    step_s
+        Time between columns.
+
+    Attributes
+    ----------
+    chart
+        Where it is drawn.
+    """
+
+    def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
+        duration_s = max(subject.ticks / subject.rate_hz, step_s)
+        self._slot_s = max(step_s, duration_s / MOST_COLUMNS)
+        slots = int(np.ceil(duration_s / self._slot_s))
+        end_s = slots * self._slot_s
+        half_row_hz = float(frequency_hz[1] - frequency_hz[0]) / 2
+        end_hz = float(frequency_hz[-1]) + half_row_hz
+        self._lowest_hz = float(frequency_hz[1]) - half_row_hz
+        width, height = SIZE
+        self.chart = Chart(
+            SPECTROGRAM,
+            width,
+            height,
+            Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
+            Axis("Frequency (Hz)", 0.0, end_hz, steps(0.0, end_hz, 8)),
+            right=_BESIDE,
+        )
+        self._bar = Chart(
+            f"{SPECTROGRAM}/bar",
+            width,
+            height,
+            Axis("", 0.0, 1.0, ()),
+            Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
+            left=width - _BAR - 24.0,
+        )
+        # Row 0 is on top. Without the mean of the torque, which is no motion.
+        self._image = np.zeros((frequency_hz.size - 1, slots), np.uint8)
+        self._filled = 0
+        self._t_ns = 0
+
+    @property
+    def image(self) -> npt.NDArray[np.uint8]:
+        """Levels that have been taken, 0–255, (frequencies from the highest down, times)."""
+        return self._image[:, : self._filled]
+
+    def draw_frame(self, stream: "RecordingStream") -> None:
+        """Draw what stays as it is: the axes, and the bar that tells what the colours mean."""
+        corners = self.chart.place([0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last])
+        _place_image(stream, f"{SPECTROGRAM}/levels", corners, self._image.shape)
+        corners = self._bar.place([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
+        bar = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
+        _place_image(stream, f"{SPECTROGRAM}/colors", corners, bar.shape)
+        _send_image(stream, f"{SPECTROGRAM}/colors", bar, static=True)
+        self.chart.draw_frame(stream)
+        self._bar.draw_frame(stream)
+
+    def update(self, t_ns: int, columns: Sequence[tuple[float, Real]]) -> None:
+        """Take columns: the middle of their window in s, and their levels (m,) in dB re 1 N·m."""
+        self._t_ns = t_ns
+        for time_s, level_db in columns:
+            slot = min(max(int(time_s / self._slot_s), 0), self._image.shape[1] - 1)
+            share = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
+            column = (255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+            np.maximum(self._image[:, slot], column, out=self._image[:, slot])
+            self._filled = max(self._filled, slot + 1)
+
+    def draw(self, stream: "RecordingStream") -> None:
+        """Draw what has been taken so far."""
+        if self._filled:
+            stream.set_time(TIMELINE, duration=1e-9 * self._t_ns)
+            _send_image(stream, f"{SPECTROGRAM}/levels", self.image)
+
+
+def _place_image(
+    stream: "RecordingStream", entity: str, corners: Real, shape: tuple[int, ...]
+) -> None:
+    """Say where an image of levels (0–255) lies, and in which colours.
+
+    Parameters
+    ----------
+    stream, entity
+        Where to say it.
+    corners
+        Bottom left and top right on the canvas, (2, 2).
+    shape
+        Rows and columns of the image.
+    """
+    import rerun as rr
+
+    (left, bottom), (right, top) = corners
+    rows, columns = shape
+    stream.log(
+        entity,
+        rr.DepthImage.from_fields(
+            colormap=rr.components.Colormap.Viridis, depth_range=(0.0, 255.0), draw_order=0.0
+        ),
+        rr.Transform3D(
+            translation=[left, top, 0.0],
+            scale=[(right - left) / columns, (bottom - top) / rows, 1.0],
+        ),
+        static=True,
+    )
+
+
+def _send_image(
+    stream: "RecordingStream", entity: str, levels: npt.NDArray[np.uint8], *, static: bool = False
+) -> None:
+    import rerun as rr
+
+    rows, columns = levels.shape
+    stream.log(
+        entity,
+        rr.DepthImage.from_fields(
+            buffer=levels.tobytes(),
+            format=rr.components.ImageFormat(
+                width=columns, height=rows, channel_datatype=rr.ChannelDatatype.U8
+            ),
+        ),
+        static=static,
+    )

@@ -1,0 +1,414 @@
+"""The one layout of Rerun's window: which views there are, how each curve is drawn, axis labels.
+
+Labels beside the axes of plots over time, whatever the amplitude.
+
+Rerun makes an axis as long as its values need, and labels multiples of a power of ten where they
+are far enough apart to be read. So ±0.06 would have a single label, 0. Where it comes to this, the
+next multiple is put among the values, invisibly, which makes the axis a little longer. In time it
+is put where an extreme value is, and leaves the picture with it.
+
+The one layout of Rerun's window: which views there are, and how each curve is drawn.
+
+Rerun's plots have no axis titles: the unit stands in the title of the view and in the legend.
+"""
+
+import collections
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.view import _antenna as antenna
+from rigd.view import _plots as plots
+from rigd.view._frequency_charts import (
+    COHERENCE,
+    MAGNITUDE,
+    OVERVIEW_MAGNITUDE,
+    PHASE,
+    SIZES,
+    SPECTROGRAM,
+)
+from rigd.view._frequency_charts import SIZE as SPECTROGRAM_SIZE
+from rigd.view._plots import TIMELINE, Plot, Source, Values, send_columns
+from rigd.view._session_info import EVENTS, SUMMARY
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import VisualizerComponentMapping
+    from rerun.datatypes import EntityPath
+
+    from rigd.view._plots import Source
+    from rigd.view._scene import Drawing
+
+LEAST_SPACING: Final = 24.0
+"""Between labels, in points: Rerun shows none that are nearer than 20, and hardly those of 21."""
+MARGINS: Final = 1.1
+"""How many times longer than its values need an axis is."""
+
+_STEP_NS: Final = 100_000_000
+"""Of what lies within so much time, the extremes are looked at."""
+_ABSURDLY_SMALL, _ABSURDLY_LARGE = 1e-300, 1e300
+_Mark = tuple[int, float]
+"""Time since the start of the session in ns, and a value."""
+
+
+class Scale:
+    """Follows the extremes of what views show of one source.
+
+    Parameters
+    ----------
+    source
+        Of the values.
+    views
+        Those of other sources are passed over, and those whose axis has fixed ends.
+    """
+
+    def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
+        self._entity = source.ticks
+        self._axes = [
+            _Axis(view) for view in views if view.source is source and view.plot.span is None
+        ]
+
+    def frame(self) -> list["Drawing"]:
+        """Return what each new connection needs first: a view complains of what it never got."""
+        nothing = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
+        start_ns = np.array([0])
+        return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=nothing)]
+
+    def draw(self, t_ns: npt.NDArray[np.int64], columns: Mapping[str, Values]) -> list["Drawing"]:
+        """Take values (n, k) by component, at times (n,) of the session; draw the ticks they lack.
+
+        What is not a finite number is passed over, as Rerun does.
+        """
+        steps = (t_ns - t_ns[0]) // _STEP_NS
+        begins = np.append(0, np.flatnonzero(np.diff(steps)) + 1)
+        times_ns = t_ns[np.append(begins[1:], len(t_ns)) - 1].tolist()
+        lows, highs = (
+            {
+                component: extreme.reduceat(values.ravel(), begins * values.shape[1]).tolist()
+                for component, values in columns.items()
+            }
+            for extreme in (np.fmin, np.fmax)
+        )
+        drawings: list[Drawing] = []
+        for axis in self._axes:
+            component = axis.view.plot.component
+            marks = [
+                mark
+                for moment in zip(times_ns, lows[component], highs[component], strict=True)
+                for mark in axis.take(*moment)
+            ]
+            if marks:
+                drawings.append(self._ticks(axis.view.ticks, marks))
+        return drawings
+
+    def _ticks(self, component: str, marks: Sequence[_Mark]) -> "Drawing":
+        times_ns, values = zip(*marks, strict=True)
+        columns = {component: np.array(values)[:, None]}
+        return partial(send_columns, entity=self._entity, t_ns=np.array(times_ns), columns=columns)
+
+
+class _Axis:
+    """Of one view: the extremes within its window, and the ticks it was given last."""
+
+    def __init__(self, view: "TimeView") -> None:
+        self.view = view
+        self._window_ns = round(1e9 * view.window_s)
+        self._greatest, self._least = _Greatest(self._window_ns), _Greatest(self._window_ns)
+        self._below: _Mark | None = None
+        self._above: _Mark | None = None
+
+    def take(self, t_ns: int, low: float, high: float) -> list[_Mark]:
+        """Take the extremes of a moment; return the ticks that are to be added."""
+        if not (math.isfinite(low) and math.isfinite(high)):
+            return []
+        high_ns, high = self._greatest.take(t_ns, high)
+        low_ns, minus_low = self._least.take(t_ns, -low)
+        below, above = missing_ticks(-minus_low, high, self.view.height)
+        # When either extreme leaves, it is seen anew what is missing.
+        earlier_ns = min(low_ns, high_ns)
+        added = []
+        if above is not None and self._lacks(self._above, above, t_ns):
+            self._above = earlier_ns, above
+            added.append(self._above)
+        if below is not None and self._lacks(self._below, below, t_ns):
+            self._below = earlier_ns, below
+            added.append(self._below)
+        return added
+
+    def _lacks(self, last: _Mark | None, value: float, t_ns: int) -> bool:
+        """Whether the last tick is another one, or about to leave the window."""
+        return last is None or last[1] != value or last[0] <= t_ns - self._window_ns + _STEP_NS
+
+
+class _Greatest:
+    """The greatest value within a window of time that moves on."""
+
+    def __init__(self, window_ns: int) -> None:
+        self._window_ns = window_ns
+        # Each is greater than all that come after it.
+        self._marks: collections.deque[_Mark] = collections.deque()
+
+    def take(self, t_ns: int, value: float) -> _Mark:
+        """Take the newest value; return the greatest one, and when it was."""
+        while self._marks and self._marks[-1][1] <= value:
+            self._marks.pop()
+        self._marks.append((t_ns, value))
+        while self._marks[0][0] <= t_ns - self._window_ns:
+            self._marks.popleft()
+        return self._marks[0]
+
+
+def missing_ticks(low: float, high: float, height: float) -> tuple[float | None, float | None]:
+    """Return what an axis must hold besides its values for two labels to be seen beside it.
+
+    Parameters
+    ----------
+    low, high
+        Extremes of the values.
+    height
+        Of the plot, in points.
+
+    Returns
+    -------
+    below, above
+        Values that are labelled if the axis holds them; None where none is needed.
+    """
+    spacing = MARGINS * (high - low) / height * LEAST_SPACING
+    # Of a single value Rerun shows one unit to either side; of what is absurd, whatever it can.
+    if not _ABSURDLY_SMALL < spacing < _ABSURDLY_LARGE:
+        return None, None
+    step = 10.0 ** math.ceil(math.log10(spacing))
+    first, last = math.ceil(low / step), math.floor(high / step)
+    if last > first:
+        return None, None
+    below, above = (first - 1) * step, (last + 1) * step
+    if last < first:
+        return below, above
+    # Rather above, so that it stays there while a signal swings, and makes room for the legend.
+    return (None, above) if above - high <= 2.0 * (low - below) else (below, None)
+
+
+WINDOW_S = 10.0
+"""Time shown up to the cursor; a viewer's load grows with it, not with the session."""
+
+CLOSE_UP_S = 2.0
+"""Time shown of the signals where they are all that is shown: one sees the oscillations."""
+
+HISTORY_S = 60.0
+"""Time shown of what comes a few times a second only."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeView:
+    """A plot over time in one of the tabs.
+
+    Attributes
+    ----------
+    source, plot
+        What it shows.
+    window_s
+        Time shown up to the cursor.
+    height
+        Of what its axes enclose, in points, in a window of 1280 × 800.
+    """
+
+    source: Source
+    plot: Plot
+    window_s: float
+    height: float
+
+    @property
+    def ticks(self) -> str:
+        """What Rerun calls the values that stand beside the axis and are to be in the picture."""
+        return f"{self.plot.component}_ticks_{self.window_s:g}_s"
+
+
+_THREE_ROWS: Final = 189.0
+_FOUR_ROWS: Final = 131.0
+"""Heights of the plots of a tab."""
+
+OVERVIEW: Final = tuple(
+    TimeView(plots.SIGNALS, plot, WINDOW_S, _THREE_ROWS)
+    for plot in (plots.ANGLE, plots.COUPLING_TORQUE, plots.TRACKING_ERROR)
+)
+SIGNALS: Final = tuple(
+    TimeView(plots.SIGNALS, plot, CLOSE_UP_S, _THREE_ROWS)
+    for plot in (
+        plots.ANGLE,
+        plots.TRACKING_ERROR,
+        plots.COUPLING_TORQUE,
+        plots.TORQUE_COMMAND,
+        plots.FORCES,
+        plots.TORQUES,
+    )
+)
+HEALTH: Final = (
+    TimeView(plots.SIGNALS, plots.LOOP, WINDOW_S, _FOUR_ROWS),
+    TimeView(plots.READINGS, plots.AGES, WINDOW_S, _FOUR_ROWS),
+    *(TimeView(plots.HEALTH, plot, HISTORY_S, _FOUR_ROWS) for plot in plots.HEALTH.plots),
+)
+TIME_VIEWS: Final = (*OVERVIEW, *SIGNALS, *HEALTH)
+
+TABS = ("Overview", "Signals", "Frequency response", "Spectrogram", "Health", "Events")
+
+
+def blueprint(active_tab: str = TABS[0]) -> "rrb.Blueprint":
+    """Return the layout, which follows the newest sample, with one of its tabs in front."""
+    import rerun.blueprint as rrb
+
+    contents = (
+        _overview(),
+        _signals(),
+        _frequency_response(),
+        _spectrogram(),
+        _health(),
+        _events(),
+    )
+    for tab, name in zip(contents, TABS, strict=True):
+        tab.name = name
+    return rrb.Blueprint(
+        rrb.Tabs(*contents, active_tab=TABS.index(active_tab)),
+        rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+    )
+
+
+def _overview() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Horizontal(
+        rrb.Vertical(*map(_plot, OVERVIEW)),
+        rrb.Vertical(
+            _chart(
+                "Frequency response, torque over angle",
+                OVERVIEW_MAGNITUDE,
+                SIZES[OVERVIEW_MAGNITUDE],
+            ),
+            rrb.Horizontal(
+                antenna.view(),
+                _log(),
+            ),
+        ),
+        column_shares=[6, 7],
+    )
+
+
+def _signals() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
+
+
+def _frequency_response() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(
+        _chart("Magnitude of torque over angle", MAGNITUDE, SIZES[MAGNITUDE]),
+        rrb.Horizontal(
+            _chart("Phase of torque over angle", PHASE, SIZES[PHASE]),
+            _chart("Coherence of angle and torque", COHERENCE, SIZES[COHERENCE]),
+        ),
+        row_shares=[4, 3],
+    )
+
+
+def _spectrogram() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(_chart("Spectrogram of the coupling torque", SPECTROGRAM, SPECTROGRAM_SIZE))
+
+
+def _health() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Horizontal(
+        rrb.Grid(*map(_plot, HEALTH), grid_columns=2),
+        _summary(),
+        column_shares=[7, 2],
+    )
+
+
+def _events() -> "rrb.Container":
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(_log())
+
+
+def _plot(view: TimeView) -> "rrb.TimeSeriesView":
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    plot = view.plot
+    lines = rr.SeriesLines(
+        names=[curve.label for curve in plot.curves],
+        colors=[curve.color for curve in plot.curves],
+        widths=[curve.width for curve in plot.curves],
+        # The default averages what falls on one pixel, and so understates peaks.
+        aggregation_policy="MinMax",
+    )
+    # Not seen, but within the axis. The legend has one entry for all that is called the same.
+    ticks = rr.SeriesPoints(
+        names=[plot.curves[0].label], colors=[plot.curves[0].color], marker_sizes=[0.0]
+    )
+    visualizers: dict[EntityPath | str, rrb.Visualizer] = {
+        view.source.entity: lines.visualizer(mappings=[_values(plot.component)])
+    }
+    if plot.span is None:
+        visualizers[view.source.ticks] = ticks.visualizer(mappings=[_values(view.ticks)])
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-view.window_s)
+    end = rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.TimeSeriesView(
+        name=plot.title,
+        origin=view.source.entity,
+        contents=[str(entity) for entity in visualizers],
+        overrides=visualizers,
+        # The title says it all where there is but one curve.
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot.curves) > 1),
+        # Left to itself it shows a minute round the cursor, half of it yet to come.
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+        axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
+        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
+    )
+
+
+def _values(component: str) -> "VisualizerComponentMapping":
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+
+    return VisualizerComponentMapping(
+        "Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=component
+    )
+
+
+def _chart(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
+    import rerun.blueprint as rrb
+
+    width, height = size
+    return rrb.Spatial2DView(
+        name=name,
+        origin=entity,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
+    )
+
+
+def _summary() -> "rrb.TextDocumentView":
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(name="State", origin=SUMMARY)
+
+
+def _log() -> "rrb.TextLogView":
+    import rerun.blueprint as rrb
+
+    return rrb.TextLogView(
+        name="Events",
+        origin=EVENTS,
+        columns=rrb.TextLogColumns(
+            timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]
+        ),
+    )

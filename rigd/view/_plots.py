@@ -1,0 +1,248 @@
+"""What is plotted over time: which curves, in which units and colours.
+
+Colours of what is shown, as red, green and blue from 0 to 255.
+
+Those of Okabe and Ito (2008) are told apart with any colour vision. Here are the ones of them that
+stand out from Rerun's dark background and from its light one.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from rerun import ComponentColumn, RecordingStream
+
+Color = tuple[int, int, int]
+
+ORANGE: Color = (230, 159, 0)
+SKY_BLUE: Color = (86, 180, 233)
+GREEN: Color = (0, 158, 115)
+VERMILION: Color = (213, 94, 0)
+PURPLE: Color = (204, 121, 167)
+GREY: Color = (130, 130, 130)
+"""Of frames, grids and tick labels, and of a curve that is beside the point."""
+
+
+Records = npt.NDArray[Any]
+"""Structured array (n,) with a field ``t_ns``."""
+
+Values = npt.NDArray[np.float64]
+
+APPLICATION_ID: Final = "rigd"
+"""Rerun keeps one layout for each application."""
+
+TIMELINE: Final = "session_time"
+"""Time since the start of the session, from ``t_ns``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One curve of a plot.
+
+    Attributes
+    ----------
+    label
+        What the legend calls it, with its unit.
+    color
+        Of the line.
+    values
+        Its values (n,) from records (n,).
+    width
+        Of the line, in points.
+    """
+
+    label: str
+    color: Color
+    values: Callable[[Records], Values]
+    width: float = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Curves over time that share an axis.
+
+    Attributes
+    ----------
+    component
+        What Rerun calls their values: a name that ends in the unit.
+    title
+        What the axis shows, with its unit.
+    curves
+        From the lowest to the topmost.
+    span
+        The ends of the axis, where they are the same for every session.
+    """
+
+    component: str
+    title: str
+    curves: tuple[Curve, ...]
+    span: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Plots whose values come together.
+
+    Attributes
+    ----------
+    entity
+        Where Rerun keeps them. One place for all of them: what sending costs is the number of
+        places, hardly that of the values.
+    plots
+        What is made of each record.
+    """
+
+    entity: str
+    plots: tuple[Plot, ...]
+
+    @property
+    def ticks(self) -> str:
+        """Where Rerun keeps values that the axes must hold besides."""
+        return f"{self.entity}/ticks"
+
+    def columns(self, records: Records) -> dict[str, Values]:
+        """Return values (n, curves of the plot) by the plot's component, from records (n,)."""
+        return {
+            plot.component: np.column_stack([curve.values(records) for curve in plot.curves])
+            for plot in self.plots
+        }
+
+
+def send_columns(
+    stream: "RecordingStream",
+    entity: str,
+    t_ns: npt.NDArray[np.int64],
+    columns: Mapping[str, Values],
+) -> None:
+    """Send values (n, k) by component, which were at times (n,) of the session, to an entity."""
+    import rerun as rr
+
+    time = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
+    stream.send_columns(
+        entity, [time], [_column(name, values) for name, values in columns.items()], strict=True
+    )
+
+
+def _column(component: str, values: Values) -> "ComponentColumn":
+    """Values (n, k) as Rerun's column of k scalars a row."""
+    import rerun as rr
+
+    rows, width = values.shape
+    batch = rr.components.ScalarBatch(values.ravel())
+    return rr.ComponentColumn(
+        rr.ComponentDescriptor(component, component_type=batch.component_type()),
+        batch,
+        offsets=np.arange(0, rows * width + 1, width, dtype=np.int32),
+    )
+
+
+def _axes(field: str, symbol: str, unit: str) -> tuple[Curve, ...]:
+    """Return the curves of the sensor's three axes, from fields named like ``f{}_n``."""
+    return tuple(
+        Curve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
+        for axis, color in zip("xyz", (ORANGE, SKY_BLUE, PURPLE), strict=True)
+    )
+
+
+ANGLE = Plot(
+    "angle_mrad",
+    "Motor angle (mrad)",
+    (
+        # Wider, for it lies under the measured angle.
+        Curve("reference (mrad)", ORANGE, lambda r: 1e3 * r["angle_reference_rad"], 2.5),
+        Curve("measured (mrad)", SKY_BLUE, lambda r: 1e3 * r["angle_rad"]),
+    ),
+)
+TRACKING_ERROR = Plot(
+    "tracking_error_mrad",
+    "Tracking error, reference − measured (mrad)",
+    (
+        Curve(
+            "tracking error (mrad)",
+            VERMILION,
+            lambda r: 1e3 * (r["angle_reference_rad"] - r["angle_rad"]),
+        ),
+    ),
+)
+COUPLING_TORQUE = Plot(
+    "coupling_torque_nm",
+    "Coupling torque, tared (N·m)",
+    (Curve("coupling torque (N·m)", GREEN, lambda r: r["coupling_torque_nm"]),),
+)
+TORQUE_COMMAND = Plot(
+    "torque_command_nm",
+    "Torque command, after limits (N·m)",
+    (Curve("torque command (N·m)", PURPLE, lambda r: r["torque_command_nm"]),),
+)
+FORCES = Plot("forces_n", "Forces at the sensor (N)", _axes("f{}_n", "F", "N"))
+TORQUES = Plot("torques_nm", "Torques at the sensor (N·m)", _axes("t{}_nm", "T", "N·m"))
+LOOP = Plot(
+    "loop_us",
+    "Lateness and work time of the loop (µs)",
+    (
+        Curve("wake-up after schedule (µs)", GREY, lambda r: 1e-3 * r["lateness_ns"]),
+        Curve("work of the tick (µs)", ORANGE, lambda r: 1e-3 * r["work_ns"]),
+    ),
+)
+SIGNALS = Source(
+    "/signals",
+    (ANGLE, TRACKING_ERROR, COUPLING_TORQUE, TORQUE_COMMAND, FORCES, TORQUES, LOOP),
+)
+"""From samples."""
+
+AGES = Plot(
+    "ages_ms",
+    "Age of the readings when used (ms)",
+    (
+        Curve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
+        Curve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
+    ),
+)
+READINGS = Source("/readings", (AGES,))
+"""From timings."""
+
+FAULTY_TICKS = Plot(
+    "faulty_ticks",
+    "Missed, late and lost (ticks since the start)",
+    (
+        Curve("missed (ticks)", VERMILION, lambda r: r["missed_ticks"]),
+        Curve("late (ticks)", ORANGE, lambda r: r["late_ticks"]),
+        Curve("lost (ticks)", PURPLE, lambda r: r["lost_ticks"]),
+    ),
+)
+BACKLOG = Plot(
+    "backlog_samples",
+    "Recorder's lag and not shown (samples)",
+    (
+        Curve("waiting for the recorder (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
+        Curve("dropped by the view (samples)", GREY, lambda r: r["view_dropped"]),
+    ),
+)
+BUS_LOAD = Plot(
+    "bus_load_percent",
+    "Bus load (%)",
+    (Curve("bus load (%)", SKY_BLUE, lambda r: r["bus_load_percent"]),),
+    span=(0.0, 105.0),
+)
+BUS_ERRORS = Plot(
+    "bus_errors",
+    "Bus errors since the devices were connected (count)",
+    (Curve("bus errors (count)", VERMILION, lambda r: r["bus_errors"]),),
+)
+SENSOR_STATUS = Plot(
+    "sensor_status",
+    "Status word of the sensor (0: well)",
+    (Curve("sensor status (word)", PURPLE, lambda r: r["sensor_status"]),),
+)
+DISK = Plot(
+    "disk_free_gb",
+    "Free on the disk (GB)",
+    (Curve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
+)
+HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
+"""From readings of the health."""

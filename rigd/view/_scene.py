@@ -1,0 +1,187 @@
+"""Everything that is shown of one session."""
+
+import collections
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.spectral import RunningSpectrogram
+from rigd.view._antenna import Antenna
+from rigd.view._frequency_charts import LAST_HZ, ResponseCharts, SpectrogramChart, SweepResponse
+from rigd.view._layout import TIME_VIEWS, Scale, blueprint
+from rigd.view._plots import HEALTH, READINGS, SIGNALS, Source, send_columns
+from rigd.view._session_info import (
+    Health,
+    Note,
+    Subject,
+    health_record,
+    send_note,
+    send_summary,
+)
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+    from rerun import RecordingStream
+
+    from rigd.view._session_info import Health, Note, Subject
+
+Records = npt.NDArray[Any]
+
+Drawing = Callable[["RecordingStream"], None]
+"""Sends one thing to Rerun."""
+
+_BLOCK_S: Final = 0.1
+"""Records are drawn in blocks of at least so much: what a block costs hardly grows with it."""
+_CHARTS_S: Final = 1.0
+"""Session time between drawings of the charts: a response is computed anew for each."""
+_STEP_S: Final = 0.5
+"""Between columns of the spectrogram."""
+_MOST_NOTES: Final = 200
+"""Lines of the log that a new connection is given again."""
+
+
+class Picture:
+    """Keeps what must be computed along, and turns what comes into drawings.
+
+    It sends nothing itself, so nothing that stalls can disturb what is computed.
+
+    Parameters
+    ----------
+    subject
+        The session.
+    layout
+        Returns the layout of the window; by default that of the live view.
+    """
+
+    def __init__(self, subject: Subject, layout: "Callable[[], rrb.Blueprint]" = blueprint) -> None:
+        self._subject = subject
+        self._layout = layout
+        last_hz = min(LAST_HZ, subject.rate_hz / 2)
+        self._antenna = Antenna(subject)
+        self._response = SweepResponse(subject, last_hz)
+        self.response_charts = ResponseCharts(subject)
+        self._response_is_final = False
+        self._spectrogram = RunningSpectrogram(subject.rate_hz, step_s=_STEP_S, last_hz=last_hz)
+        self._spectrogram_chart = SpectrogramChart(subject, self._spectrogram.frequency_hz, _STEP_S)
+        self._columns: list[tuple[float, npt.NDArray[Any]]] = []
+        self._notes: collections.deque[Note] = collections.deque(maxlen=_MOST_NOTES)
+        self._charts_due = _Periodically(_CHARTS_S)
+        self._samples = _Gathering(subject.rate_hz)
+        self._timings = _Gathering(subject.rate_hz)
+        self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
+        self._t_ns = 0
+
+    def frame(self) -> list[Drawing]:
+        """Return what each new connection needs first: name, layout, axes, and what is known."""
+        name = self._subject.name
+        return [
+            lambda stream: stream.send_recording_name(name),
+            lambda stream: stream.send_blueprint(self._layout()),
+            *(drawing for scale in self._scales.values() for drawing in scale.frame()),
+            self.response_charts.draw_frames,
+            self.response_charts.draw,
+            self._spectrogram_chart.draw_frame,
+            self._spectrogram_chart.draw,
+            *self._antenna.frame(),
+            *(partial(send_note, note=note) for note in self._notes),
+        ]
+
+    def samples(self, samples: Records) -> list[Drawing]:
+        """Take samples (n,) of ``SAMPLE_DTYPE``, in order; there may be gaps."""
+        return self._draw_samples(self._samples.add(samples))
+
+    def timings(self, timings: Records) -> list[Drawing]:
+        """Take the readings' ages (n,) of ``TIMING_DTYPE``."""
+        return self._draw_timings(self._timings.add(timings))
+
+    def events(self, events: Sequence[Note]) -> list[Drawing]:
+        """Take what happened."""
+        self._notes.extend(events)
+        return [partial(send_note, note=note) for note in events]
+
+    def health(self, t_ns: int, health: Health) -> list[Drawing]:
+        """Take a reading of the health, a few times a second."""
+        return [
+            *self._plot(HEALTH, health_record(t_ns, health)),
+            partial(send_summary, subject=self._subject, t_ns=t_ns, health=health),
+        ]
+
+    def finish(self) -> list[Drawing]:
+        """Return what can only be drawn when everything has come: the final frequency response."""
+        return [
+            *self._draw_samples(self._samples.rest()),
+            *self._draw_timings(self._timings.rest()),
+            *self._charts(),
+        ]
+
+    def _draw_samples(self, samples: Records | None) -> list[Drawing]:
+        if samples is None:
+            return []
+        self._t_ns = int(samples["t_ns"][-1])
+        self._response.feed(samples)
+        self._columns += self._spectrogram.feed(samples["tick"], samples["coupling_torque_nm"])
+        drawings = [*self._plot(SIGNALS, samples), *self._antenna.samples(samples)]
+        if self._charts_due(self._t_ns):
+            drawings += self._charts()
+        return drawings
+
+    def _draw_timings(self, timings: Records | None) -> list[Drawing]:
+        return [] if timings is None else self._plot(READINGS, timings)
+
+    def _plot(self, source: Source, records: Records) -> list[Drawing]:
+        t_ns, columns = records["t_ns"].astype(np.int64), source.columns(records)
+        return [
+            partial(send_columns, entity=source.entity, t_ns=t_ns, columns=columns),
+            *self._scales[source].draw(t_ns, columns),
+        ]
+
+    def _charts(self) -> list[Drawing]:
+        drawings: list[Drawing] = []
+        if not self._response_is_final and (estimate := self._response.estimate()) is not None:
+            self.response_charts.update(self._t_ns, estimate)
+            self._response_is_final = estimate.final
+        # Again although it is known: what was drawn last may have been dropped on its way.
+        drawings.append(self.response_charts.draw)
+        if self._columns:
+            self._spectrogram_chart.update(self._t_ns, self._columns)
+            self._columns = []
+            drawings.append(self._spectrogram_chart.draw)
+        return drawings
+
+
+class _Periodically:
+    """Whether it is time again, by the clock of the session."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ns = round(1e9 * period_s)
+        self._due_ns = 0
+
+    def __call__(self, t_ns: int) -> bool:
+        if t_ns < self._due_ns:
+            return False
+        self._due_ns = t_ns + self._period_ns
+        return True
+
+
+class _Gathering:
+    """Makes larger blocks of records with a field ``tick`` from small ones."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._ticks = max(1, round(_BLOCK_S * rate_hz))
+        self._parts: list[Records] = []
+
+    def add(self, records: Records) -> Records | None:
+        """Take records (n,); return all that wait as soon as they span a block."""
+        if len(records) == 0:
+            return None
+        self._parts.append(records)
+        span = int(records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
+        return self.rest() if span >= self._ticks else None
+
+    def rest(self) -> Records | None:
+        """Return all that wait, None if nothing does."""
+        parts, self._parts = self._parts, []
+        return np.concatenate(parts) if parts else None

@@ -1,0 +1,202 @@
+"""What a picture tells of a session in words: what it is of, its log lines, its health."""
+
+from dataclasses import astuple, dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.beam import Beam, Damping
+from rigd.view._plots import TIMELINE
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A session, as far as its views depend on it.
+
+    Attributes
+    ----------
+    name
+        Of the session; the viewer shows it as the recording's.
+    rate_hz
+        Scheduled ticks a second.
+    ticks
+        Of the whole record, as scheduled.
+    sweep
+        First tick of the excitation, and its end (exclusive).
+    beam
+        The specimen.
+    damping
+        Nominal damping of the profile; None where it is not known: then no model is drawn over the
+        frequency response.
+    tool_inertia_kg_m2
+        Between the torque sensor and the beam, about the motor's axis.
+    angle_delay_s, torque_delay_s
+        Age of either value at its time stamp; positive: the value is older.
+    """
+
+    name: str
+    rate_hz: float
+    ticks: int
+    sweep: tuple[int, int]
+    beam: Beam
+    damping: Damping | None
+    tool_inertia_kg_m2: float = 0.0
+    angle_delay_s: float = 0.0
+    torque_delay_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something that happened.
+
+    Attributes
+    ----------
+    t_ns
+        When, since the start of the session.
+    level
+        "debug", "info", "warning", "error" or "fatal", as in the session file.
+    message
+        In the operator's words.
+    """
+
+    t_ns: int
+    level: str
+    message: str
+
+
+def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
+    """Return the last line of a session's log: how it ended, at the time of its last sample."""
+    return Note(
+        t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
+    )
+
+
+_LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Readings of one moment; None is one that is not known (there is no bus, say).
+
+    Attributes
+    ----------
+    missed_ticks
+        Skipped by the loop since the start of the session.
+    late_ticks
+        That woke late but were not missed, since the start.
+    lost_ticks
+        Whose samples found no room in the ring, since the start.
+    recorder_lag_ticks
+        Samples that wait in the ring for the recorder.
+    disk_free_mb
+        On the disk that the session goes to, in 10⁶ bytes.
+    view_dropped
+        Samples that could not be shown in time, since the start.
+    bus_load_percent
+        Of the CAN bus or the serial line.
+    bus_errors
+        Disturbed, damaged or missing messages, since the devices were connected.
+    sensor_status
+        Status word of the force-torque sensor; 0: all is well.
+    rate_hz
+        Ticks a second, as measured.
+    """
+
+    missed_ticks: float | None = None
+    late_ticks: float | None = None
+    lost_ticks: float | None = None
+    recorder_lag_ticks: float | None = None
+    disk_free_mb: float | None = None
+    view_dropped: float | None = None
+    bus_load_percent: float | None = None
+    bus_errors: float | None = None
+    sensor_status: float | None = None
+    rate_hz: float | None = None
+
+
+HEALTH_DTYPE: Final = np.dtype(
+    [("t_ns", "<i8")] + [(field.name, "<f8") for field in fields(Health)]
+)
+"""A reading as a record; NaN is what is not known."""
+
+
+def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
+    """Return an array (1,) of ``HEALTH_DTYPE`` with the reading of one moment."""
+    values = (np.nan if value is None else value for value in astuple(health))
+    return np.array([(t_ns, *values)], HEALTH_DTYPE)
+
+
+EVENTS: Final = "/events"
+
+_RERUN_LEVELS: Final = {
+    "debug": "DEBUG",
+    "info": "INFO",
+    "warning": "WARN",
+    "error": "ERROR",
+    "fatal": "CRITICAL",
+}
+"""What Rerun calls the levels: it has colours for these."""
+
+
+def send_note(stream: "RecordingStream", note: "Note") -> None:
+    """Add a line to the log."""
+    import rerun as rr
+
+    # To the millisecond: more is hard to read.
+    stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
+    stream.log(EVENTS, rr.TextLog(note.message, level=_RERUN_LEVELS.get(note.level, "INFO")))
+
+
+SUMMARY: Final = "/summary"
+
+
+def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
+    """Return a Markdown table of how the session is doing; what is not known is left out."""
+    elapsed_s = 1e-9 * t_ns
+    total_s = subject.ticks / subject.rate_hz
+    rows = [
+        ("rate", _number(health.rate_hz, "{:.1f} Hz"), True),
+        ("missed ticks", _number(health.missed_ticks), not health.missed_ticks),
+        ("late ticks", _number(health.late_ticks), not health.late_ticks),
+        ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
+        ("waiting for the recorder", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
+        ("not shown here", _number(health.view_dropped, "{:.0f} samples"), True),
+        ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
+        ("bus errors", _number(health.bus_errors), not health.bus_errors),
+        ("sensor status", _status(health.sensor_status), not health.sensor_status),
+        ("free on the disk", _disk(health.disk_free_mb), True),
+    ]
+    lines = [
+        f"| {name} | {text if well else f'⚠ **{text}**'} |" for name, text, well in rows if text
+    ]
+    head = f"| session | {elapsed_s:.0f} of {total_s:.0f} s |"
+    return "\n".join([head, "|---|---|", *lines])
+
+
+def send_summary(
+    stream: "RecordingStream", subject: "Subject", t_ns: int, health: "Health"
+) -> None:
+    """Show the summary of one moment."""
+    import rerun as rr
+
+    stream.set_time(TIMELINE, duration=1e-9 * t_ns)
+    text = summary(subject, t_ns, health)
+    stream.log(SUMMARY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _number(value: float | None, form: str = "{:.0f}") -> str:
+    return "" if value is None else form.format(value)
+
+
+def _status(word: float | None) -> str:
+    if word is None:
+        return ""
+    return f"0x{int(word):04x}" if word else "well"
+
+
+def _disk(free_mb: float | None) -> str:
+    return "" if free_mb is None else f"{1e-3 * free_mb:.1f} GB"
