@@ -7,7 +7,7 @@ import signal
 def main() -> None:
     """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    from analysis.cli import main as run
+    from analysis.cli.app import main as run
     from rigd.runtime import let_pass
 
     try:

@@ -27,7 +27,7 @@ from pathlib import Path
 marks = [("", 0.0)]
 mark = lambda name: marks.append((name, time.process_time()))
 mark("interpreter")
-import analysis.cli, analysis.record, analysis.identify, analysis.paper._route, rich.progress
+import analysis.cli.app, analysis.record, analysis.identify, analysis.paper._route, rich.progress
 from analysis.models import WelchSettings
 from analysis.identify import BAND_HZ, Measurement
 mark("imports of the analysis")
@@ -38,9 +38,9 @@ mark("the paper's route")
 selection = analysis.identify._select(Measurement.of_record(record))
 mark("whole record")
 from analysis.report.html import Subject
-from analysis.report.html.figures import illustrations
-from analysis.report.frf_figure import frf_figure
-from analysis.report.write import write_report
+from analysis.report._record_page import illustrations
+from analysis.report._frf_figure import frf_figure
+from analysis.report._write import write_report
 mark("imports of matplotlib")
 subject = Subject.of(record, selection, BAND_HZ, (), welch)
 write_report(welch, Path(sys.argv[2]), mark, subject)

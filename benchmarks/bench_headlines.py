@@ -69,13 +69,13 @@ from independent_records import (
     exact,
 )
 
-from analysis.exchange.write_session import write_session
+from analysis.exchange._session_file import write_session
 from analysis.identify import BAND_HZ, Measurement, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.record import Record, load_record
-from analysis.report.document import document
+from analysis.report._bands import loss_factors
+from analysis.report._document import document
 from analysis.report.html import Subject
-from analysis.report.record_figure_bands import loss_factors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,8 +10,8 @@ from exact_sessions import LINK
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from analysis.identify import ResponseGrid
-from analysis.report import style
-from analysis.report.record_figure_bands import loss_factors
+from analysis.report import _style as style
+from analysis.report._bands import loss_factors
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:

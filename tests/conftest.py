@@ -198,7 +198,7 @@ def rigd_here(tmp_path, monkeypatch):
 @pytest.fixture
 def analyze_here(tmp_path, monkeypatch):
     """Run `analyze` in this process, which has imported what takes long."""
-    from analysis.cli import app
+    from analysis.cli.app import app
 
     monkeypatch.chdir(tmp_path)
     return partial(run_here, app)

@@ -1,16 +1,19 @@
 """Many sessions together: statistics, nominal models, pooled estimate, validation."""
 
-from analysis.campaigns.campaign import Campaign, campaign
-from analysis.campaigns.errors import CampaignError
-from analysis.campaigns.estimates import RecordEstimate, WelchFit
-from analysis.campaigns.homogeneity import Heterogeneity, Homogeneity
-from analysis.campaigns.nominal import MeanPeakDeviation, NominalModel
-from analysis.campaigns.parameter_statistics import ParameterStatistics
-from analysis.campaigns.pooled import PooledEstimate, PooledParameter
-from analysis.campaigns.ranking import RankedStructure
-from analysis.campaigns.session import SessionFailure, SessionResult
-from analysis.campaigns.validation import LeftOutError, LostTrial
-from analysis.campaigns.verdict import CampaignVerdict
+from analysis.campaigns._campaign import Campaign, campaign
+from analysis.campaigns._estimates import RecordEstimate, WelchFit
+from analysis.campaigns._experiment import CampaignError
+from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity
+from analysis.campaigns._pooling import PooledEstimate, PooledParameter
+from analysis.campaigns._session import SessionFailure, SessionResult
+from analysis.campaigns._statistics import (
+    MeanPeakDeviation,
+    NominalModel,
+    ParameterStatistics,
+    RankedStructure,
+)
+from analysis.campaigns._validation import LeftOutError, LostTrial
+from analysis.campaigns._verdict import CampaignVerdict
 
 __all__ = [
     "Campaign",

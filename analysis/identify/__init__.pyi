@@ -21,11 +21,6 @@ from ._headline import StructureStatus as StructureStatus
 from ._headline import headline_json as headline_json
 from ._headline import of_fit as of_fit
 from ._noise import Line as Line
-from ._optimizer import Box as Box
-from ._optimizer import Minimum as Minimum
-from ._optimizer import NormalEquations as NormalEquations
-from ._optimizer import Recent as Recent
-from ._optimizer import descend as descend
 from ._parametrization import Steps as Steps
 from ._parametrization import Unknowns as Unknowns
 from ._predictor import EXTRAS as EXTRAS

@@ -23,9 +23,9 @@ import numpy as np
 from analysis.identify._data import Decimation, MeasurementError, fast_length, fast_length_below
 from analysis.identify._drag_torque import DragExpansion, DragResponse
 from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
-from analysis.identify._optimizer import NormalEquations, Recent
 from analysis.identify._predictor import Prediction
 from analysis.models import LARGEST_SHARE_OF_RATE
+from analysis.optimizer import NormalEquations, Recent
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:

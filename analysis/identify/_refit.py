@@ -17,9 +17,9 @@ import numpy as np
 
 from analysis.identify._fit import summary
 from analysis.identify._noise import Noise, smooth_power
-from analysis.identify._optimizer import Box, descend
 from analysis.identify._parametrization import FILTER_DELAYS, bare_beam
 from analysis.identify._problem import Linearisation, Objective
+from analysis.optimizer import Box, descend
 from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._optimizer import NormalEquations
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._predictor import Plant
     from analysis.identify._problem import Comparison
     from analysis.identify._result import ModeEstimate, RecordFit
     from analysis.models import Structure
+    from analysis.optimizer import NormalEquations
 
 _SMALL: Final = 1e-5
 """Loss, relative to stiffness or inertia, at which a damping is brought in."""

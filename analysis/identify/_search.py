@@ -18,10 +18,10 @@ import numpy as np
 
 from analysis.identify._hum import hum_beside_modes, resonance_reach_hz
 from analysis.identify._noise import Noise, noise_of
-from analysis.identify._optimizer import NormalEquations, descend
 from analysis.identify._parametrization import Steps
 from analysis.identify._predictor import ResponseGrid
 from analysis.identify._problem import Objective
+from analysis.optimizer import NormalEquations, descend
 from analysis.paper import thinned
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
     from analysis.identify._hum import Hum
     from analysis.identify._noise import Noise
-    from analysis.identify._optimizer import Minimum
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._predictor import Plant
     from analysis.identify._problem import Comparison
+    from analysis.optimizer import Minimum
 
 _SCANS: Final = {"density_over_stiffness": np.linspace(-0.3, 0.3, 61)}
 _OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)

@@ -37,7 +37,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import Box, Minimum, NormalEquations, Recent, descend
 from analysis.models import (
     PARAMETERS,
     STRUCTURES,
@@ -49,6 +48,7 @@ from analysis.models import (
     weighting_name,
     weights,
 )
+from analysis.optimizer import Box, Minimum, NormalEquations, Recent, descend
 from rigd.beam import Beam, Damping
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from analysis.identify._optimizer import Box, NormalEquations, descend
 from analysis.identify._parametrization import Steps
+from analysis.optimizer import Box, NormalEquations, descend
 
 T = np.linspace(0.0, 4.0, 200)
 

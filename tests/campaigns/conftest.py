@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns.estimates import RecordEstimate, WelchFit
-from analysis.campaigns.experiment import Experiment
-from analysis.campaigns.session import SessionResult
+from analysis.campaigns._estimates import RecordEstimate, WelchFit
+from analysis.campaigns._experiment import Experiment
+from analysis.campaigns._session import SessionResult
 from analysis.identify import ModeEstimate, Plant
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper._route import Indices, Peak

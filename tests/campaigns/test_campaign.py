@@ -10,13 +10,13 @@ import pytest
 from PIL import Image
 
 from analysis.campaigns import CampaignError, campaign
-from analysis.campaigns.document import campaign_document
-from analysis.campaigns.session import SessionTask, analyse_session
-from analysis.campaigns.tables import campaign_tables, tables_text
-from analysis.campaigns.validation import forecasts, left_out_errors
-from analysis.campaigns.write import write_campaign
+from analysis.campaigns._session import SessionTask, analyse_session
+from analysis.campaigns._validation import forecasts, left_out_errors
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
+from analysis.report._campaign_document import campaign_document
+from analysis.report._campaign_tables import campaign_tables, tables_text
+from analysis.report._campaign_write import write_campaign
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ import dask
 import distributed
 import pytest
 
-from analysis.campaigns import CampaignError, campaign, dask_workers
-from analysis.campaigns.dask_workers import dask_cluster, versions
-from analysis.campaigns.workers import Lost
+from analysis.campaigns import CampaignError, campaign
+from analysis.campaigns import _workers as dask_workers
+from analysis.campaigns._workers import Lost, dask_cluster, versions
 
 ONE_DEATH_IS_ENOUGH = {"distributed.scheduler.allowed-failures": 0}
 

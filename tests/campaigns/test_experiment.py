@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from analysis.campaigns.campaign import _of_one_experiment
-from analysis.campaigns.experiment import most_common, stated_specimens
-from analysis.campaigns.session import SessionFailure, SessionTask, analyse_session
+from analysis.campaigns._campaign import _of_one_experiment
+from analysis.campaigns._experiment import most_common, stated_specimens
+from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 
 
 @pytest.fixture

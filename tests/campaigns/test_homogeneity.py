@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns import campaign, specimen_sentences
-from analysis.campaigns.document import campaign_document
-from analysis.campaigns.experiment import stated_specimens
-from analysis.campaigns.homogeneity import Homogeneity, groups, homogeneity
-from analysis.campaigns.page import campaign_page
-from analysis.campaigns.pooled_figure import pooled_figure
-from analysis.campaigns.rows import all_tables
-from analysis.campaigns.tables import tables_text
+from analysis.campaigns import _sentences as specimen_sentences
+from analysis.campaigns import campaign
+from analysis.campaigns._experiment import stated_specimens
+from analysis.campaigns._homogeneity import Homogeneity, groups, homogeneity
+from analysis.report._campaign_document import campaign_document
+from analysis.report._campaign_figures import pooled_figure
+from analysis.report._campaign_page import campaign_page
+from analysis.report._campaign_rows import all_tables
+from analysis.report._campaign_tables import tables_text
 from rigd.beam import undamped_frequencies_rad_s
 
 STIFFER = 1.03

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from analysis.campaigns.pooled import pooled_bic
-from analysis.campaigns.ranking import ranked_structures
+from analysis.campaigns._pooling import pooled_bic
+from analysis.campaigns._statistics import ranked_structures
 
 QUICK = (
     "--types", "I", "--weights", "const", "--segment", "2000", "--nfft", "8000", "--band", "1,50"
@@ -30,7 +30,7 @@ def run_here(monkeypatch, analyze_here):
     def here(_count):
         yield Here()
 
-    monkeypatch.setattr(sys.modules["analysis.campaigns.campaign"], "process_pool", here)
+    monkeypatch.setattr(sys.modules["analysis.campaigns._campaign"], "process_pool", here)
     return lambda *arguments: analyze_here(*arguments, *QUICK)
 
 

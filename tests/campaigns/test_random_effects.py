@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.campaigns.random_effects import chance_of, random_effects, t_quantile
+from analysis.campaigns._pooling import chance_of, random_effects, t_quantile
 
 
 def one_dimension(values, variances):

@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.campaigns import paper
-from analysis.campaigns.nominal import best_models, mean_deviations, nominal_models
-from analysis.campaigns.parameter_statistics import parameter_statistics
+from analysis.campaigns._statistics import (
+    best_models,
+    mean_deviations,
+    nominal_models,
+    parameter_statistics,
+)
 from analysis.models import STRUCTURES, FrequencyResponseModel
 from analysis.paper._route import Peak, resonant_peaks
+from analysis.report import _campaign_rows as paper
 from rigd.beam import transfer
 
 DATA = Path(__file__).parents[1] / "data"

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from analysis.campaigns import CampaignError, campaign
-from analysis.campaigns.command import campaign_command
-from analysis.campaigns.document import campaign_document
-from analysis.campaigns.page import campaign_page
-from analysis.campaigns.tables import tables_text
-from analysis.campaigns.validation import LostTrial, left_out_errors, validate
-from analysis.campaigns.validation_figure import validation_figure
+from analysis.campaigns._validation import LostTrial, left_out_errors, validate
+from analysis.cli.campaign import campaign_command
 from analysis.identify import BAND_HZ
+from analysis.report._campaign_document import campaign_document
+from analysis.report._campaign_figures import validation_figure
+from analysis.report._campaign_page import campaign_page
+from analysis.report._campaign_tables import tables_text
 
 
 def ends_at_one(path, tried, band_hz):
@@ -29,7 +29,7 @@ def ends_at_one(path, tried, band_hz):
 def shaken(short_sessions, settings):
     """A campaign of four whose worker is killed in the middle of the validation."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("analysis.campaigns.validation.left_out_errors", ends_at_one)
+        patch.setattr("analysis.campaigns._validation.left_out_errors", ends_at_one)
         progress = []
         found = campaign(
             short_sessions, replace(settings, types=("I",)), structures=("III",), jobs=2,
@@ -74,9 +74,9 @@ def test_terminal_page_and_files_account_for_it(shaken):
 
 def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
     # The package's function has its module's name.
-    module = import_module("analysis.campaigns.campaign")
+    module = import_module("analysis.campaigns._campaign")
     monkeypatch.setattr(module, "campaign", lambda *_, **__: shaken)
-    monkeypatch.setattr("analysis.campaigns.write.write_campaign", lambda *_, **__: None)
+    monkeypatch.setattr("analysis.report._campaign_write.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
     code = campaign_command(paths, shaken.settings, structures=("III",), report=tmp_path / "new")
     assert code == 1

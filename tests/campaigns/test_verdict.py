@@ -6,13 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.campaigns import sentences
-from analysis.campaigns.common_findings import common_findings
-from analysis.campaigns.common_structure import freest_estimate
-from analysis.campaigns.homogeneity import Heterogeneity, Homogeneity
-from analysis.campaigns.pooled import pooled
-from analysis.campaigns.pooled_orders import pooled_order
-from analysis.campaigns.verdict import campaign_verdict
+from analysis.campaigns import _sentences as sentences
+from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity
+from analysis.campaigns._orders import freest_estimate, pooled_order
+from analysis.campaigns._pooling import pooled
+from analysis.campaigns._verdict import campaign_verdict, common_findings
 from analysis.identify import Finding
 
 ALIKE = Homogeneity((), ())

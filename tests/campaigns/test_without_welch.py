@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from analysis.campaigns import campaign
-from analysis.campaigns.campaign import _of_one_experiment
-from analysis.campaigns.session import SessionFailure, SessionTask, analyse_session
-from analysis.campaigns.tables import tables_text
-from analysis.campaigns.write import write_campaign
+from analysis.campaigns._campaign import _of_one_experiment
+from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 from analysis.models import WelchSettings
+from analysis.report._campaign_tables import tables_text
+from analysis.report._campaign_write import write_campaign
 
 
 @pytest.fixture(scope="module")

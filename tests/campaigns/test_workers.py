@@ -5,8 +5,7 @@ import time
 import pytest
 
 from analysis.campaigns import CampaignError
-from analysis.campaigns.local_workers import process_pool
-from analysis.campaigns.workers import Lost
+from analysis.campaigns._workers import Lost, process_pool
 
 
 def test_results_come_in_order_and_progress_as_they_are_done(monkeypatch):

@@ -127,7 +127,7 @@ def test_what_the_system_refuses_is_told_as_what_it_is(error, words):
 
 def test_both_commands_say_which_version_they_are(rigd_here):
     import rigd
-    from analysis.cli import app
+    from analysis.cli.app import app
 
     assert rigd_here("--version").stdout == f"rigd {rigd.__version__}\n"
     assert CliRunner().invoke(app, ["--version"]).stdout == f"analyze {rigd.__version__}\n"

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.cli import app
-from analysis.exchange.import_plan import ImportPlan
-from analysis.exchange.mapping import parse_choice
-from analysis.exchange.specimen import Specimen
-from analysis.exchange.write_session import write_session
+from analysis.cli.app import app
+from analysis.exchange._channels import parse_choice
+from analysis.exchange._import_record import ImportPlan
+from analysis.exchange._session_file import write_session
+from analysis.exchange._specimen import Specimen
 from rigd.beam import Beam
 
 PROJECT = Path(__file__).parents[2]

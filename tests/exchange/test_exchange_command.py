@@ -157,7 +157,7 @@ def test_a_disk_that_fills_up_leaves_no_part_of_a_file(analyze, session, tmp_pat
         stream.write(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("analysis.exchange.write_csv.write_csv", full)
+    monkeypatch.setattr("analysis.exchange._csv_format.write_csv", full)
     result = analyze("export", "record", session, tmp_path / "r.csv")
     assert result.exit_code == 1
     assert "r.csv cannot be written: No space left on device" in result.stderr
@@ -179,7 +179,7 @@ def test_the_analysis_stands_beside_its_subcommands(analyze):
 
 def test_the_commands_load_no_library_before_they_run(analyze):
     code = (
-        "import sys, analysis.cli; "
+        "import sys, analysis.cli.app; "
         "print(sorted({'numpy', 'scipy', 'matplotlib', 'nptdms', 'pyuff'} & set(sys.modules)))"
     )
     result = subprocess.run(

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from analysis.exchange.bounded_memory import MAX_MEMORY
-from analysis.exchange.source import MAX_SAMPLES
-from analysis.exchange.specimen import read_specimen
-from analysis.exchange.units import UNITS
+from analysis.exchange._channels import UNITS
+from analysis.exchange._source import MAX_MEMORY, MAX_SAMPLES
+from analysis.exchange._specimen import read_specimen
 from rigd.session import read_session
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "exchange.md").read_text(encoding="utf-8")

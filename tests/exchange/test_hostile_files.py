@@ -8,13 +8,13 @@ import zlib
 
 import pytest
 
-from analysis.exchange.bounded_memory import bounded_memory
+from analysis.exchange._source import bounded_memory
 
 READ = """
 import sys
 from pathlib import Path
-from analysis.exchange.errors import ExchangeError
-from analysis.exchange.source import read_source
+from analysis.exchange._source import ExchangeError
+from analysis.exchange._source import read_source
 try:
     read_source(Path(sys.argv[1]), [sys.argv[2]])
     print("read")

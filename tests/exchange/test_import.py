@@ -5,11 +5,10 @@ import hashlib
 import numpy as np
 import pytest
 
-from analysis.exchange.errors import ExchangeError
-from analysis.exchange.import_plan import ImportPlan
-from analysis.exchange.import_record import import_record
-from analysis.exchange.mapping import parse_choice
-from analysis.exchange.specimen import Specimen, read_specimen
+from analysis.exchange._channels import parse_choice
+from analysis.exchange._import_record import ImportPlan, import_record
+from analysis.exchange._source import ExchangeError
+from analysis.exchange._specimen import Specimen, read_specimen
 from analysis.record import load_record
 from rigd.beam import Beam, Damping, transfer
 from rigd.session import SessionError, SessionExistsError, Status, read_session

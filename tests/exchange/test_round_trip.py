@@ -7,12 +7,11 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.exchange.export import export_frf, export_record
-from analysis.exchange.import_plan import ImportPlan
-from analysis.exchange.import_record import import_record
-from analysis.exchange.mapping import QUANTITIES, parse_choice
-from analysis.exchange.source import read_source
-from analysis.exchange.specimen import Specimen
+from analysis.exchange._channels import QUANTITIES, parse_choice
+from analysis.exchange._export import export_frf, export_record
+from analysis.exchange._import_record import ImportPlan, import_record
+from analysis.exchange._source import read_source
+from analysis.exchange._specimen import Specimen
 from analysis.models import WelchSettings
 from analysis.paper._estimate import estimate
 from analysis.paper._route import analyse

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.exchange.errors import ExchangeError
-from analysis.exchange.source import MAX_SAMPLES, read_source
+from analysis.exchange._source import MAX_SAMPLES, ExchangeError, read_source
 
 NUMBERS = arrays(np.float64, st.integers(2, 40), elements=st.floats(width=64))
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.exchange.errors import ExchangeError
-from analysis.exchange.table import Column, Table
-from analysis.exchange.write_uff58 import write_uff58
+from analysis.exchange._source import ExchangeError
+from analysis.exchange._table import Column, Table
+from analysis.exchange._uff_format import write_uff58
 
 NUMBERS = arrays(np.float64, st.integers(1, 17), elements=st.floats(-1e99, 1e99))
 LENGTHS = range(1, 10)

@@ -4,9 +4,15 @@ import math
 
 import pytest
 
-from analysis.exchange.errors import ExchangeError
-from analysis.exchange.mapping import parse_choice
-from analysis.exchange.units import UNITS, canonical_unit, factor, unit_in_brackets, unit_in_suffix
+from analysis.exchange._channels import (
+    UNITS,
+    canonical_unit,
+    factor,
+    parse_choice,
+    unit_in_brackets,
+    unit_in_suffix,
+)
+from analysis.exchange._source import ExchangeError
 
 
 @pytest.mark.parametrize(

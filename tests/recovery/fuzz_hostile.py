@@ -418,7 +418,7 @@ def command_action(command, path):
     def action():
         folder = path.parent
         if command == "analyze":
-            from analysis.cli import app
+            from analysis.cli.app import app
 
             arguments = [str(path), "--method", "welch", "--types", "III", "--report",
                          str(folder / "report")]  # fmt: skip

@@ -6,7 +6,7 @@ import os
 import pytest
 from typer.testing import CliRunner
 
-from analysis.cli import app as analyze
+from analysis.cli.app import app as analyze
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from analysis.cli import app
+from analysis.cli.app import app
 
 QUICK = ("--method", "welch", "--types", "I", "--weights", "const")
 
@@ -256,11 +256,11 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
 
 
 STOPPED = (
-    "import analysis.cli\n"
+    "import analysis.cli.app\n"
     "def stopped(*_):\n"
     "{body}\n"
-    "analysis.cli.session_command = stopped\n"
-    "analysis.cli.main()\n"
+    "analysis.cli.app.session_command = stopped\n"
+    "analysis.cli.app.main()\n"
 )
 CTRL_C = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep({})"
 
@@ -297,10 +297,10 @@ def test_ctrl_c_while_it_is_being_imported_ends_with_130_and_without_traceback(t
 
 def test_ctrl_c_while_options_are_made_ready_ends_with_130_and_without_traceback(tmp_path):
     (tmp_path / "early.py").write_text(
-        "import analysis.cli\n"
+        "import analysis.cli.app\n"
         f"def app(): {CTRL_C.format(30)}\n"
-        "analysis.cli.app = app\n"
-        "analysis.cli.main()\n"
+        "analysis.cli.app.app = app\n"
+        "analysis.cli.app.main()\n"
     )
     assert run_as_is("early", tmp_path) == (130, "", "")
 
@@ -314,7 +314,7 @@ def test_help_has_an_example_and_the_choices(tmp_path):
 
 def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
     code = (
-        "import sys, analysis.cli; "
+        "import sys, analysis.cli.app; "
         "print([m for m in ('numpy', 'scipy', 'matplotlib', 'rich', 'mcap') if m in sys.modules])"
     )
     result = subprocess.run(
@@ -335,8 +335,8 @@ def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, fil
         fixed.append(options["fixed"])
         return 0
 
-    monkeypatch.setattr("analysis.cli.session_command", run)
-    monkeypatch.setattr("analysis.campaigns.command.campaign_command", campaign)
+    monkeypatch.setattr("analysis.cli.app.session_command", run)
+    monkeypatch.setattr("analysis.cli.campaign.campaign_command", campaign)
     result = CliRunner().invoke(app, [*files, "--fix", "tool_inertia_kg_m2, delay_s"])
     assert result.exit_code == 0, result.output
     assert fixed == [("delay_s", "tool_inertia_kg_m2")]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.report.document import document, document_text
+from analysis.report._document import document, document_text
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ from PIL import Image
 from analysis.models import WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report import style
-from analysis.report.frf_figure import frf_figure
-from analysis.report.signals_figure import signals_figure
-from analysis.report.torque_figure import best_model, torque_figure
+from analysis.report import _style as style
+from analysis.report._frf_figure import frf_figure
+from analysis.report._signal_figures import best_model, torque_figure
+from analysis.report._signal_figures import paper_signals_figure as signals_figure
 
 
 def pixels(figure, path):

@@ -1,6 +1,6 @@
 import pytest
 
-from analysis.report.folder import (
+from analysis.report._folder import (
     OutputError,
     OutputExistsError,
     check_new_file,

@@ -22,7 +22,7 @@ def peak():
     status = dict(line.split(":", 1) for line in open("/proc/self/status"))
     print(int(status["VmHWM"].split()[0]) // 1024)
 atexit.register(peak)
-from analysis.cli import main
+from analysis.cli.app import main
 main()
 """
 

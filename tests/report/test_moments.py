@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.report import style
-from analysis.report.moments import resonance_moments
-from analysis.report.signals_figure import signals_figure
-from analysis.report.torque_figure import torque_figure
+from analysis.report import _style as style
+from analysis.report._signal_figures import paper_signals_figure as signals_figure
+from analysis.report._signal_figures import resonance_moments, torque_figure
 
 MODES_HZ = np.array([2.5537, 16.003, 44.810])
 

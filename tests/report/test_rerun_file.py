@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.cli import app
+from analysis.cli.app import app
 from analysis.models import WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report import fit_charts
-from analysis.report.folder import OutputError
-from analysis.report.rerun_file import write_rerun_file
+from analysis.report import _rerun_file as fit_charts
+from analysis.report._folder import OutputError
+from analysis.report._rerun_file import write_rerun_file
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
 from rigd.view._recorded import new_rrd_file
@@ -214,7 +214,7 @@ def run(application, *arguments):
 
 def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeypatch):
     # The figures take longer than all the rest, and are tested elsewhere.
-    monkeypatch.setattr("analysis.report.write.write_report", lambda *_: None)
+    monkeypatch.setattr("analysis.report._write.write_report", lambda *_: None)
     out = tmp_path / "new" / "fits.rrd"
     quick = ("--types", "I", "--weights", "const", "--method", "welch", "--segment", "1000")
     done = run(app, session, *quick, "--rerun", out)

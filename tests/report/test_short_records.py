@@ -9,9 +9,9 @@ from analysis.models import WelchSettings
 from analysis.paper._estimate import estimate_warnings
 from analysis.paper._route import analyse
 from analysis.record import RecordError, load_record
-from analysis.report import style
-from analysis.report.document import document_text
-from analysis.report.folder import write_new
+from analysis.report import _style as style
+from analysis.report._document import document_text
+from analysis.report._folder import write_new
 
 ONE_FIT = ("--frf", "fft", "--types", "VI", "--weights", "omega")
 

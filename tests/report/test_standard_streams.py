@@ -13,7 +13,7 @@ needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs a disk that is 
 
 QUICK = ("--method", "welch", "--frf", "fft", "--types", "I", "--weights", "const")
 GREEK = """
-from analysis.commands.standard_streams import standard_streams
+from analysis.cli.standard_streams import standard_streams
 with standard_streams():
     for _ in range(20_000):
         print("\\u03b6 = 1")

@@ -7,8 +7,8 @@ from rich.console import Console
 from analysis.models import WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report.tables import summary_table, with_spread
-from analysis.report.write import tables_text
+from analysis.report._text import summary_table, with_spread
+from analysis.report._write import tables_text
 from rigd.beam import modes
 
 

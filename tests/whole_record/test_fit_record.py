@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, MeasurementError, Plant, fit_record
-from analysis.identify._optimizer import descend
 from analysis.identify._parametrization import Steps, Unknowns
 from analysis.identify._problem import Comparison, Objective
 from analysis.models import STRUCTURES
+from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, modes
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

@@ -8,8 +8,8 @@ from analysis.identify import Measurement, fit_record, of_fit
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report.html import Subject, Verdict
-from analysis.report.html.write import write_html_report
+from analysis.report._write import write_html_report
+from analysis.results import Subject, Verdict
 
 TYPES = ("I", "III", "VI", "VII")
 HOSTILE = "<script>alert('note')</script> & \"quotes\" $x^2$"

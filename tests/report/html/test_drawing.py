@@ -1,7 +1,7 @@
 import re
 
-from analysis.report import style
-from analysis.report.html.drawing import drawing, svg_text
+from analysis.report import _style as style
+from analysis.report._html import drawing, svg_text
 
 TEXTS = re.compile(r"<text[^>]*>([^<]*)</text>")
 

@@ -12,16 +12,13 @@ import pytest
 
 from analysis.identify import of_fit
 from analysis.identify._headline import Simpler
-from analysis.report import style
-from analysis.report.document import _finite
-from analysis.report.folder import OutputError
-from analysis.report.html import Verdict
-from analysis.report.html.damping_sentences import damping_sentences
-from analysis.report.html.figures import illustrations
-from analysis.report.html.page import page
-from analysis.report.html.record_entries import record_entries
-from analysis.report.html.table import Number
-from analysis.report.html.write import FIGURES, report_tables, write_html_report
+from analysis.report import _style as style
+from analysis.report._document import _finite, record_entries
+from analysis.report._folder import OutputError
+from analysis.report._record_page import damping_sentences, illustrations, page
+from analysis.report._table import Number
+from analysis.report._write import FIGURES, report_tables, write_html_report
+from analysis.results import Verdict
 
 VOID = {"meta", "br", "img"}
 LIMIT_BYTES = 2_000_000

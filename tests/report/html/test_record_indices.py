@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.paper._route import fit_indices
-from analysis.report.document import document
-from analysis.report.record_indices import indices_of_record_fit, whole_record_indices
+from analysis.report._document import document, indices_of_record_fit, whole_record_indices
 from rigd.beam import transfer
 
 

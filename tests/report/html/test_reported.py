@@ -12,17 +12,13 @@ from rich.console import Console
 
 from analysis.identify import of_fit
 from analysis.models import STRUCTURES
-from analysis.report import style
-from analysis.report.document import document
-from analysis.report.html.damping_sentences import damping_sentences
-from analysis.report.html.figures import illustrations
-from analysis.report.html.page import page
-from analysis.report.html.reported import MARK, unreported
-from analysis.report.html.table import Number, csv_text
-from analysis.report.html.write import report_tables
-from analysis.report.record_text import record_text
-from analysis.report.supported_band import excited_band_hz, supported_band_hz
-from analysis.report.write import tables_text
+from analysis.report import _style as style
+from analysis.report._bands import excited_band_hz, supported_band_hz
+from analysis.report._document import document
+from analysis.report._record_page import damping_sentences, illustrations, page
+from analysis.report._table import MARK, Number, csv_text, unreported
+from analysis.report._text import record_text
+from analysis.report._write import report_tables, tables_text
 
 ALPHA = frozenset({"alpha"})
 REASON = "order 1 on another beam explains as much"

@@ -1,0 +1,286 @@
+"""A campaign: all sessions analysed in parallel, then what they say together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.campaigns._experiment import CampaignError, labelled, most_common, stated_specimens
+from analysis.campaigns._homogeneity import Homogeneity, homogeneity
+from analysis.campaigns._orders import freest_estimate
+from analysis.campaigns._pooling import PooledEstimate, pooled_estimates
+from analysis.campaigns._session import (
+    SessionFailure,
+    SessionResult,
+    SessionTask,
+    analyse_session,
+)
+from analysis.campaigns._statistics import (
+    NominalModel,
+    ParameterStatistics,
+    RankedStructure,
+    nominal_models,
+    parameter_statistics,
+    ranked_structures,
+)
+from analysis.campaigns._validation import FEWEST, LeftOutError, LostTrial, validate
+from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
+from analysis.campaigns._workers import Lost, available_cores, dask_cluster, process_pool
+from analysis.models import STRUCTURES, WelchSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from analysis.campaigns._workers import Workers
+    from analysis.identify import Setting
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """Results of all sessions, and of all together.
+
+    Attributes
+    ----------
+    settings : WelchSettings
+    record_band_hz : tuple of float
+        Of the whole-record fits of most sessions.
+    sessions : tuple of SessionResult
+        In the order of the paths.
+    failures : tuple of SessionFailure
+        Sessions of which nothing is used.
+    statistics : tuple of ParameterStatistics
+        Table 3; empty where Welch's method does not suit some session, as the following.
+    nominal : tuple of NominalModel
+        By type, then by weighting: Table 4 and Figures 6 and 7.
+    homogeneity : Homogeneity
+        Whether the sessions are of one specimen.
+    structures : tuple of RankedStructure
+        Every structure fitted to the whole records, those pooled first.
+    pooled : tuple of PooledEstimate
+        Of the structures that two sessions or more determine, the lowest BIC first; empty without
+        whole-record fits.
+    verdict : CampaignVerdict or None
+        Which of them the data support, and what else they say; None without any.
+    validation : tuple of LeftOutError
+        Session by session; empty with fewer than three sessions.
+    lost_trials : tuple of LostTrial
+        Sessions that were to be predicted and were not. With three sessions or more, each has its
+        errors in `validation` or is here.
+    """
+
+    settings: WelchSettings
+    record_band_hz: tuple[float, float]
+    sessions: tuple[SessionResult, ...]
+    failures: tuple[SessionFailure, ...]
+    statistics: tuple[ParameterStatistics, ...]
+    nominal: tuple[NominalModel, ...]
+    homogeneity: Homogeneity
+    structures: tuple[RankedStructure, ...]
+    pooled: tuple[PooledEstimate, ...]
+    verdict: CampaignVerdict | None
+    validation: tuple[LeftOutError, ...]
+    lost_trials: tuple[LostTrial, ...]
+
+    @property
+    def headline(self) -> PooledEstimate | None:
+        """Pooled estimate that the numbers are of, None without any: see `freest_estimate`."""
+        return freest_estimate(self.pooled)
+
+    @property
+    def trials(self) -> int:
+        """Sessions that were to be predicted from the others."""
+        return len(self.sessions) if len(self.sessions) >= FEWEST else 0
+
+
+def campaign(
+    paths: Sequence[Path],
+    settings: WelchSettings | None = None,
+    *,
+    structures: Sequence[str] = tuple(STRUCTURES),
+    fixed: Sequence[Setting] = (),
+    band_hz: tuple[float, float] | None = None,
+    jobs: int | None = None,
+    dask: str | None = None,
+    on_progress: Callable[[int, int, str], None] = lambda _done, _total, _what: None,
+) -> Campaign:
+    """Analyse a campaign of sessions of one specimen on one rig.
+
+    Every session goes by Welch's method (`analysis.paper`), where that suits all of them, and
+    by the whole record (`analysis.identify`); each is then predicted from the others.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Session files.
+    settings : WelchSettings, optional
+        Of the paper's route, by default the paper's.
+    structures : sequence of str
+        Types of the whole-record estimate to choose from; none leaves that estimate, the verdict
+        and the estimate's validation out.
+    fixed : sequence of str
+        Settings of rig and specimen that stay at the file's values in those fits.
+    band_hz : tuple of float, optional
+        Of all fits and of the validation; by default what suits each record.
+    jobs : int, optional
+        Worker processes, by default one a core.
+    dask : str, optional
+        Address of a Dask scheduler whose workers are used instead; they find the files under the
+        same absolute paths.
+    on_progress : callable, optional
+        Called with the steps done, their number and a file's name.
+
+    Raises
+    ------
+    CampaignError
+        No session could be analysed, or the workers could not be had.
+
+    Notes
+    -----
+    Worker processes import the calling script anew, so a script has to call this under
+    ``if __name__ == "__main__":``.
+    """
+    if not paths:
+        raise CampaignError("A campaign needs session files, and none was given.")
+    if dask is not None:
+        paths = [path.absolute() for path in paths]
+    settings = settings or WelchSettings()
+    task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz)
+    done, total = 0, 2 * len(paths)
+
+    def step(name: str) -> None:
+        nonlocal done
+        done += 1
+        on_progress(done, total, name)
+
+    made: AbstractContextManager[Workers] = (
+        process_pool(min(jobs or available_cores(), len(paths)))
+        if dask is None
+        else dask_cluster(dask)
+    )
+    with made as workers:
+        results = workers.run(
+            analyse_session, [(path, task) for path in paths], lambda i: step(paths[i].name)
+        )
+        sessions, failures = _of_one_experiment(
+            [
+                SessionFailure(path, f"{path}: {result.reason}; analyse it by itself.")
+                if isinstance(result, Lost)
+                else result
+                for path, result in zip(paths, results, strict=True)
+            ]
+        )
+        if not sessions:
+            raise CampaignError(
+                "No session could be analysed:\n" + "\n".join(f.message for f in failures)
+            )
+        validation: tuple[LeftOutError, ...] = ()
+        lost: tuple[LostTrial, ...] = ()
+        if len(sessions) >= FEWEST:
+            total = len(paths) + len(sessions)
+            names = [session.path.name for session in sessions]
+            validation, lost = validate(workers, sessions, band_hz, lambda i: step(names[i]))
+    pooled = pooled_estimates(sessions)
+    usable = [(each.path, each.experiment) for each in sessions]
+    left_out = [(each.path, each.experiment) for each in failures]
+    specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
+    alike = homogeneity(sessions, pooled, specimens)
+    return Campaign(
+        settings=sessions[0].settings,
+        record_band_hz=sessions[0].record_band_hz,
+        sessions=tuple(sessions),
+        failures=tuple(failures),
+        statistics=parameter_statistics(sessions),
+        nominal=nominal_models(sessions),
+        homogeneity=alike,
+        structures=ranked_structures(sessions, pooled),
+        pooled=pooled,
+        verdict=campaign_verdict(sessions, pooled, alike, validation, lost),
+        validation=validation,
+        lost_trials=lost,
+    )
+
+
+def _of_one_experiment(
+    results: Sequence[SessionResult | SessionFailure],
+) -> tuple[list[SessionResult], list[SessionFailure]]:
+    """Set aside what failed, and what is not the experiment that most of the sessions are."""
+    usable = [result for result in results if isinstance(result, SessionResult)]
+    if not usable:
+        return [], [result for result in results if isinstance(result, SessionFailure)]
+    results = _labelled(results)
+    usable = [result for result in results if isinstance(result, SessionResult)]
+    common = usable[most_common([session.experiment for session in usable])]
+    sessions: list[SessionResult] = []
+    failures: list[SessionFailure] = []
+    for result in results:
+        reason = _reason_against(result, common, sessions)
+        if reason is None and isinstance(result, SessionResult):
+            sessions.append(result)
+        elif reason is None and isinstance(result, SessionFailure):
+            failures.append(result)
+        else:
+            failures.append(
+                SessionFailure(result.path, f"{result.path}: {reason}", result.experiment)
+            )
+    return _alike_by_welch(sessions, failures)
+
+
+def _alike_by_welch(
+    sessions: list[SessionResult], failures: list[SessionFailure]
+) -> tuple[list[SessionResult], list[SessionFailure]]:
+    """Leave Welch's fits to all sessions or to none: set aside the odd ones, or do without."""
+    without = [each for each in sessions if not each.frequency_hz.size]
+    if not without:
+        return sessions, failures
+    if 2 * len(without) >= len(sessions):
+        return [each.without_welch() for each in sessions], failures
+    odd = [
+        SessionFailure(
+            each.path,
+            f"{each.path}: {each.warnings[-1]} Most others have them: analyse this one by itself.",
+            each.experiment,
+        )
+        for each in without
+    ]
+    return [each for each in sessions if each.frequency_hz.size], [*failures, *odd]
+
+
+def _labelled(
+    results: Sequence[SessionResult | SessionFailure],
+) -> list[SessionResult | SessionFailure]:
+    """Take the specimens' labels for what they say: see `labelled`."""
+    stated = iter(labelled([each.experiment for each in results if each.experiment]))
+    return [replace(each, experiment=next(stated)) if each.experiment else each for each in results]
+
+
+def _reason_against(
+    result: SessionResult | SessionFailure, common: SessionResult, before: Sequence[SessionResult]
+) -> str | None:
+    """Say why a session does not belong to those it came with, None if nothing speaks against."""
+    experiment = result.experiment
+    difference = experiment and common.experiment.difference(experiment)
+    if difference:
+        return (
+            f"{difference} in {common.path}, as in most; a campaign repeats one experiment on one "
+            "specimen: analyse this one by itself, or correct the metadata."
+        )
+    if isinstance(result, SessionFailure):
+        return None
+    for other in before:
+        if result.path == other.path:
+            return "the file is given more than once, and counts once."
+        if result.experiment.identity == other.experiment.identity:
+            return f"it is the same session as {other.path}, which would count twice."
+    both = common.frequency_hz.size and result.frequency_hz.size
+    if both and not np.array_equal(common.frequency_hz, result.frequency_hz):
+        return (
+            f"its estimate has {len(result.frequency_hz)} bins from {result.frequency_hz[0]:g} Hz, "
+            f"but that of {common.path} {len(common.frequency_hz)} from "
+            f"{common.frequency_hz[0]:g} Hz, so they cannot be averaged: their rates differ; "
+            "analyse this one by itself, or leave --segment and --nfft to the defaults."
+        )
+    return None

@@ -1,0 +1,248 @@
+"""What the sessions of one campaign have in common, and what can go wrong with a campaign."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from analysis.campaigns._session import SessionFailure
+    from analysis.record import Record
+
+
+class CampaignError(ValueError):
+    """A campaign that cannot be analysed; the message says why and what to do."""
+
+
+class LoneSessionError(CampaignError):
+    """A campaign of whose files one alone can be used.
+
+    Attributes
+    ----------
+    path : Path
+        That one.
+    failures : tuple of SessionFailure
+        The others, and why.
+    """
+
+    def __init__(self, path: Path, failures: tuple[SessionFailure, ...]) -> None:
+        super().__init__(f"Of {len(failures) + 1} files only {path} can be used.")
+        self.path = path
+        self.failures = failures
+
+
+def task_errors() -> tuple[type[Exception], ...]:
+    """Errors that concern one session and leave the others as they are."""
+    from analysis.identify import MeasurementError
+    from analysis.paper import EstimateError
+    from analysis.record import RecordError
+    from rigd.session import SessionError
+
+    return SessionError, RecordError, EstimateError, MeasurementError
+
+
+_STATED: Final = ("excitation", "amplitude_rad", "start_hz", "stop_hz", "duration_s", "taper_s")
+LABEL: Final = "specimen"
+"""Key of what the operator calls the specimen."""
+
+_OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
+                       "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
+_UNITS: Final = {"beam_length_m": "m", "beam_density_kg_per_m": "kg/m",
+                 "beam_bending_stiffness_n_m2": "N·m²", "tool_inertia_kg_m2": "kg·m²",
+                 "amplitude_rad": "rad", "start_hz": "Hz", "stop_hz": "Hz", "duration_s": "s",
+                 "taper_s": "s"}  # fmt: skip
+_WHOLE: Final = 0.99
+"""Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """Specimen and excitation of one session, as its file states them.
+
+    Attributes
+    ----------
+    facts : mapping of str to (str or float)
+        By the key of the session file; of what is optional there, what is stated.
+    sweep_s : float
+        How long the sweep in the file is.
+    identity : tuple of str
+        By which a copy of the file is recognised: the session's, or without one the file's path.
+    start_utc : str
+        When it was recorded, to the second; empty if the file does not say.
+    operator, note : str
+        What the file says of either, or nothing.
+    """
+
+    facts: Mapping[str, str | float]
+    sweep_s: float
+    identity: tuple[str, ...]
+    start_utc: str = ""
+    operator: str = ""
+    note: str = ""
+
+    @classmethod
+    def of(cls, record: Record) -> Experiment:
+        """Collect what a record states."""
+        beam, metadata = record.beam, record.metadata
+        stated = {key: _number(metadata[key]) for key in _STATED if key in metadata}
+        label = metadata.get(LABEL, "").strip()
+        return cls(
+            facts={
+                **({LABEL: label} if label else {}),
+                "beam_length_m": beam.length_m,
+                "beam_density_kg_per_m": beam.density_kg_per_m,
+                "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
+                "tool_inertia_kg_m2": record.tool_inertia_kg_m2,
+                **stated,
+            },
+            sweep_s=record.sweep_samples / record.rate_hz,
+            identity=(
+                (metadata["id"], metadata["start_utc_ns"])
+                if {"id", "start_utc_ns"} <= metadata.keys()
+                else (str(record.path.resolve()),)
+            ),
+            start_utc=_time(metadata.get("start_utc_ns", "")),
+            operator=metadata.get("operator", "").strip(),
+            note=metadata.get("note", "").strip(),
+        )
+
+    @property
+    def label(self) -> str:
+        """What the file calls the specimen; empty if nothing."""
+        return str(self.facts.get(LABEL, ""))
+
+    def unfinished(self, outcome: str) -> str:
+        """Say that the sweep ended early, as the end of a sentence; empty if it did not."""
+        planned_s = self.facts.get("duration_s")
+        if not isinstance(planned_s, float) or self.sweep_s >= _WHOLE * planned_s:
+            return ""
+        return (
+            f"its sweep ended after {self.sweep_s:.4g} s of {planned_s:g} s (outcome: {outcome}), "
+            "and is not averaged with whole ones; analyse it by itself."
+        )
+
+    def difference(self, other: Experiment) -> str | None:
+        """Name the first fact in which another one differs, None if it is the same experiment."""
+        for key, mine in self.facts.items():
+            theirs = other.facts.get(key, mine)
+            if not _same(theirs, mine):
+                return f"{key} is {told(key, theirs)}, but {told(key, mine)}"
+        return None
+
+    def same_specimen(self, other: Experiment) -> bool:
+        """Whether another one states the same beam and the same inertia of the tool."""
+        return not any(
+            key in self.facts and not _same(other.facts.get(key, self.facts[key]), self.facts[key])
+            for key in _OF_SPECIMEN
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class StatedSpecimen:
+    """One specimen, as files state it.
+
+    Attributes
+    ----------
+    facts : mapping of str to (str or float)
+        Beam and inertia of the tool by the keys of the session files.
+    paths : tuple of Path
+        Files that state it, whether they can be used or not.
+    """
+
+    facts: Mapping[str, str | float]
+    paths: tuple[Path, ...]
+
+
+def stated_specimens(
+    stated: Iterable[tuple[Path, Experiment | None]], of_campaign: Experiment
+) -> tuple[StatedSpecimen, ...]:
+    """Group files by the specimen that they state; first that of the campaign, then as they come.
+
+    Parameters
+    ----------
+    stated : iterable of (Path, Experiment or None)
+        None of a file that could not be read.
+    of_campaign : Experiment
+        Of the sessions that are pooled.
+    """
+    found: list[tuple[Experiment, list[Path]]] = [(of_campaign, [])]
+    for path, experiment in stated:
+        if experiment is None:
+            continue
+        for specimen, paths in found:
+            if specimen.same_specimen(experiment):
+                paths.append(path)
+                break
+        else:
+            found.append((experiment, [path]))
+    return tuple(
+        StatedSpecimen(
+            {key: specimen.facts[key] for key in _OF_SPECIMEN if key in specimen.facts},
+            tuple(paths),
+        )
+        for specimen, paths in found
+    )
+
+
+def labelled(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Tell the unlabelled from the labelled where there are several labels.
+
+    With one label alone, a session without it is taken for the same specimen. With several nobody
+    knows which of them it is.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    """
+    if len({each.label for each in experiments if each.label}) < 2:
+        return list(experiments)
+    return [replace(each, facts={LABEL: each.label, **each.facts}) for each in experiments]
+
+
+def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
+    """Keys in which specimens differ."""
+    first = specimens[0].facts
+    return tuple(
+        key
+        for key, value in first.items()
+        if not all(_same(each.facts.get(key, value), value) for each in specimens)
+    )
+
+
+def most_common(experiments: Sequence[Experiment]) -> int:
+    """Return the place of the one with which most others agree, the first of several."""
+    agree = [sum(one.difference(two) is None for two in experiments) for one in experiments]
+    return agree.index(max(agree))
+
+
+def _same(one: str | float, two: str | float) -> bool:
+    if isinstance(one, str) or isinstance(two, str):
+        return one == two
+    return math.isclose(one, two, rel_tol=1e-9)
+
+
+def told(key: str, value: str | float) -> str:
+    """Write a fact with its unit."""
+    if isinstance(value, str):
+        return (f"“{value}”" if value else "not stated") if key == LABEL else value
+    return f"{value:g} {_UNITS.get(key, '')}".rstrip()
+
+
+def _time(utc_ns: str) -> str:
+    """Write the wall clock's time as in ISO 8601, to the second; nothing where there is none."""
+    try:
+        return f"{datetime.fromtimestamp(int(utc_ns) // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"
+    except (ValueError, OverflowError, OSError):
+        return ""
+
+
+def _number(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,0 +1,152 @@
+"""What a campaign says first, for programs: each session's headline, then that of all together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from analysis.campaigns._pooling import t_quantile
+from analysis.identify import STRONG, Mode, Numbers, Quantity, Simpler, Size, headline_json
+from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.campaigns._campaign import Campaign
+    from analysis.campaigns._orders import PooledOrder
+    from analysis.campaigns._pooling import PooledEstimate
+    from analysis.campaigns._statistics import RankedStructure
+    from analysis.campaigns._verdict import CampaignVerdict
+    from analysis.identify import StructureStatus
+
+_UNEXPLAINED: Final = "part of the records is unexplained"
+_MIXTURE: Final = "the mean of a mixture: sessions differ in it in kind"
+_ON_BOUND: Final = "the plain mean: it rests on its bound in some session"
+_ADEQUATE: Final = 0.9
+
+
+def headlines(campaign: Campaign) -> list[dict[str, Any]]:
+    """Collect the headlines of a campaign.
+
+    Parameters
+    ----------
+    campaign : Campaign
+
+    Returns
+    -------
+    list of dict
+        As of single files; the last one, with ``file`` null, is of all sessions together. Without
+        whole-record fits there are none.
+    """
+    found = [dict(each.headline) for each in campaign.sessions if each.headline]
+    pooled, verdict = campaign.headline, campaign.verdict
+    if pooled is not None and verdict is not None:
+        found.append(_shared(campaign, pooled, verdict))
+    return found
+
+
+def _shared(campaign: Campaign, pooled: PooledEstimate, verdict: CampaignVerdict) -> dict[str, Any]:
+    orders = (verdict.alpha, verdict.lambda_)
+    explained = verdict.adequate >= _ADEQUATE * verdict.sessions
+    every = None if explained else _UNEXPLAINED
+    told = Numbers(
+        name=pooled.name,
+        parameters=_parameters(campaign, pooled, orders, every),
+        sizes=_sizes(pooled, orders, every),
+        modes=_modes(campaign, pooled, every),
+        structures=tuple((each.name, _status(each, pooled)) for each in campaign.structures),
+        simpler=_simpler(campaign, pooled),
+    )
+    named = (
+        replace(each.example, sentence=each.sentence, interval=None) for each in verdict.findings
+    )
+    return headline_json(None, told, orders, named)
+
+
+def _simpler(campaign: Campaign, pooled: PooledEstimate) -> Simpler | None:
+    """Take what the lowest BIC gives, on condition that its orders are true."""
+    conditional = campaign.pooled[0]
+    if conditional is pooled:
+        return None
+    fixed = STRUCTURES[conditional.structure].fixed
+    return Simpler(
+        name=conditional.name,
+        fixed={name: value for name, value in fixed.items() if name in COEFFICIENT_OF},
+        parameters={
+            each.name: Quantity(each.value, each.std, each.interval)
+            for each in conditional.parameters
+        },
+    )
+
+
+def _parameters(
+    campaign: Campaign,
+    pooled: PooledEstimate,
+    orders: tuple[PooledOrder, ...],
+    every: str | None,
+) -> dict[str, Quantity]:
+    mixed = campaign.homogeneity.is_mixed
+    flags = _flags(orders)
+    found = {
+        each.name: Quantity(
+            each.value,
+            each.std,
+            each.interval,
+            every or (_MIXTURE if mixed(each.name) else flags.get(each.name)),
+        )
+        for each in pooled.parameters
+    }
+    free = STRUCTURES[pooled.structure].free
+    for name, value in pooled.plant.parameters.items():
+        if name not in found and (name not in PARAMETERS or name in free):
+            found[name] = Quantity(value, None, None, every or _ON_BOUND)
+    return found
+
+
+def _flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
+    """Reasons against an order, which its coefficient shares."""
+    return {
+        name: each.reason
+        for each in orders
+        if each.reason is not None
+        for name in (each.order, COEFFICIENT_OF[each.order])
+    }
+
+
+def _sizes(
+    pooled: PooledEstimate, orders: tuple[PooledOrder, ...], every: str | None
+) -> tuple[Size, ...]:
+    flags = _flags(orders)
+    return tuple(
+        Size(
+            each.damping,
+            each.omega_rad_s,
+            Quantity(each.value, each.std, each.interval, every or flags.get(each.order)),
+        )
+        for each in pooled.sizes
+    )
+
+
+def _modes(campaign: Campaign, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
+    t, mixed = t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
+
+    def told(value: float, std: float, quantity: str) -> Quantity:
+        flag = every or (_MIXTURE if mixed(quantity) else None)
+        return Quantity(value, std, (value - t * std, value + t * std), flag)
+
+    return tuple(
+        Mode(
+            mode.number,
+            told(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
+            told(mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"),
+            shown=True,
+        )
+        for mode in pooled.modes
+    )
+
+
+def _status(each: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
+    if each.name == pooled.name:
+        return "selected"
+    above = each.bic_above_lowest
+    return "compatible" if above is not None and above < STRONG else "excluded"

@@ -1,0 +1,237 @@
+"""One structure for all sessions, and what they say together about the orders of the damping.
+
+The one structure by which all sessions are compared and pooled: the freest that they support.
+
+What a session selects by itself depends on its noise. Sessions compared by what each of them
+selected differ by the difference between structures, and forty sessions of one beam then seem to
+be of two. Intervals of the freest structure hold whichever simpler one is true.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from analysis.campaigns._pooling import by_structure, t_quantile
+from analysis.identify import STRONG, WIDEST_SHARE
+from analysis.models import ORDER_RANGE, STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from analysis.campaigns._estimates import RecordEstimate
+    from analysis.campaigns._homogeneity import Homogeneity
+    from analysis.campaigns._pooling import PooledEstimate, PooledParameter
+    from analysis.campaigns._session import SessionResult
+    from analysis.identify import Order, Verdict
+
+_NEARLY_ALL: Final = 0.9
+"""Share of the sessions that determine the selected structure that must determine a freer one."""
+
+
+def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
+    """Return the freest pooled structure on the beam that all sessions together support.
+
+    The beam is that of the lowest BIC; a structure that far fewer sessions determine does not
+    stand for all. None without any.
+
+    Parameters
+    ----------
+    pooled : sequence of PooledEstimate
+        The lowest BIC first.
+    """
+    if not pooled:
+        return None
+    best = pooled[0]
+    return max(
+        (
+            each
+            for each in pooled
+            if each.beam == best.beam and each.sessions >= _NEARLY_ALL * best.sessions
+        ),
+        key=lambda each: len(STRUCTURES[each.structure].free),
+    )
+
+
+def common_structure(
+    sessions: Sequence[SessionResult], pooled: Sequence[PooledEstimate]
+) -> str | None:
+    """Name the structure by which the modes of all sessions are compared.
+
+    Parameters
+    ----------
+    sessions : sequence of SessionResult
+    pooled : sequence of PooledEstimate
+        The lowest BIC first.
+
+    Returns
+    -------
+    str or None
+        Of those fitted to every session, the freest: on the beam of what is pooled, or with nothing
+        pooled on the one that most sessions select. None without whole-record fits.
+    """
+    fitted = by_structure(sessions)
+    tried = max(map(len, fitted.values()), default=0)
+    found = [each[0] for each in fitted.values() if len(each) == tried]
+    if not found:
+        return None
+    beam = pooled[0].beam if pooled else _usual_beam(sessions)
+    on_beam = [each for each in found if each.beam == beam] or found
+    return max(on_beam, key=_freedom).name
+
+
+def _usual_beam(sessions: Sequence[SessionResult]) -> str:
+    """Beam of the structure that most sessions select by themselves."""
+    beams = [
+        min(session.record_estimates, key=lambda each: each.bic).beam
+        for session in sessions
+        if session.record_estimates
+    ]
+    return max(beams, key=beams.count)
+
+
+def _freedom(estimate: RecordEstimate) -> int:
+    return len(STRUCTURES[estimate.structure].free)
+
+
+PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
+
+_ADEQUATE: Final = 0.9
+"""Share of the sessions that must leave nothing but noise before an order is reported."""
+
+_SURE: Final = 0.999
+"""Two-sided level at which 1 is excluded: falsely so in one campaign of a thousand."""
+
+_FEW_MODES: Final = "one mode alone shows how much damping there is, not of which order"
+
+
+@dataclass(frozen=True, slots=True)
+class PooledOrder:
+    """One order of the damping over all sessions, in the freest structure.
+
+    Attributes
+    ----------
+    order : str
+        "alpha" or "lambda".
+    status : str
+        "compatible": the 95 % interval holds 1; "fractional": 1 is excluded; "open": 1 is doubtful
+        but not excluded, or something else explains as much; "not identifiable": it could be almost
+        anything; "absent": such damping does not show.
+    value : float or None
+        Pooled estimate, where the order is identifiable.
+    interval : tuple of float or None
+        Its 95 % interval, scatter between sessions included; None also if it was fixed at 1.
+    reason : str or None
+        Why the number must not be taken for a property of the specimen; None: it may.
+    alone : mapping of str to int
+        How many sessions say what by themselves.
+    mixture : bool
+        Whether the reason is that sessions differ in it in kind, or are of different specimens and
+        do not all determine it.
+    """
+
+    order: Order
+    status: PooledStatus
+    value: float | None
+    interval: tuple[float, float] | None
+    reason: str | None
+    alone: Mapping[str, int]
+    mixture: bool = False
+
+
+def pooled_order(
+    order: Order,
+    ranked: Sequence[PooledEstimate],
+    verdicts: Sequence[Verdict],
+    alike: Homogeneity,
+) -> PooledOrder:
+    """Judge one order by what all sessions share, as one record is judged by what it shows.
+
+    Parameters
+    ----------
+    order : str
+    ranked : sequence of PooledEstimate
+        The lowest BIC first; not empty.
+    verdicts : sequence of Verdict
+        Of the sessions.
+    alike : Homogeneity
+        Whether they are of one specimen.
+    """
+    each = [verdict.alpha if order == "alpha" else verdict.lambda_ for verdict in verdicts]
+    alone: dict[str, int] = dict(Counter(str(one.status) for one in each).most_common())
+    freest = freest_estimate(ranked)
+    assert freest is not None
+    free = freest.by_name.get(order)
+    status, reason = _judged(order, ranked, freest, verdicts, alone)
+    known = free is not None and status not in ("not identifiable", "absent")
+    mixture = known and (alike.is_mixed(order) or (alike.mixed and freest.sessions < len(verdicts)))
+    if mixture:
+        status = "open"
+        reason = "the sessions are not of one specimen and do not all share it"
+    return PooledOrder(
+        order=order,
+        status=status,
+        value=free.value if free and known else 1.0 if status == "compatible" else None,
+        interval=free.interval if free and known else None,
+        reason=reason,
+        alone=alone,
+        mixture=mixture,
+    )
+
+
+def _judged(
+    order: Order,
+    ranked: Sequence[PooledEstimate],
+    freest: PooledEstimate,
+    verdicts: Sequence[Verdict],
+    alone: Mapping[str, int],
+) -> tuple[PooledStatus, str | None]:
+    structure = STRUCTURES[freest.structure]
+    modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
+    several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
+    if not several_modes:
+        return "not identifiable", _FEW_MODES
+    if not structure.has(order):
+        return "absent", "no such damping shows"
+    free = freest.by_name.get(order)
+    if free is None and structure.fixed.get(order) == 1.0 and next(iter(alone)) == "compatible":
+        # None of those fitted has it free: the sessions' own verdicts are all that there is.
+        return "compatible", None
+    if free is None or _wide(free.interval) > WIDEST_SHARE:
+        return "not identifiable", "the sessions do not tell the order"
+    if not freest.uniform and len(structure.free) > modes:
+        # The modes' frequencies say nothing of the damping here: a loss factor each is all.
+        return "not identifiable", (
+            f"on a beam that is not uniform it rests on {modes} loss factors alone"
+        )
+    if sum(v.adequate for v in verdicts) < _ADEQUATE * len(verdicts):
+        return "open", "part of the records is unexplained"
+    integer = [each for each in (ranked[0], *rivals(ranked, STRONG)) if _integer(each, order)]
+    if any(each.beam != freest.beam for each in integer):
+        return "open", "order 1 on another kind of beam explains the records about as well"
+    low, high = free.interval
+    if low <= 1 <= high:
+        return "compatible", None
+    excluded = not integer and _excludes_one(free, freest.sessions)
+    return ("fractional" if excluded else "open"), None
+
+
+def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
+    """Return those whose BIC is less than so much above the lowest, without the best."""
+    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
+
+
+def _integer(estimate: PooledEstimate, order: Order) -> bool:
+    """Whether a structure has this damping with an order of 1."""
+    return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
+
+
+def _excludes_one(order: PooledParameter, sessions: int) -> bool:
+    """Whether 1 lies outside the interval of the level at which it is called excluded."""
+    return abs(order.value - 1) > t_quantile(_SURE, sessions - 1) * order.std
+
+
+def _wide(interval: tuple[float, float]) -> float:
+    """Share of the range of orders that an interval spans."""
+    return (interval[1] - interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

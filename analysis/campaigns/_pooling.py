@@ -1,0 +1,454 @@
+"""Whole-record estimates of all sessions pooled: random effects, parameters, modes.
+
+Estimates of many sessions pooled, when sessions differ by more than their own uncertainty.
+
+The random-effects model ``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k
+states for itself, tau the scatter of each parameter between sessions, by the moments of R.
+DerSimonian and N. Laird, "Meta-analysis in clinical trials", Controlled Clinical Trials 7 (1986)
+177-188. A full matrix in place of ``diag(tau²)`` would have more numbers than a campaign has
+sessions: by maximum likelihood, five sessions that do repeat then show two thirds of their own
+standard deviations as scatter in each of eight parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
+from analysis.models import STRUCTURES
+from rigd.beam import Beam, undamped_frequencies_rad_s
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.campaigns._estimates import RecordEstimate
+    from analysis.campaigns._session import SessionResult
+    from analysis.identify import Damping, Order
+
+
+@dataclass(frozen=True, slots=True)
+class RandomEffects:
+    """Pooled estimate of k parameters over K sessions.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (k,)
+    covariance : ndarray, shape (k, k)
+        Of the mean.
+    between_std : ndarray, shape (k,)
+        Scatter between sessions, tau; 0 where the sessions' own uncertainties explain all.
+    cochran_q : ndarray, shape (k,)
+        Squares of the deviations from the weighted mean over the sessions' variances, summed:
+        about K − 1 without scatter between sessions.
+    deviance : float
+        ``-2 ln`` likelihood of the mean and tau, above that of a value of its own for each
+        session: ``sum_k ln|I + S_k⁻¹ diag(tau²)| + r_kᵀ (S_k + diag(tau²))⁻¹ r_k``. Of the tau by
+        moments and of none, the one that is likelier: parameters that each session correlates
+        closely do not scatter one by one, and a tau of a third of their standard deviations then
+        makes forty sessions that repeat less likely by a factor of e⁶⁵.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    between_std: NDArray[np.float64]
+    cochran_q: NDArray[np.float64]
+    deviance: float
+
+
+def random_effects(
+    estimates: NDArray[np.float64], covariances: NDArray[np.float64]
+) -> RandomEffects:
+    """Pool estimates by the random-effects model.
+
+    Parameters
+    ----------
+    estimates : ndarray, shape (K, k)
+        Of two sessions at least.
+    covariances : ndarray, shape (K, k, k)
+        Positive definite, of each estimate.
+    """
+    weight = 1 / np.diagonal(covariances, axis1=1, axis2=2)
+    total = weight.sum(axis=0)
+    q = (weight * (estimates - (weight * estimates).sum(axis=0) / total) ** 2).sum(axis=0)
+    excess = q - (len(estimates) - 1)
+    between = np.maximum(excess / (total - (weight**2).sum(axis=0) / total), 0.0)
+
+    # In units of a typical standard deviation: parameters differ by orders of magnitude.
+    unit = 1 / np.sqrt(weight.mean(axis=0))
+    units = np.outer(unit, unit)
+    origin = estimates.mean(axis=0)
+    own, every = covariances / units, covariances / units + np.diag(between / unit**2)
+    away = (estimates - origin) / unit
+    shift, spread, squares = _combined(away, every)
+    widening = float((np.linalg.slogdet(every)[1] - np.linalg.slogdet(own)[1]).sum())
+    return RandomEffects(
+        mean=origin + unit * shift,
+        covariance=units * spread,
+        between_std=np.sqrt(between),
+        cochran_q=q,
+        deviance=min(widening + squares, _combined(away, own)[2]),
+    )
+
+
+def _combined(
+    values: NDArray[np.float64], covariances: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Weighted mean, its covariance, and the sum of squares of what values are off it."""
+    precision = np.linalg.inv(covariances)
+    spread = np.linalg.inv(precision.sum(axis=0))
+    mean = spread @ np.einsum("kij,kj->i", precision, values)
+    off = values - mean
+    return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
+
+
+@cache
+def t_quantile(level: float, degrees_of_freedom: int) -> float:
+    """Two-sided point of Student's t: within it a share `level` lies.
+
+    With ``t = sqrt(nu) tan(theta)`` the density of theta is ``cos(theta)^(nu-1)`` up to a factor.
+    """
+    theta = np.linspace(0.0, np.pi / 2, 100_001)
+    density = np.cos(theta) ** (degrees_of_freedom - 1)
+    reached = np.concatenate(([0.0], np.cumsum(density[1:] + density[:-1])))
+    at = float(np.interp(level, reached / reached[-1], theta))
+    return float(np.sqrt(degrees_of_freedom) * np.tan(at))
+
+
+def chance_of(cochran_q: NDArray[np.float64], sessions: int) -> NDArray[np.float64]:
+    """Probability of at least that Q without scatter between sessions, shape (k,).
+
+    Chi-square of K − 1 degrees of freedom by the cube-root approximation of Wilson and Hilferty
+    (PNAS 17 (1931) 684-688).
+    """
+    freedom = sessions - 1
+    spread = 2 / (9 * freedom)
+    z = (np.cbrt(cochran_q / freedom) - 1 + spread) / np.sqrt(spread)
+    return np.array([math.erfc(each / math.sqrt(2)) / 2 for each in z])
+
+
+@dataclass(frozen=True, slots=True)
+class PooledMode:
+    """One mode over all sessions.
+
+    Attributes
+    ----------
+    number : int
+    frequency_hz, frequency_std_hz : float
+        Mean over the sessions, and its standard deviation.
+    frequency_between_std_hz : float
+        Scatter between sessions beyond their own uncertainties.
+    damping_ratio, damping_ratio_std, damping_ratio_between_std : float
+        Likewise.
+    """
+
+    number: int
+    frequency_hz: float
+    frequency_std_hz: float
+    frequency_between_std_hz: float
+    damping_ratio: float
+    damping_ratio_std: float
+    damping_ratio_between_std: float
+
+
+def pooled_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
+    """Pool each mode that all sessions have, frequency and damping ratio each by itself."""
+    found = []
+    for modes in zip(*(each.modes for each in estimates), strict=False):
+        frequency = _pooled([(mode.frequency_hz, mode.frequency_std_hz) for mode in modes])
+        ratio = _pooled([(mode.damping_ratio, mode.damping_ratio_std) for mode in modes])
+        if frequency is not None and ratio is not None:
+            found.append(PooledMode(modes[0].number, *frequency, *ratio))
+    return tuple(found)
+
+
+def _pooled(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, float] | None:
+    """Mean, its standard deviation and the scatter between sessions; None if one has no std."""
+    values, std = np.array(estimates).T
+    if not (np.isfinite(std).all() and (std > 0).all()):
+        return None
+    effects = random_effects(values[:, None], (std**2)[:, None, None])
+    mean, variance, between = effects.mean[0], effects.covariance[0, 0], effects.between_std[0]
+    return float(mean), math.sqrt(variance), float(between)
+
+
+_FEWEST: Final = 2
+_DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (
+    ("internal", "zeta", "alpha"),
+    ("external", "gamma", "lambda"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PooledParameter:
+    """One parameter over all sessions.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        Of a positive parameter that is estimated by its logarithm: the geometric mean.
+    std : float
+        Of `value`.
+    interval : (float, float)
+        95 % confidence interval of the value, by Student's t with K − 1 degrees of freedom.
+    within_std : float
+        What a typical session states as its own standard deviation (root mean square).
+    between_std : float
+        Scatter between sessions beyond that; 0 if that explains all.
+    chance : float
+        Probability that sessions without any such scatter differ as much as these (W. G. Cochran,
+        Biometrics 10 (1954) 101-129), each parameter by itself.
+    next_interval : (float, float)
+        Where the parameter of one more session would lie with 95 % (J. P. T. Higgins et al.,
+        J. R. Stat. Soc. A 172 (2009) 137-159), whatever the noise of its own estimate.
+    """
+
+    name: str
+    value: float
+    std: float
+    interval: tuple[float, float]
+    within_std: float
+    between_std: float
+    chance: float
+    next_interval: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PooledSize:
+    """Size of one damping over all sessions, where it depends least on its order.
+
+    Attributes
+    ----------
+    damping : str
+        "internal" or "external".
+    order : str
+        "alpha" or "lambda".
+    omega_rad_s : float or None
+        That frequency; None if the order is fixed: then the size is the coefficient.
+    value, std : float
+        Loss factor, or without that frequency the coefficient: see `DampingSize`.
+    interval : (float, float)
+        95 %.
+    """
+
+    damping: Damping
+    order: Order
+    omega_rad_s: float | None
+    value: float
+    std: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PooledEstimate:
+    """One structure over all sessions.
+
+    Attributes
+    ----------
+    structure : str
+        Name.
+    uniform : bool
+        Whether the beam was taken to be uniform; else each mode has a stiffness of its own.
+    beam : str
+        As of `RecordEstimate`.
+    plant : Plant
+        Of the pooled parameters.
+    parameters : tuple of PooledParameter
+        Those that every session used determines.
+    covariance : ndarray, shape (k, k)
+        Of these, positive ones as logarithms.
+    modes : tuple of PooledMode
+    sessions : int
+        Used: those that determine the structure's damping.
+    misfit : float
+        Median over the sessions of the whitened residual's mean square: 1 if the model leaves
+        nothing but noise. Where it is far beyond 1 the structure is wrong, and its standard
+        deviations mean little.
+    bic : float
+        Of all sessions together, see `pooled_bic`.
+    """
+
+    structure: str
+    uniform: bool
+    beam: str
+    plant: Plant
+    parameters: tuple[PooledParameter, ...]
+    covariance: NDArray[np.float64]
+    modes: tuple[PooledMode, ...]
+    sessions: int
+    misfit: float
+    bic: float
+
+    @property
+    def name(self) -> str:
+        """As tables call it."""
+        return f"{self.structure}{self.beam}"
+
+    @property
+    def sizes(self) -> tuple[PooledSize, ...]:
+        """Sizes of the dampings that all sessions together determine."""
+        names = tuple(each.name for each in self.parameters)
+        t, found = t_quantile(0.95, self.sessions - 1), []
+        values = self.plant.parameters
+        first = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
+        for damping, coefficient, order in _DAMPINGS:
+            size = damping_size(coefficient, order, values, names, self.covariance, first)
+            if size is not None:
+                factor = math.exp(t * size.std / size.value)
+                ends = size.value / factor, size.value * factor
+                at = PooledSize(damping, order, size.omega_rad_s, size.value, size.std, ends)
+                found.append(at)
+        return tuple(found)
+
+    @property
+    def by_name(self) -> dict[str, PooledParameter]:
+        """Parameters by name."""
+        return {each.name: each for each in self.parameters}
+
+
+def pooled_estimates(sessions: Sequence[SessionResult]) -> tuple[PooledEstimate, ...]:
+    """Pool every structure that all sessions tried and two or more determine; lowest BIC first."""
+    by_name = by_structure(sessions)
+    tried = max(map(len, by_name.values()), default=0)
+    found = [pooled(estimates) for estimates in by_name.values() if len(estimates) == tried]
+    return tuple(sorted((each for each in found if each is not None), key=lambda each: each.bic))
+
+
+def by_structure(sessions: Sequence[SessionResult]) -> dict[str, list[RecordEstimate]]:
+    """Whole-record estimates of all sessions by the name of the structure."""
+    found: dict[str, list[RecordEstimate]] = {}
+    for session in sessions:
+        for estimate in session.record_estimates:
+            found.setdefault(estimate.name, []).append(estimate)
+    return found
+
+
+def determines_damping(estimate: RecordEstimate) -> bool:
+    """Whether a session determines its structure's damping, and the modes' offsets if free."""
+    return set(_of_specimen(estimate)) <= set(estimate.determined)
+
+
+def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
+    """Pool one structure; None if fewer than two sessions determine its damping.
+
+    A setting of rig or specimen (the tool's inertia, mostly) that rests on its bound in some
+    session has no place in the common covariance; the plant gets its plain mean.
+    """
+    used = list(filter(determines_damping, estimates))
+    if len(used) < _FEWEST:
+        return None
+    names = [name for name in used[0].determined if all(name in e.determined for e in used)]
+    values, covariances = _stacked(used, names)
+    effects = random_effects(values, covariances)
+    std = np.sqrt(np.diag(effects.covariance))
+    within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
+    t = t_quantile(0.95, len(used) - 1)
+    chances = chance_of(effects.cochran_q, len(used))
+    columns = (effects.mean, std, within, effects.between_std, chances)
+    parameters = tuple(
+        _parameter(name, t, *row)
+        for name, row in zip(names, np.transpose(columns).tolist(), strict=True)
+    )
+    means = {name: float(np.mean([e.parameters[name] for e in used])) for name in SETTINGS}
+    return PooledEstimate(
+        structure=used[0].structure,
+        uniform=used[0].uniform,
+        beam=used[0].beam,
+        plant=_plant(used[0], means | {each.name: each.value for each in parameters}),
+        parameters=parameters,
+        covariance=effects.covariance,
+        modes=pooled_modes(used),
+        sessions=len(used),
+        misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used])),
+        bic=pooled_bic(estimates),
+    )
+
+
+def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
+    """Bayesian information criterion of one structure for all sessions together.
+
+    Damping and offsets of the modes belong to the specimen: one value for all sessions, and a
+    scatter between them if they differ by more than their uncertainties; each costs the logarithm
+    of the number of all data. What the sessions lose by sharing a value follows from their own
+    estimates and covariances (the likelihood is taken to be normal about each). Settings of rig and
+    beam are each session's own, with every structure alike, and so cost nothing here. A parameter
+    that some session leaves undetermined cannot be shared: it counts in every session. One session
+    shares with none, and loses nothing.
+    """
+    of_specimen = _of_specimen(estimates[0])
+    shared = [name for name in of_specimen if all(name in e.determined for e in estimates)]
+    deviance = sum(e.deviance for e in estimates)
+    if shared and len(estimates) >= _FEWEST:
+        deviance += random_effects(*_stacked(estimates, shared)).deviance
+    each_its_own = (len(of_specimen) - len(shared)) * sum(math.log(e.values) for e in estimates)
+    return deviance + len(shared) * math.log(sum(e.values for e in estimates)) + each_its_own
+
+
+def _of_specimen(estimate: RecordEstimate) -> tuple[str, ...]:
+    """Name the free parameters that are the specimen's: damping, and offsets of the modes."""
+    offsets = (name for name in estimate.parameters if name.startswith("stiffness_offset"))
+    return (*STRUCTURES[estimate.structure].free, *offsets)
+
+
+def _stacked(
+    estimates: Sequence[RecordEstimate], names: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Estimates, shape (K, k), and their covariances, (K, k, k)."""
+    values = [[_coordinate(name, e.parameters[name]) for name in names] for e in estimates]
+    return np.array(values), np.array([_block(e, names) for e in estimates])
+
+
+def _parameter(
+    name: str, t: float, mean: float, std: float, within: float, between: float, chance: float
+) -> PooledParameter:
+    value = math.exp(mean) if name in LOGARITHMIC else mean
+    unit = value if name in LOGARITHMIC else 1.0
+    return PooledParameter(
+        name=name,
+        value=value,
+        std=unit * std,
+        interval=_interval(name, mean, t * std),
+        within_std=unit * within,
+        between_std=unit * between,
+        chance=chance,
+        next_interval=_interval(name, mean, t * math.hypot(std, between)),
+    )
+
+
+def _interval(name: str, mean: float, half: float) -> tuple[float, float]:
+    if name in LOGARITHMIC:
+        return math.exp(mean - half), math.exp(mean + half)
+    return mean - half, mean + half
+
+
+def _coordinate(name: str, value: float) -> float:
+    return math.log(value) if name in LOGARITHMIC else value
+
+
+def _block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:
+    places = [estimate.determined.index(name) for name in names]
+    return estimate.covariance[np.ix_(places, places)]
+
+
+def _plant(like: RecordEstimate, values: dict[str, float]) -> Plant:
+    stiffness = values["bending_stiffness_n_m2"]
+    free = STRUCTURES[like.structure].free
+    return Plant(
+        beam=Beam(
+            like.plant.beam.length_m, values["density_over_stiffness"] * stiffness, stiffness
+        ),
+        damping=STRUCTURES[like.structure].damping({name: values[name] for name in free}),
+        delay_s=values["delay_s"],
+        tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
+        stiffness_offsets=tuple(
+            values[name] for name in like.parameters if name.startswith("stiffness_offset")
+        ),
+        **{name: values.get(name, own) for name, own in like.plant.extras.items()},
+    )

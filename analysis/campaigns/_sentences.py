@@ -1,0 +1,408 @@
+"""The verdict on a campaign and on its specimen in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns._experiment import in_dispute, told
+from analysis.models import STRUCTURES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from analysis.campaigns._experiment import StatedSpecimen
+    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, Values
+    from analysis.campaigns._orders import PooledOrder
+    from analysis.campaigns._pooling import PooledEstimate, PooledMode
+    from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.identify import Order
+
+_LABELS: Final = {
+    "zeta": ("ζ", 1e5, "10⁻⁵ s^α"),
+    "alpha": ("α", 1.0, ""),
+    "gamma": ("γ", 1e2, "10⁻² s^λ/m⁴"),
+    "lambda": ("λ", 1.0, ""),
+    "density_over_stiffness": ("ρ/EI", 1e3, "10⁻³ s²/m⁴"),
+    "bending_stiffness_n_m2": ("EI", 1e3, "10⁻³ N·m²"),
+    "delay_s": ("delay of the torque", 1e6, "µs"),
+    "tool_inertia_kg_m2": ("tool's inertia", 1e6, "10⁻⁶ kg·m²"),
+}
+
+
+_LEAST: Final = 1e-99
+_OF_MODES: Final = {
+    "frequency_hz": ("frequency", 1.0, "Hz"),
+    "damping_ratio": ("damping ratio", 100.0, "%"),
+    "stiffness_offset": ("stiffness", 100.0, "% above mode 1"),
+}
+
+
+def label(quantity: str) -> tuple[str, float, str]:
+    """Symbol, factor and unit in which a parameter or a mode's quantity is shown."""
+    if quantity in _LABELS:
+        return _LABELS[quantity]
+    of_mode, mode = quantity.rsplit("_", 1)
+    what, factor, unit = _OF_MODES[of_mode]
+    return f"{what} of mode {mode}", factor, unit
+
+
+def with_unit(parameter: str) -> str:
+    """Symbol with its unit, if it has one."""
+    symbol, _, unit = label(parameter)
+    return f"{symbol} ({unit})" if unit else symbol
+
+
+def probability(chance: float) -> str:
+    """Write a probability that may be too small for a number, but is not 0."""
+    return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
+
+
+MIXTURE_MARK: Final = "‡"
+_OF_MIXTURE: Final = "of a mixture"
+MIXTURE_NOTE: Final = (
+    f"{MIXTURE_MARK} sessions differ in it in kind, not by their uncertainties: the mean of a "
+    "mixture, which may belong to none of them."
+)
+_MANY: Final = 5
+_SLIGHT: Final = 2e-3
+"""Scatter of frequencies that one beam may have: ten kelvin change steel's stiffness by 0.3 %."""
+
+
+def specimens(found: Homogeneity) -> list[str]:
+    """Say first that sessions are not of one specimen; nothing if they are."""
+    said = _stated(found.specimens) if len(found.specimens) > 1 else []
+    leading = found.leading
+    return said if leading is None else [*said, *_differing(found, leading)]
+
+
+def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
+    keys = in_dispute(found)
+    each = "; ".join(
+        f"{', '.join(f'{key} {told(key, one.facts[key])}' for key in keys if key in one.facts)} "
+        f"in {_files([path.name for path in one.paths])}"
+        for one in found
+    )
+    first = ", ".join(f"{key} {told(key, found[0].facts[key])}" for key in keys)
+    return [
+        f"The files are not of one specimen, they state {len(found)}: {each}. Nothing is pooled "
+        f"over different specimens: all that follows is of {first}. Give analyze the files of "
+        "each of the others by themselves, or correct the metadata where they are wrong."
+    ]
+
+
+def _differing(found: Homogeneity, leading: Heterogeneity) -> list[str]:
+    others = [
+        label(each.quantity)[0]
+        for each in found.quantities
+        if each.mixed and not each.of_rig and each is not leading
+    ]
+    also = f" The same holds of {', '.join(others)}." if others else ""
+    return [
+        f"The sessions are not of one specimen in one state: {_scatter(leading)}.{also}",
+        f"{_where(leading)} So what is pooled here is the mean of a mixture (marked "
+        f"{MIXTURE_MARK} where sessions differ in it so), and may belong to none of them: analyse "
+        "the sessions of each specimen by themselves, or find what changed between sessions "
+        f"(clamp, temperature, wear).{_slight(found)}",
+    ]
+
+
+def _slight(found: Homogeneity) -> str:
+    """Say where a scatter is many standard deviations only because these are so small."""
+    frequencies = [each for each in found.quantities if each.quantity.startswith("frequency_hz")]
+    mixed = [each for each in frequencies if each.mixed]
+    if not mixed or any(each.between_std > _SLIGHT * each.mean for each in mixed):
+        return ""
+    return (
+        f" Frequencies scatter by less than {100 * _SLIGHT:g} %: one beam may do so whose "
+        "temperature or clamp changes."
+    )
+
+
+def _scatter(each: Heterogeneity) -> str:
+    """Say by how much one quantity scatters, of its own uncertainty and of its size."""
+    percents = percent(each.i_squared)
+    equals = "" if percents.startswith(">") else "= "
+    size = _told([each.between_std], each)
+    share = f"{size}, {100 * each.between_std / abs(each.mean):.2g} %; " if each.mean else ""
+    return (
+        f"{label(each.quantity)[0]} scatters between sessions by {each.own_stds:.3g} of its own "
+        f"standard deviations ({share}Cochran's Q = {each.cochran_q:.3g} where "
+        f"{each.degrees_of_freedom} is expected, I² {equals}{percents})"
+    )
+
+
+def percent(share: float) -> str:
+    """Write a share that may be next to 1, but is not 1."""
+    return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
+
+
+def title(text: str, found: Homogeneity) -> str:
+    """Say in a title that what is under it is pooled over a mixture."""
+    return f"{text}, {_OF_MIXTURE}" if found.mixed else text
+
+
+def _where(each: Heterogeneity) -> str:
+    """Say which sessions lie together, or where the outermost are."""
+    name, _, _ = label(each.quantity)
+    values = {file: (value, std) for file, value, std in each.values}
+    if each.groups:
+        parts = "; ".join(
+            f"{_told([values[file][0] for file in part], each)} in {_files(part)}"
+            for part in each.groups
+        )
+        return f"By the {name} they are {len(each.groups)} groups: {parts}."
+    low, high = _ends(each.values)
+    return (
+        f"There are no clear groups: the {name} goes from {_told([low[1]], each)} in {low[0]} to "
+        f"{_told([high[1]], each)} in {high[0]}."
+    )
+
+
+def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
+    ordered = sorted(values, key=lambda each: each[1])
+    return ordered[0], ordered[-1]
+
+
+def _told(values: Sequence[float], each: Heterogeneity) -> str:
+    """Write a mean with the digits that tell it from the others."""
+    _, factor, unit = label(each.quantity)
+    digits = max(1 - int(np.floor(np.log10(factor * max(each.between_std, 1e-300)))), 0)
+    times = "·" if unit.startswith("10") else " "
+    return f"{factor * float(np.mean(values)):.{min(digits, 9)}f}{times}{unit}".rstrip()
+
+
+def _files(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_MANY]) + (
+        f" and {len(names) - _MANY} more" if len(names) > _MANY else ""
+    )
+    return f"{len(names)} file{'' if len(names) == 1 else 's'} ({shown})"
+
+
+_OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
+_ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
+_SIZES: Final = {"internal": "material", "external": "surroundings"}
+_WRONG: Final = 1.5
+"""Residual, in units of the noise, from which a structure is called wrong."""
+
+_SIGNIFICANT: Final = 0.01
+_NORMAL_95: Final = 1.959963984540054
+_AS_GOOD: Final = 1.01
+
+
+def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
+    """Say of which structure the numbers are, and which simpler one would do.
+
+    Parameters
+    ----------
+    freest : PooledEstimate
+        On the beam that all sessions support.
+    best : PooledEstimate
+        Of the lowest BIC.
+    """
+    given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
+    are = "is" if len(given) == 1 else "are"
+    so = (
+        f", and takes for granted that {' and '.join(given)} {are} 1."
+        if given
+        else ", so its intervals hold whichever simpler one is true."
+    )
+    said = (
+        f"The numbers are those of type {freest.name}: damping {_damping(freest.structure)}"
+        f"{_on_beam(freest)}. It is the freest structure that the sessions determine{so}"
+    )
+    if best.name != freest.name:
+        said += (
+            f" Of all together type {best.name} has the lowest BIC (damping "
+            f"{_damping(best.structure)}{_on_beam(best)}); what it gives is narrower and holds on "
+            "that condition only."
+        )
+    return said
+
+
+def sizes(freest: PooledEstimate) -> list[str]:
+    """Say how large each damping is where it depends least on its order."""
+    said = []
+    for each in freest.sizes:
+        if each.omega_rad_s is None:
+            continue
+        low, high = each.interval
+        said.append(
+            f"{each.value:.4g} by the {_SIZES[each.damping]} (95 %: {low:.4g} to {high:.4g}) at "
+            f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
+        )
+    return (
+        [f"Loss factors where they depend least on the orders: {'; '.join(said)}."] if said else []
+    )
+
+
+def selected(
+    ranked: Sequence[PooledEstimate],
+    close: Sequence[PooledEstimate],
+    alone: Mapping[str, int],
+    sessions: int,
+) -> str:
+    """Say what all sessions together would select, what it cannot be told from, and who agrees."""
+    best = ranked[0]
+    said = f"Lowest BIC: type {best.name}."
+    if close:
+        names = " or ".join(f"type {each.name}" for each in close)
+        said += (
+            f" All sessions together cannot tell it from {names} (BIC differs by "
+            f"{close[0].bic - best.bic:.1f}; 10 would be clear)."
+        )
+    elif len(ranked) > 1:
+        margin = ranked[1].bic - best.bic
+        said += f" The next, type {ranked[1].name}, is worse by {margin:.3g}."
+    return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
+
+
+def _on_beam(estimate: PooledEstimate) -> str:
+    modes = "" if estimate.uniform else ", on a beam whose modes each have a stiffness of their own"
+    more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
+    return f"{modes}, with {more}" if more else modes
+
+
+def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
+    """Say how many sessions select or say what when each is looked at by itself."""
+    (first, count), *others = counts.items()
+    verb = do if count > 1 else f"{do}s"
+    more = "".join(f", {n} {what}" for what, n in others)
+    return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
+
+
+def _damping(structure: str) -> str:
+    """Say which kinds of damping a structure has, and of which orders."""
+    shape = STRUCTURES[structure]
+    kinds = [
+        f"by the {what} ({'order free' if order in shape.free else 'of order 1'})"
+        for what, order, present in (
+            ("material", "alpha", shape.internal),
+            ("surroundings", "lambda", shape.external),
+        )
+        if present
+    ]
+    return " and ".join(kinds)
+
+
+def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
+    """Say whether what the structure leaves is noise."""
+    if best.misfit > _WRONG:
+        return (
+            f"What it leaves is {best.misfit:.3g} times the noise: no structure tried describes "
+            "the beam, and standard deviations mean little."
+        )
+    if adequate == sessions:
+        return "What it leaves is noise in every session: nothing in the records asks for more."
+    return (
+        f"What is left is noise in {adequate} of {sessions} sessions; in the others something is "
+        "unexplained."
+    )
+
+
+def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
+    """Say how the modes are damped; of a mixture, that it is one."""
+    if not best.modes:
+        return []
+    said = "; ".join(map(_mode, best.modes))
+    of = "the sessions, which are a mixture" if mixed else "the sessions"
+    return [f"Modes: {said} (± 95 % of the mean over {of})."]
+
+
+def _mode(mode: PooledMode) -> str:
+    half = _NORMAL_95 * 100 * mode.damping_ratio_std
+    digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
+    return (
+        f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
+        f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"
+    )
+
+
+def order(found: PooledOrder) -> str:
+    """Say what is known of one order."""
+    name, of = found.order, _OF[found.order]
+    counts = {f"“{status}”": count for status, count in found.alone.items()}
+    alone = " " + _alone(counts, sum(counts.values()), "say")
+    if found.status == "absent":
+        return f"No {of} shows, so its order {name} means nothing here.{alone}"
+    if found.status == "compatible" and found.interval is None:
+        return f"The order {name} of the {of} is taken to be 1, as it may be.{alone}"
+    if found.value is None or found.interval is None:
+        return f"The order {name} of the {of} is not identifiable: {found.reason}.{alone}"
+    low, high = found.interval
+    is_ = (
+        f"The order {name} of the {of} is {found.value:.4f} "
+        f"(95 %: {low:.4f} to {high:.4f}, scatter between sessions included)"
+    )
+    if found.reason is not None:
+        would = is_.replace(" is ", " would be ", 1)
+        return f"{would}, but {found.reason}; it is not reported.{alone}"
+    said = {
+        "compatible": "1 would do",
+        "fractional": "1 is excluded",
+        "open": "1 is doubtful, but not excluded",
+    }
+    return f"{is_}: {said[found.status]}.{alone}"
+
+
+def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
+    """Name the sessions, with what they select, that by themselves dismiss it."""
+    if not who:
+        return []
+    names = ", ".join(f"{file} (type {structure})" for file, structure in who[:_MANY])
+    more = f" and {len(who) - _MANY} more" if len(who) > _MANY else ""
+    return [
+        f"Type {best.name} is dismissed by {len(who)} session{'s' if len(who) > 1 else ''} alone: "
+        f"{names}{more}. Look at their reports (analyze --each) before you trust the mean."
+    ]
+
+
+def scatter(best: PooledEstimate) -> str:
+    """Say whether the sessions repeat: one alarm in a hundred campaigns that do is false."""
+    level = _SIGNIFICANT / max(len(best.parameters), 1)
+    moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
+    if not moved:
+        return (
+            "Sessions differ by no more than their own uncertainties (p: probability of so much "
+            "scatter by these alone); they repeat."
+        )
+    return (
+        f"Sessions differ by more than their own uncertainties in {', '.join(moved)} (p: "
+        "probability of so much scatter by these alone): something changes between sessions, "
+        "such as clamp, temperature or motor, and the interval of one session alone is too "
+        "narrow for the specimen."
+    )
+
+
+def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int) -> list[str]:
+    """Say how well the sessions predict one that they have not seen."""
+    of_best = [each for each in validation if each.method == "record" and each.name == best.name]
+    own = [each.own_error for each in of_best if each.own_error is not None]
+    if not own:
+        return []
+    error, alone = float(np.mean([each.error for each in of_best])), float(np.mean(own))
+    verdict = (
+        "as well as by a fit to itself"
+        if error <= _AS_GOOD * alone
+        else "worse than by a fit to itself: the parameters wander"
+    )
+    fewer = f"; mean of {len(own)} of {sessions} sessions" if len(own) < sessions else ""
+    return [
+        f"From the others, the torque of a session is predicted to {100 * error:.2f} % (its own "
+        f"fit: {100 * alone:.2f} %, noise included{fewer}), {verdict}."
+    ]
+
+
+def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
+    """Account for the sessions that were to be predicted and were not."""
+    if not lost:
+        return []
+    each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])
+    more = f"; and {len(lost) - _MANY} more" if len(lost) > _MANY else ""
+    return [
+        f"Of {asked} sessions to be predicted from the others, {asked - len(lost)} "
+        f"{'was' if asked - len(lost) == 1 else 'were'} and {len(lost)} "
+        f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Errors of prediction are over "
+        "those that were."
+    ]

@@ -1,0 +1,231 @@
+"""What a worker does to one session, and the little it sends back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from analysis.campaigns._estimates import RecordEstimate, WelchFit
+from analysis.campaigns._experiment import Experiment, task_errors
+from analysis.models import RECORD_BAND_HZ, WelchSettings
+from analysis.paper import Indices, fit_indices
+from rigd.spectral import FrequencyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from analysis.identify import Candidate, Setting, Verdict
+    from analysis.paper import Peak
+    from analysis.record import Record
+    from rigd.beam import Beam
+
+
+_MISREAD: Final = ("sign", "unit")
+"""Findings beside which no number is the specimen's."""
+
+_NO_RESPONSE: Final = FrequencyResponse(
+    np.zeros(0), np.zeros(0, dtype=np.complex128), coherence=None, segments=0, estimator="h1"
+)
+_USUAL: Final = WelchSettings()
+_NOT_COMPARED: Final = Indices(math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFailure:
+    """A session of which nothing is used, why, and what experiment it is as far as is known."""
+
+    path: Path
+    message: str
+    experiment: Experiment | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SessionResult:
+    """One session of a campaign: some 200 kB for the paper's settings.
+
+    Attributes
+    ----------
+    path : Path
+    experiment : Experiment
+    beam : Beam
+        As the file states it.
+    tool_inertia_kg_m2, delay_s : float
+        As the file states them; the delay is by how much the torque is older than the angle.
+    frequency_hz : ndarray, shape (n,)
+        Bins in the band; none if Welch's method does not suit the session.
+    response : ndarray of complex, shape (n,)
+        Measured torque per angle in N·m/rad, without the channels' delays.
+    peaks : tuple of Peak or None
+        Measured resonant peaks, mode by mode.
+    welch_fits : tuple of WelchFit
+        By type, then by weighting; none if Welch's method does not suit the session.
+    record_estimates : tuple of RecordEstimate
+        By type, those of a uniform beam first; empty if none was asked for, or the record could
+        not be used.
+    verdict : Verdict or None
+        What the whole record says by itself, None without estimates.
+    warnings : tuple of str
+    headline : mapping or None
+        What the session says first, as of a single file's document; None without a verdict.
+    settings : WelchSettings
+        As used.
+    record_band_hz : tuple of float
+        Of the whole-record fits.
+    """
+
+    path: Path
+    experiment: Experiment
+    beam: Beam
+    tool_inertia_kg_m2: float
+    delay_s: float
+    frequency_hz: NDArray[np.float64]
+    response: NDArray[np.complex128]
+    peaks: tuple[Peak | None, ...]
+    welch_fits: tuple[WelchFit, ...]
+    record_estimates: tuple[RecordEstimate, ...]
+    verdict: Verdict | None
+    warnings: tuple[str, ...]
+    headline: Mapping[str, Any] | None = None
+    settings: WelchSettings = _USUAL
+    record_band_hz: tuple[float, float] = RECORD_BAND_HZ
+
+    def without_welch(self) -> SessionResult:
+        """Leave out what is there by Welch's method."""
+        return replace(
+            self,
+            frequency_hz=_NO_RESPONSE.frequency_hz,
+            response=_NO_RESPONSE.response,
+            peaks=(),
+            welch_fits=(),
+        )
+
+    @property
+    def selected(self) -> str | None:
+        """Name of the structure that the session selects by itself, None without a verdict."""
+        if self.verdict is None:
+            return None
+        return min(self.record_estimates, key=lambda each: each.bic).name
+
+
+@dataclass(frozen=True, slots=True)
+class SessionTask:
+    """What is to be done with every session.
+
+    Attributes
+    ----------
+    settings : WelchSettings
+    structures : tuple of str
+        Names of those that are kept of the whole-record fits; without any there are none.
+    fixed : tuple of str
+        Settings that stay at the file's values in those fits.
+    band_hz : tuple of float or None
+        Of all fits; None takes what suits each record.
+    """
+
+    settings: WelchSettings
+    structures: tuple[str, ...]
+    fixed: tuple[Setting, ...]
+    band_hz: tuple[float, float] | None
+
+
+def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFailure:
+    """Read a session, analyse it by both routes, or by the whole record where that suits alone.
+
+    A session that cannot be analysed is told, not raised: it is one of many.
+    """
+    from analysis.record import load_record
+    from analysis.suited import record_band_hz, remarks, welch_analysis, welch_settings
+
+    failures = task_errors()
+    experiment = None
+    try:
+        record = load_record(path)
+        experiment = Experiment.of(record)
+        unfinished = experiment.unfinished(record.outcome)
+        if unfinished:
+            return SessionFailure(path, f"{path}: {unfinished}", experiment)
+        welch, left_out = welch_analysis(
+            record, task.settings, task.band_hz, optional=bool(task.structures)
+        )
+    except failures as error:
+        return SessionFailure(path, str(error), experiment)
+    except MemoryError:
+        return SessionFailure(
+            path, f"{path}: there is not memory enough to analyse it; use fewer --jobs."
+        )
+    measured = _NO_RESPONSE if welch is None else welch.response
+    warnings = record.warnings if welch is None else welch.warnings
+    warnings = (*warnings, *remarks(record, task.band_hz), *((left_out,) if left_out else ()))
+    estimates: tuple[RecordEstimate, ...] = ()
+    verdict = headline = None
+    if task.structures:
+        try:
+            estimates, verdict, headline = _whole_record(record, task, measured)
+            if wrong := next((f.sentence for f in verdict.findings if f.kind in _MISREAD), None):
+                return SessionFailure(path, f"{path}: {wrong}", experiment)
+        except failures as error:
+            if welch is None:
+                return SessionFailure(path, str(error), experiment)
+            warnings = (*warnings, f"Not in the whole-record estimate: {error}")
+        except (MemoryError, np.linalg.LinAlgError) as error:
+            why = "there is not memory enough" if isinstance(error, MemoryError) else error
+            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {why}")
+    return SessionResult(
+        path=path,
+        experiment=experiment,
+        beam=record.beam,
+        tool_inertia_kg_m2=record.tool_inertia_kg_m2,
+        delay_s=record.torque_delay_s - record.angle_delay_s,
+        frequency_hz=measured.frequency_hz,
+        response=measured.response,
+        peaks=() if welch is None else welch.peaks,
+        welch_fits=() if welch is None else tuple(map(WelchFit.of, welch.models)),
+        record_estimates=estimates,
+        verdict=verdict,
+        warnings=warnings,
+        headline=headline,
+        settings=welch_settings(record, task.settings, task.band_hz),
+        record_band_hz=record_band_hz(record, task.band_hz),
+    )
+
+
+def _whole_record(
+    record: Record, task: SessionTask, measured: FrequencyResponse
+) -> tuple[tuple[RecordEstimate, ...], Verdict, dict[str, Any]]:
+    """Select a structure on the whole record; of all fits, keep it and those asked for."""
+    from analysis.identify import Measurement, ResponseGrid, headline_json, select
+    from analysis.models import STRUCTURES
+    from analysis.suited import record_band_hz
+
+    measurement = Measurement.of_record(record)
+    band_hz = record_band_hz(record, task.band_hz)
+    selection = select(measurement, fixed=task.fixed, band_hz=band_hz)
+    omega = 2 * np.pi * measured.frequency_hz
+    grid = ResponseGrid(1j * omega)
+
+    def kept(candidate: Candidate) -> RecordEstimate:
+        # The measured response is free of the delay that the file states.
+        plant = candidate.fit.plant
+        plant = replace(plant, delay_s=plant.delay_s - measurement.delay_s)
+        if not omega.size:
+            return RecordEstimate.of(candidate, _NOT_COMPARED)
+        response = grid.evaluate(plant)[0]
+        return RecordEstimate.of(candidate, fit_indices(omega, measured.response, response))
+
+    order = list(STRUCTURES)
+    asked = [
+        kept(each)
+        for each in selection.candidates
+        if each.fit.structure.name in task.structures or each.fit is selection.fit
+    ]
+    asked.sort(key=lambda each: (not each.uniform, order.index(each.structure)))
+    said = selection.verdict
+    orders = (said.alpha, said.lambda_)
+    told = headline_json(str(record.path), selection.headline, orders, said.findings)
+    return tuple(asked), said, told

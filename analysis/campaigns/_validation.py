@@ -1,0 +1,168 @@
+"""Each session predicted from the others: what a model is worth for data it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns._experiment import CampaignError, task_errors
+from analysis.campaigns._pooling import pooled_estimates
+from analysis.campaigns._statistics import mean_damping
+from analysis.campaigns._workers import Lost
+from analysis.identify import Measurement, Plant
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._workers import Workers
+
+FEWEST: Final = 3
+"""Sessions from which each can be predicted from the others: two are the fewest to be pooled."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOutError:
+    """Error of one model in one session, of which it has seen nothing.
+
+    Attributes
+    ----------
+    path : Path
+        Of the session.
+    method : {"record", "welch"}
+        Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
+        of the others by the paper's route.
+    name : str
+        The structure, as tables call it.
+    weighting : str or None
+        None with "record".
+    error : float
+        Root mean square of predicted minus measured torque over that of the measured torque, in
+        the band, without means.
+    own_error : float or None
+        The same with the session's own whole-record fit of that structure, None with "welch". What
+        noise there is, it holds too: an error no larger shows that the sessions agree.
+    """
+
+    path: Path
+    method: str
+    name: str
+    weighting: str | None
+    error: float
+    own_error: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class LostTrial:
+    """A session that was to be predicted from the others, and why it was not."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What others say of a session: a model's name and its plant, the session's own beside it."""
+
+    method: str
+    name: str
+    weighting: str | None
+    plant: Plant
+    own: Plant | None
+
+
+def forecasts(sessions: Sequence[SessionResult], left_out: int) -> tuple[Forecast, ...]:
+    """Models of all sessions but one, to be tried on that one."""
+    session = sessions[left_out]
+    others = [*sessions[:left_out], *sessions[left_out + 1 :]]
+    own = {each.name: each.plant for each in session.record_estimates}
+    found = [
+        Forecast("record", each.name, None, each.plant, own[each.name])
+        for each in pooled_estimates(others)
+        if each.name in own
+    ]
+    for number, fit in enumerate(session.welch_fits):
+        damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
+        plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
+        found.append(Forecast("welch", fit.structure, fit.weighting, plant, None))
+    return tuple(found)
+
+
+def validate(
+    workers: Workers,
+    sessions: Sequence[SessionResult],
+    band_hz: tuple[float, float] | None,
+    on_done: Callable[[int], None],
+) -> tuple[tuple[LeftOutError, ...], tuple[LostTrial, ...]]:
+    """Try every session once, and account for each trial: done, or lost and why.
+
+    What was found of the sessions is kept though all workers may go.
+    """
+    trials = [(each.path, forecasts(sessions, i), band_hz) for i, each in enumerate(sessions)]
+    try:
+        results = workers.run(left_out_errors, trials, on_done)
+    except CampaignError as error:
+        return (), tuple(LostTrial(session.path, str(error)) for session in sessions)
+    errors: list[LeftOutError] = []
+    lost: list[LostTrial] = []
+    for session, result in zip(sessions, results, strict=True):
+        if isinstance(result, Lost):
+            lost.append(LostTrial(session.path, result.reason))
+        elif isinstance(result, LostTrial):
+            lost.append(result)
+        else:
+            errors.extend(result)
+    return tuple(errors), tuple(lost)
+
+
+def left_out_errors(
+    path: Path, tried: Sequence[Forecast], band_hz: tuple[float, float] | None
+) -> tuple[LeftOutError, ...] | LostTrial:
+    """Read a session and compare its torque with what each model predicts from its angle.
+
+    A session that the whole-record estimator cannot use is told, not raised: it is one of many.
+    """
+    from analysis.identify import Comparison
+    from analysis.record import load_record
+    from analysis.suited import record_band_hz
+
+    try:
+        record = load_record(path)
+        band_hz = record_band_hz(record, band_hz)
+        comparison = Comparison.of(Measurement.of_record(record), band_hz)
+    except task_errors() as why:
+        return LostTrial(path, str(why))
+    except MemoryError:
+        return LostTrial(path, "there is not memory enough to predict it; use fewer --jobs")
+    measured = comparison.torque_nm[comparison.kept]
+    size = np.linalg.norm(comparison.spectrum(measured))
+
+    def error(plant: Plant) -> float:
+        predicted, _ = comparison.prediction.torque(plant)
+        return float(np.linalg.norm(comparison.spectrum(predicted - measured)) / size)
+
+    return tuple(
+        LeftOutError(
+            path=path,
+            method=each.method,
+            name=each.name,
+            weighting=each.weighting,
+            error=error(each.plant),
+            own_error=None if each.own is None else error(each.own),
+        )
+        for each in tried
+    )
+
+
+def by_model(
+    errors: Sequence[LeftOutError],
+) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
+    """Group errors by method, name and weighting, the smallest mean error first."""
+    found: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
+    for each in errors:
+        found.setdefault((each.method, each.name, each.weighting), []).append(each)
+    groups = [(*key, tuple(group)) for key, group in found.items()]
+    return sorted(groups, key=lambda group: float(np.mean([each.error for each in group[3]])))

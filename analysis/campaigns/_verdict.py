@@ -1,0 +1,237 @@
+"""The verdict on a campaign: one structure for the specimen, what is known of its damping."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from statistics import median_low
+from typing import TYPE_CHECKING, Final
+
+from analysis.campaigns import _sentences as sentences
+from analysis.campaigns import _sentences as specimen_sentences
+from analysis.campaigns._orders import PooledOrder, freest_estimate, pooled_order, rivals
+from analysis.identify import EVEN, STRONG
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from analysis.campaigns._homogeneity import Homogeneity
+    from analysis.campaigns._pooling import PooledEstimate
+    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.identify import Finding
+
+_FIGURE: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+"""A number, but not that of a mode: it tells what is meant and not how much."""
+
+_SHOWN: Final = {"s": (1e3, "ms"), "N·m": (1e3, "mN·m"), "1": (100.0, "%"),
+                 "kg·m²": (1e6, "10⁻⁶ kg·m²")}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class CommonFinding:
+    """One thing that one or more sessions hold beside the beam.
+
+    Attributes
+    ----------
+    example : Finding
+        Of the session in the middle, by size.
+    files : tuple of str
+        Names of the sessions that have it.
+    sessions : int
+        Of how many.
+    span : tuple of float or None
+        Least and largest size, in the finding's unit.
+    """
+
+    example: Finding
+    files: tuple[str, ...]
+    sessions: int
+    span: tuple[float, float] | None
+
+    @property
+    def sentence(self) -> str:
+        """In how many sessions, in the words of the one in the middle, and from what to what."""
+        count = len(self.files)
+        which = f" ({', '.join(self.files)})" if count < min(self.sessions, 3) else ""
+        words = f"In {count} of {self.sessions} sessions{which}: {self.example.sentence}"
+        if self.span is None or count == 1:
+            return words
+        factor, unit = _SHOWN.get(self.example.unit, (1.0, self.example.unit))
+        low, high = (f"{factor * end:.3g}" for end in self.span)
+        return f"{words} (So the session in the middle; over the sessions {low} to {high} {unit}.)"
+
+
+def common_findings(sessions: Sequence[SessionResult]) -> tuple[CommonFinding, ...]:
+    """Count the findings of all sessions, the most common first.
+
+    Two findings are of the same thing if their sentences are the same but for the figures in them.
+    """
+    found: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    judged = [session for session in sessions if session.verdict is not None]
+    for session in judged:
+        for finding in session.verdict.findings if session.verdict else ():
+            kind = finding.kind, _FIGURE.sub("#", finding.sentence)
+            found.setdefault(kind, []).append((session.path.name, finding))
+    counted = [_counted(group, len(judged)) for group in found.values()]
+    return tuple(sorted(counted, key=lambda each: -len(each.files)))
+
+
+def _counted(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
+    files = tuple(dict.fromkeys(name for name, _ in group))
+    sizes = [finding.value for _, finding in group if finding.value is not None]
+    if len(sizes) < len(group):
+        return CommonFinding(group[0][1], files, sessions, None)
+    middle = median_low(sizes)
+    example = next(finding for _, finding in group if finding.value == middle)
+    return CommonFinding(example, files, sessions, (min(sizes), max(sizes)))
+
+
+@dataclass(frozen=True, slots=True)
+class Dissent:
+    """A session that by itself dismisses what all together select.
+
+    Attributes
+    ----------
+    file : str
+        Name.
+    structure : str
+        What it selects, as tables call it.
+    margin : float
+        By how much its own BIC is lower so.
+    """
+
+    file: str
+    structure: str
+    margin: float
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignVerdict:
+    """What can be said of a specimen from all its sessions.
+
+    Attributes
+    ----------
+    headline : str
+        Structure that the numbers are of, as tables call it: the freest on the beam selected.
+    structure : str
+        Of the lowest BIC: "I" to "VII".
+    uniform : bool
+        Whether the beam selected is uniform.
+    rivals : tuple of str
+        Structures, as tables call them, that all data together cannot tell from it.
+    sessions : int
+        Those with a verdict of their own, on which this one rests.
+    alone : mapping of str to int
+        How many sessions select which structure by themselves.
+    adequate : int
+        Sessions in which what it leaves is noise.
+    alpha, lambda_ : PooledOrder
+    findings : tuple of CommonFinding
+        What else is in the records.
+    dissent : tuple of Dissent
+    sentences : tuple of str
+        The verdict in words, the most important first.
+    experiments : tuple of str
+        What would tell more.
+    """
+
+    headline: str
+    structure: str
+    uniform: bool
+    rivals: tuple[str, ...]
+    sessions: int
+    alone: Mapping[str, int]
+    adequate: int
+    alpha: PooledOrder
+    lambda_: PooledOrder
+    findings: tuple[CommonFinding, ...]
+    dissent: tuple[Dissent, ...]
+    sentences: tuple[str, ...]
+    experiments: tuple[str, ...]
+
+    @property
+    def withheld(self) -> frozenset[str]:
+        """Orders that are not to be reported."""
+        return _withheld(self.alpha, self.lambda_)
+
+
+def campaign_verdict(
+    sessions: Sequence[SessionResult],
+    pooled: Sequence[PooledEstimate],
+    alike: Homogeneity,
+    validation: Sequence[LeftOutError],
+    lost: Sequence[LostTrial],
+) -> CampaignVerdict | None:
+    """Judge a campaign; None if fewer than two sessions determine any structure's damping.
+
+    Parameters
+    ----------
+    sessions : sequence of SessionResult
+    pooled : sequence of PooledEstimate
+        The lowest BIC first.
+    alike : Homogeneity
+        Whether they are of one specimen.
+    validation : sequence of LeftOutError
+    lost : sequence of LostTrial
+    """
+    verdicts = [session.verdict for session in sessions if session.verdict is not None]
+    if not pooled or not verdicts:
+        return None
+    best, freest = pooled[0], freest_estimate(pooled)
+    assert freest is not None
+    alpha, lambda_ = (pooled_order(order, pooled, verdicts, alike) for order in ("alpha", "lambda"))
+    found = common_findings(sessions)
+    close = rivals(pooled, EVEN)
+    alone = dict(Counter(each.selected for each in sessions if each.selected).most_common())
+    adequate = sum(verdict.adequate for verdict in verdicts)
+    dissent = _dissent(sessions, best)
+    advice = Counter(advice for verdict in verdicts for advice in verdict.experiments)
+    return CampaignVerdict(
+        headline=freest.name,
+        structure=best.structure,
+        uniform=best.uniform,
+        rivals=tuple(each.name for each in close),
+        sessions=len(verdicts),
+        alone=alone,
+        adequate=adequate,
+        alpha=alpha,
+        lambda_=lambda_,
+        findings=found,
+        dissent=dissent,
+        sentences=(
+            *specimen_sentences.specimens(alike),
+            sentences.headline(freest, best),
+            sentences.left_over(freest, adequate, len(verdicts)),
+            *sentences.sizes(freest),
+            *sentences.modes(freest, mixed=alike.mixed),
+            sentences.order(alpha),
+            sentences.order(lambda_),
+            sentences.selected(pooled, close, alone, len(verdicts)),
+            *(finding.sentence for finding in found),
+            *sentences.dissenting([(each.file, each.structure) for each in dissent], best),
+            *([] if alike.mixed else [sentences.scatter(freest)]),
+            *sentences.foresight(freest, validation, len(sessions)),
+            *sentences.lost_trials(lost, len(sessions)),
+        ),
+        experiments=tuple(
+            what for what, count in advice.most_common() if 2 * count > len(verdicts)
+        ),
+    )
+
+
+def _withheld(*orders: PooledOrder) -> frozenset[str]:
+    return frozenset(each.order for each in orders if each.reason is not None)
+
+
+def _dissent(sessions: Sequence[SessionResult], best: PooledEstimate) -> tuple[Dissent, ...]:
+    found = []
+    for session in sessions:
+        by_name = {each.name: each for each in session.record_estimates}
+        if by_name:
+            own = min(by_name.values(), key=lambda each: each.bic)
+            margin = by_name[best.name].bic - own.bic
+            if margin > STRONG:
+                found.append(Dissent(session.path.name, own.name, margin))
+    return tuple(sorted(found, key=lambda each: -each.margin))

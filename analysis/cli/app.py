@@ -1,0 +1,347 @@
+"""Command `analyze`: parses options, runs the analysis file by file, prints and writes results."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from typer.core import TyperGroup
+
+import rigd
+from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
+from analysis.cli.sessions import Routes, session_command
+from analysis.cli.standard_streams import standard_streams
+from analysis.cli.welch_options import (
+    Band,
+    Estimator,
+    Nfft,
+    Overlap,
+    Segment,
+    band_hz,
+    choice,
+    welch_settings,
+)
+from rigd.runtime import raise_on
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.campaigns._experiment import LoneSessionError
+    from analysis.identify import Setting
+
+DEFAULT: Final = "default"
+"""Name under which the command is registered that takes all other arguments."""
+
+
+class DefaultCommandGroup(TyperGroup):
+    """A group in which a first argument that names no subcommand goes to the default command.
+
+    The default command stands in the group's place from the parsing on, so its usage, help and
+    errors are those of a command without subcommands.
+    """
+
+    # Typer's click is its own in some versions and the package of that name in others, so there is
+    # no one type of context to name.
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: Any = None,  # noqa: ANN401
+        **extra: Any,  # noqa: ANN401
+    ) -> Any:  # noqa: ANN401
+        """Parse the arguments for the subcommand named first, or for the default command."""
+        if args and args[0] in self.commands and args[0] != DEFAULT:
+            return super().make_context(info_name, args, parent, **extra)
+        return self.commands[DEFAULT].make_context(info_name, args, parent, **extra)
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
+        """Run what `make_context` has parsed the arguments for."""
+        return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
+
+
+def _tell(asked: bool) -> None:
+    if asked:
+        typer.echo(f"analyze {rigd.__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_tell, is_eager=True, help="Say which it is.")
+]
+
+
+_EXIT_INTERRUPTED: Final = 130
+
+_EPILOG = """\
+Example: analyze session.mcap --types III,VI --json fits.json
+
+Writes figures, tables and JSON into session.report/ beside the file (session.report-2/ if that
+exists). Several files are a campaign: statistics, nominal models, pooled estimate and validation go
+to campaign.report/ beside the first. Records of other programs: analyze import --help; results for
+them: analyze export --help. Sessions that do not suit Welch's method (steps, multisines, narrow
+sweeps, short or stopped ones) get the whole-record analysis alone, and a line that says why.
+Exit code: 0 done; 1 a file could not be analysed, being too short for --segment for one; 2 wrong
+use, options that contradict each other or the record's rate included; 130 stopped by Ctrl-C."""
+
+
+_METHODS: Final = ("welch", "record", "all")
+"""Ways from a record to models."""
+
+_OF_WELCH: Final = ("types", "weights", "frf", "segment", "overlap", "nfft")
+"""Options of the Welch fits alone."""
+
+_TYPED: Final = "COMMANDLINE"
+"""What click calls the source of an option's value that is no default."""
+
+# Plain messages of one or two sentences, not boxes: they end up in logs.
+app = typer.Typer(
+    cls=DefaultCommandGroup,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command("import", epilog=IMPORT_EPILOG)(import_command)
+app.add_typer(export_app, name="export")
+
+
+def main() -> None:
+    """Entry point of the command."""
+    raise_on(signal.SIGINT)
+    # Threads gain nothing on matrices as small as a fit's, and cost a tenth of the time.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    _quieten_libraries()
+    with standard_streams():
+        try:
+            app()
+        except KeyboardInterrupt:
+            sys.exit(_EXIT_INTERRUPTED)
+
+
+def _quieten_libraries() -> None:
+    """Keep warnings that libraries address to programmers off the operator's terminal.
+
+    A record that suits no model drives searches where numbers overflow; what becomes of it is said
+    in the verdict. Python's own switches (``-W``, PYTHONWARNINGS) bring them back.
+    """
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ["PYTHONWARNINGS"] = "ignore"  # of worker processes
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+
+
+@app.command(DEFAULT, epilog=_EPILOG)
+def analyze(
+    context: typer.Context,
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE", readable=False, help="Session files (.mcap)."),
+    ],
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="welch|record|all",
+            help="welch: the paper's; record: the whole record's, of all types; all: both.",
+        ),
+    ] = "all",
+    fix: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="What the whole-record fits take from the file instead of estimating it, of "
+            "density_over_stiffness, bending_stiffness_n_m2, delay_s, tool_inertia_kg_m2.",
+        ),
+    ] = "",
+    types: Annotated[
+        str, typer.Option(metavar="LIST", help="Model types, of I to VII, comma-separated.")
+    ] = "I,II,III,IV,V,VI",
+    weights: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Weightings of the cost: const, omega (1/omega), omega^K for any power K.",
+        ),
+    ] = "const,omega",
+    band: Band = None,
+    frf: Estimator = "h1",
+    segment: Segment = None,
+    overlap: Overlap = None,
+    nfft: Nfft = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the report, new or empty; with --each, one folder a file in it.",
+        ),
+    ] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="New file for all results as JSON; - for stdout."),
+    ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT.rrd",
+            help="New file with the session and its fits for Rerun's viewer; of one session file.",
+        ),
+    ] = None,
+    each: Annotated[
+        bool,
+        typer.Option("--each", help="Of several files, a report of each and not of the campaign."),
+    ] = False,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Campaign: the paper's Tables 3 and 4 beside its own.")
+    ] = False,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Campaign: worker processes.  [default: one a core]"),
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Campaign: Dask scheduler whose workers are used."),
+    ] = None,
+    version: Version = False,  # noqa: ARG001 - its callback has told it
+) -> None:
+    """Identify the damping of a slewing beam from recorded sessions.
+
+    Estimates the frequency response from motor angle to coupling torque, fits the fractional
+    damping models to it, and prints and draws the results.
+    """
+    from analysis.campaigns._experiment import CampaignError, LoneSessionError
+    from analysis.report._folder import OutputError, OutputExistsError, check_new_file
+
+    is_campaign = len(files) > 1 and not each
+    if not is_campaign:
+        given = {"--paper": paper, "--jobs": jobs is not None, "--dask": dask is not None}
+        _refuse_of_campaigns([option for option, is_given in given.items() if is_given], files)
+    elif jobs is not None and dask is not None:
+        raise typer.BadParameter(
+            "the workers are those of --dask; leave one of the two out.", param_hint="--jobs"
+        )
+    method = choice(method, _METHODS, "--method")
+    if fix and method == "welch":
+        raise typer.BadParameter(
+            "the paper's route takes all of them from the file; leave it out, or take "
+            "--method all.",
+            param_hint="--fix",
+        )
+    if method == "record":
+        _check_without_paper(context, is_campaign=is_campaign, rerun=rerun)
+    settings = welch_settings(types, weights, frf, segment, overlap, nfft)
+    routes = Routes(
+        settings,
+        paper=method != "record",
+        whole_record=method != "welch",
+        fixed=_fixed(fix),
+        band_hz=band_hz(band),
+    )
+    try:
+        to_stdout = json is not None and str(json) == "-"
+        if json is not None and not to_stdout:
+            check_new_file(json, "--json")
+        if rerun is not None:
+            _check_rerun(rerun, files)
+        if not is_campaign:
+            code = session_command(files, routes, report, json, rerun)
+        else:
+            from analysis.cli.campaign import campaign_command
+            from analysis.models import STRUCTURES
+
+            try:
+                code = campaign_command(
+                    files, settings, structures=tuple(STRUCTURES) if routes.whole_record else (),
+                    fixed=routes.fixed, band_hz=routes.band_hz, report=report, json=json,
+                    jobs=jobs, dask=dask, with_paper=paper,
+                )  # fmt: skip
+            except LoneSessionError as lone:
+                code = _lone_session(lone, routes, report, json)
+    except OutputExistsError as error:
+        _complain(str(error))
+        code = 2
+    except (OutputError, CampaignError) as error:
+        _complain(str(error))
+        code = 1
+    except KeyboardInterrupt:
+        typer.echo("Stopped.", err=True)
+        code = _EXIT_INTERRUPTED
+    raise typer.Exit(code)
+
+
+def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
+    """Refuse options of a campaign where there is none."""
+    if not options:
+        return
+    if len(files) == 1:
+        why = "one session is no campaign; give several sessions, or leave it out."
+    else:
+        why = "--each makes no campaign of the sessions; leave one of the two out."
+    raise typer.BadParameter(why, param_hint=" and ".join(options))
+
+
+def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Path | None) -> None:
+    """Refuse what is made of the paper's route where that is left out, and say what has no say."""
+    if is_campaign:
+        raise typer.BadParameter(
+            "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
+            "--method all, or add --each.",
+            param_hint="--method",
+        )
+    if rerun is not None:
+        raise typer.BadParameter(
+            "its charts are of the paper's fits, which --method record leaves out; take --method "
+            "all.",
+            param_hint="--rerun",
+        )
+    sources = {name: context.get_parameter_source(name) for name in _OF_WELCH}
+    given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]
+    if given:
+        typer.echo(
+            f"Warning: {', '.join(given)} {'concerns' if len(given) == 1 else 'concern'} the Welch "
+            "fits alone, which --method record leaves out: the whole record is fitted by every "
+            "type.",
+            err=True,
+        )
+
+
+def _lone_session(
+    lone: LoneSessionError, routes: Routes, report: Path | None, json: Path | None
+) -> int:
+    """Tell what is wrong with the other files of a campaign, and report the one that is left."""
+    for failure in lone.failures:
+        _complain(failure.message)
+    typer.echo(f"One session makes no campaign: {lone.path} is reported by itself.", err=True)
+    others = {str(failure.path): failure.message for failure in lone.failures}
+    return max(1, session_command([lone.path], routes, report, json, others=others))
+
+
+def _fixed(text: str) -> tuple[Setting, ...]:
+    from analysis.identify import SETTINGS
+
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in SETTINGS]
+    if unknown:
+        raise typer.BadParameter(
+            f"there is no {', '.join(unknown)}; choose from {', '.join(SETTINGS)}.",
+            param_hint="--fix",
+        )
+    return tuple(name for name in SETTINGS if name in names)
+
+
+def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
+    from analysis.report._rerun_file import check_rerun_file
+
+    if len(files) > 1:
+        raise typer.BadParameter(
+            f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
+        )
+    check_rerun_file(rerun)
+
+
+def _complain(message: str) -> None:
+    typer.echo(f"Error: {message}", err=True)

@@ -1,0 +1,147 @@
+"""A campaign from the command line: progress with the time left, the folder, the tables."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from analysis.campaigns._campaign import Campaign
+    from analysis.identify import Setting
+    from analysis.models import WelchSettings
+
+_NAME: Final = "campaign"
+_TEXT_WIDTH: Final = 120
+_FIGURES: Final = 6
+"""At most; each takes about as long as half a session."""
+
+
+def campaign_command(
+    files: Sequence[Path],
+    settings: WelchSettings,
+    *,
+    structures: Sequence[str],
+    fixed: Sequence[Setting] = (),
+    band_hz: tuple[float, float] | None = None,
+    report: Path | None = None,
+    json: Path | None = None,
+    jobs: int | None = None,
+    dask: str | None = None,
+    with_paper: bool = False,
+) -> int:
+    """Analyse a campaign, write its folder and its JSON, and print its tables.
+
+    Parameters
+    ----------
+    files : sequence of Path
+    settings : WelchSettings
+        Of the paper's route.
+    structures : sequence of str
+        Types fitted to the whole records.
+    fixed : sequence of str
+        Settings that those fits take from the files.
+    band_hz : tuple of float, optional
+        Of all fits; by default what suits each record.
+    report : Path, optional
+        Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
+        exists ``campaign.report-2`` and so on.
+    json : Path, optional
+        New file for all results; ``-`` for standard output, which then holds nothing else.
+    jobs : int, optional
+        Worker processes, by default one a core.
+    dask : str, optional
+        Address of a Dask scheduler to use instead.
+    with_paper : bool
+        Whether the paper's numbers stand beside these.
+
+    Returns
+    -------
+    int
+        Exit code: 1 if a file could not be used or predicted from the others, 0 otherwise.
+
+    Raises
+    ------
+    CampaignError
+        None of the files could be used, or the workers could not be had.
+    LoneSessionError
+        One of the files alone could be used, which makes no campaign: nothing was written.
+    OutputExistsError, OutputError
+        Something cannot be written.
+    """
+    from rich.console import Console
+
+    from analysis.campaigns._campaign import campaign
+    from analysis.report._campaign_document import campaign_document
+    from analysis.report._campaign_tables import campaign_tables
+    from analysis.report._document import document_text
+    from analysis.report._folder import report_folders, write_new
+
+    first = files[0] if report is not None else files[0].with_name(_NAME)
+    (folder,) = report_folders([first], report)
+    run = partial(
+        campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
+        dask=dask,
+    )  # fmt: skip
+    found = _analysed(run, len(files), folder, with_paper=with_paper)
+    to_stdout = json is not None and str(json) == "-"
+    console = Console(stderr=to_stdout, highlight=False)
+    if not console.is_terminal:
+        console = Console(stderr=to_stdout, highlight=False, width=_TEXT_WIDTH)
+    lines = [f"Report of the campaign: {folder}"]
+    if json is not None and not to_stdout:
+        # Before anything is said: the streams may take nothing.
+        write_new(json, document_text(campaign_document(found, with_paper=with_paper)))
+        lines.append(f"All results as JSON: {json}")
+    console.print(campaign_tables(found, with_paper=with_paper))
+    console.print("\n".join(lines), markup=False, soft_wrap=True)
+    if to_stdout:
+        content = campaign_document(found, with_paper=with_paper)
+        print(document_text(content, ascii_only=True), end="")  # noqa: T201 - what was asked for
+    return 1 if found.failures or found.lost_trials else 0
+
+
+def _analysed(
+    run: Callable[..., Campaign], files: int, folder: Path, *, with_paper: bool
+) -> Campaign:
+    """Analyse and write, with progress on a terminal; tell what failed."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from analysis.campaigns._experiment import LoneSessionError
+    from analysis.report._campaign_write import write_campaign
+    from analysis.report._folder import new_folder
+
+    terminal = Console(stderr=True, highlight=False)
+    with Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeRemainingColumn(),
+        console=terminal,
+        transient=True,
+        disable=not terminal.is_terminal,
+    ) as progress:
+        bar = progress.add_task("starting", total=2 * files + _FIGURES)
+
+        def on_progress(done: int, total: int, name: str) -> None:
+            progress.update(bar, completed=done, total=total + _FIGURES, description=name)
+
+        with new_folder(folder) as part:
+            found = run(on_progress=on_progress)
+            if len(found.sessions) == 1:
+                raise LoneSessionError(found.sessions[0].path, found.failures)
+            write_campaign(
+                found, part, with_paper=with_paper,
+                on_step=lambda done: progress.update(bar, advance=1, description=done),
+            )  # fmt: skip
+    for failure in found.failures:
+        terminal.print(f"Error: {failure.message}", markup=False, highlight=False, soft_wrap=True)
+    for lost in found.lost_trials:
+        terminal.print(
+            f"Error: {lost.path} is not predicted from the others: {lost.reason}",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+    return found

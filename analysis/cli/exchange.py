@@ -1,0 +1,281 @@
+"""Commands `analyze import` and `analyze export`: records of other programs in, results out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer.models import OptionInfo
+
+from analysis.cli.welch_options import (
+    Band,
+    Estimator,
+    Nfft,
+    Overlap,
+    Segment,
+    band_hz,
+    welch_settings,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from analysis.exchange._channels import ChannelChoice
+
+export_app = typer.Typer(
+    help="Write a session's record or frequency response for another program: .csv, .mat, .uff.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+IMPORT_EPILOG = """\
+Example: analyze import log.tdms session.mcap --angle "Rig/Angle:deg" --torque "Rig/Tz:mN.m"
+--rate-hz 1000 --profile rig.toml --rest 0,1 --sweep 1,121
+
+Exit code: 0 done, 1 the file cannot be imported, 2 wrong use, 130 stopped by Ctrl-C."""
+
+_EXPORT_EPILOG = "Exit code: 0 done, 1 it cannot be exported, 2 wrong use, 130 stopped by Ctrl-C."
+
+_Session = Annotated[
+    Path, typer.Argument(metavar="SESSION", readable=False, help="Session file (.mcap).")
+]
+_Target = Annotated[
+    Path,
+    typer.Argument(metavar="OUT", readable=False, help="New file: .csv, .mat, .uff, .unv, .uf58."),
+]
+_Binary = Annotated[
+    bool, typer.Option("--binary", help="Of a universal file: 8-byte floats instead of text.")
+]
+
+
+def _channel(what: str) -> OptionInfo:
+    option: OptionInfo = typer.Option(metavar="CHANNEL:UNIT", help=what)
+    return option
+
+
+def import_command(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            readable=False,
+            help="File of measurements: .csv, .txt, .dat, .mat, .tdms, .uff, .unv, .uf58.",
+        ),
+    ],
+    session: Annotated[
+        Path, typer.Argument(metavar="SESSION", readable=False, help="New session file (.mcap).")
+    ],
+    angle: Annotated[str, _channel("Motor angle at the output shaft; rad, mrad, deg, …")],
+    torque: Annotated[str, _channel("Coupling torque; N.m, mN.m, N.mm, …")],
+    profile: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE", readable=False, help="TOML with [beam] and the clamp's inertia."
+        ),
+    ],
+    time: Annotated[str | None, _channel("Time of the samples; s, ms, us, ns.")] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(metavar="HZ", help="Instead of --time: samples per second, without gaps."),
+    ] = None,
+    reference: Annotated[str | None, _channel("Angle that the motor was to have.")] = None,
+    torque_command: Annotated[str | None, _channel("Torque commanded to the motor.")] = None,
+    fx: Annotated[str | None, _channel("Force in the sensor's frame; N, mN, kN, lbf.")] = None,
+    fy: Annotated[str | None, _channel("Likewise.")] = None,
+    fz: Annotated[str | None, _channel("Likewise.")] = None,
+    tx: Annotated[str | None, _channel("Torque in the sensor's frame.")] = None,
+    ty: Annotated[str | None, _channel("Likewise.")] = None,
+    tz: Annotated[str | None, _channel("Likewise.")] = None,
+    rest: Annotated[
+        str | None, typer.Option(metavar="T0,T1", help="Rest before the sweep, s from the start.")
+    ] = None,
+    sweep: Annotated[
+        str | None,
+        typer.Option(
+            metavar="T0,T1", help="Sweep, s from the first sample.  [default: the whole record]"
+        ),
+    ] = None,
+    ring_down: Annotated[
+        str | None, typer.Option(metavar="T0,T1", help="Ring-down after the sweep, likewise.")
+    ] = None,
+    angle_delay_s: Annotated[
+        float, typer.Option(metavar="S", help="Age of the angle at its time stamp.")
+    ] = 0.0,
+    torque_delay_s: Annotated[
+        float, typer.Option(metavar="S", help="Age of the torque at its time stamp.")
+    ] = 0.0,
+    reverse_torque: Annotated[
+        bool,
+        typer.Option("--reverse-torque", help="The torque is the reaction: change its sign."),
+    ] = False,
+    operator: Annotated[
+        str, typer.Option(metavar="TEXT", help="Operator name, stored in the session file.")
+    ] = "",
+    specimen: Annotated[
+        str,
+        typer.Option(metavar="TEXT", help="Label of the specimen: campaigns tell by it."),
+    ] = "",
+    note: Annotated[
+        str, typer.Option(metavar="TEXT", help="Note, stored in the session file.")
+    ] = "",
+) -> None:
+    """Make a session file of a record that another program measured.
+
+    Channels and units are stated, never guessed. A channel is named as the file names it (its
+    title in CSV and UFF58, Group/Channel in TDMS, struct.field or matrix#column in MATLAB), or #3
+    for the third of a CSV or UFF58 file.
+    """
+    from analysis.exchange._channels import QUANTITIES
+    from analysis.exchange._import_record import ImportPlan, import_record
+    from analysis.exchange._specimen import read_specimen
+
+    if (time is None) == (rate_hz is None):
+        raise typer.BadParameter(
+            "state either the channel of times or the rate.", param_hint="--time, --rate-hz"
+        )
+    _check_delay("--angle-delay-s", angle_delay_s)
+    _check_delay("--torque-delay-s", torque_delay_s)
+    if session.suffix != ".mcap":
+        raise typer.BadParameter(
+            f"'{session}' does not end in .mcap, as a session file does.", param_hint="SESSION"
+        )
+    options = {
+        "angle_rad": ("--angle", angle),
+        "coupling_torque_nm": ("--torque", torque),
+        "angle_reference_rad": ("--reference", reference),
+        "torque_command_nm": ("--torque-command", torque_command),
+        "fx_n": ("--fx", fx),
+        "fy_n": ("--fy", fy),
+        "fz_n": ("--fz", fz),
+        "tx_nm": ("--tx", tx),
+        "ty_nm": ("--ty", ty),
+        "tz_nm": ("--tz", tz),
+    }
+    channels = {
+        field: _choice(option, text, QUANTITIES[field])
+        for field, (option, text) in options.items()
+        if text is not None
+    }
+    times = None if time is None else _choice("--time", time, "time")
+    segments = {
+        name: _interval(option, text)
+        for name, option, text in (
+            ("rest", "--rest", rest),
+            ("sweep", "--sweep", sweep),
+            ("ring_down", "--ring-down", ring_down),
+        )
+        if text is not None
+    }
+
+    def run() -> None:
+        plan = ImportPlan(
+            channels,
+            read_specimen(profile),
+            times,
+            rate_hz,
+            segments,
+            angle_delay_s,
+            torque_delay_s,
+            reverse_torque,
+            note,
+            specimen,
+            operator,
+        )
+        done = import_record(source, session, plan)
+        for warning in done.warnings:
+            typer.echo(f"Warning: {warning}", err=True)
+        typer.echo(
+            f"{done.samples} samples at {done.rate_hz:g} Hz from {source}: {session}"
+            + ("" if "sweep" in done.segments else "; the whole record counts as the sweep")
+        )
+
+    raise typer.Exit(_explained(run))
+
+
+@export_app.command("record", epilog=_EXPORT_EPILOG)
+def export_record_command(session: _Session, target: _Target, binary: _Binary = False) -> None:
+    """Write the samples as recorded: time, angles, torques, wrench, status bits."""
+    from analysis.exchange._export import export_record
+
+    def run() -> None:
+        table = export_record(session, target, binary=binary)
+        typer.echo(f"{len(table.axis.values)} samples of {session}: {target}")
+
+    raise typer.Exit(_explained(run))
+
+
+@export_app.command("frf", epilog=_EXPORT_EPILOG)
+def export_frf_command(
+    session: _Session,
+    target: _Target,
+    binary: _Binary = False,
+    frf: Estimator = "h1",
+    band: Band = None,
+    segment: Segment = None,
+    overlap: Overlap = None,
+    nfft: Nfft = None,
+) -> None:
+    """Write the frequency response from angle to coupling torque, as an analysis estimates it."""
+    from analysis.exchange._export import export_frf
+
+    settings = welch_settings("I", "const", frf, segment, overlap, nfft)
+    asked_hz = band_hz(band)
+
+    def run() -> None:
+        table = export_frf(session, target, settings, asked_hz, binary=binary)
+        typer.echo(f"{len(table.axis.values)} frequencies of {session}: {target}")
+
+    raise typer.Exit(_explained(run))
+
+
+def _explained(run: Callable[[], None]) -> int:
+    """Run a command and return its exit code; what went wrong is said in a sentence or two."""
+    from analysis.exchange._source import ExchangeError, TargetError
+    from analysis.paper import EstimateError, SettingsError
+    from analysis.record import RecordError
+    from analysis.report._folder import OutputError, OutputExistsError
+    from rigd.session import SessionError, SessionExistsError
+
+    try:
+        run()
+    except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
+        typer.echo(f"Error: {error}", err=True)
+        return 2
+    except (ExchangeError, SessionError, RecordError, EstimateError, OutputError) as error:
+        typer.echo(f"Error: {error}", err=True)
+        return 1
+    except KeyboardInterrupt:
+        typer.echo("Stopped.", err=True)
+        return 130
+    return 0
+
+
+def _choice(option: str, text: str, quantity: str) -> ChannelChoice:
+    from analysis.exchange._channels import parse_choice
+    from analysis.exchange._source import ExchangeError
+
+    try:
+        return parse_choice(text, quantity)
+    except ExchangeError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
+
+
+def _interval(option: str, text: str) -> tuple[float, float]:
+    try:
+        begin_s, end_s = (float(part) for part in text.split(","))
+    except ValueError:
+        begin_s = end_s = math.nan
+    if not 0.0 <= begin_s < end_s < math.inf:
+        raise typer.BadParameter(
+            f"'{text}' is not two times in s with 0 <= T0 < T1, such as 1,121.", param_hint=option
+        )
+    return begin_s, end_s
+
+
+def _check_delay(option: str, delay_s: float) -> None:
+    if not abs(delay_s) <= 1.0:
+        raise typer.BadParameter(
+            f"{delay_s} s is no delay between a quantity and its sample.", param_hint=option
+        )

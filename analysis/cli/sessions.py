@@ -1,0 +1,272 @@
+"""Sessions analysed one by one from the command line: progress, reports, tables, JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from rich.console import Console
+
+    from analysis.identify import Setting
+    from analysis.models import WelchSettings
+    from analysis.paper import WelchAnalysis
+    from analysis.record import Record
+    from analysis.results import Subject
+
+    _Found = tuple[WelchAnalysis | None, Subject | None]
+
+_FIGURE_STEPS: Final = 4
+"""How many times longer a figure takes than another step, roughly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Routes:
+    """What is done with a record: Welch's fits, by these settings, and those of the whole record.
+
+    Attributes
+    ----------
+    settings : WelchSettings
+    paper, whole_record : bool
+        Which of the two.
+    fixed : tuple of str
+        Settings of rig and specimen that stay at the file's values.
+    band_hz : tuple of float or None
+        Of both; None takes what suits the record.
+    """
+
+    settings: WelchSettings
+    paper: bool
+    whole_record: bool
+    fixed: tuple[Setting, ...]
+    band_hz: tuple[float, float] | None = None
+
+
+def session_command(
+    files: Sequence[Path],
+    routes: Routes,
+    report: Path | None,
+    json: Path | None,
+    rerun: Path | None = None,
+    others: Mapping[str, str] | None = None,
+) -> int:
+    """Analyse the files one after the other, write a report of each, and print the tables.
+
+    Parameters
+    ----------
+    files : sequence of Path
+    routes : Routes
+    report : Path, optional
+        Folder of the report of one file, or of one folder a file.
+    json : Path, optional
+        New file for all results; ``-`` for standard output, which then holds nothing else.
+    rerun : Path, optional
+        New file with session and fits for Rerun's viewer, of one session.
+    others : mapping of str to str, optional
+        Files that were left out before, with the reason that was told: errors of the results, too.
+
+    Returns
+    -------
+    int
+        Exit code: 1 if a file could not be analysed, 2 if the settings suit none, 0 otherwise.
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+        Something cannot be written.
+    """
+    from rich.console import Console
+
+    from analysis.report._document import document, document_text
+    from analysis.report._folder import report_folders, write_new
+
+    folders = report_folders(files, report)
+    found, errors, code = _analyse_all(files, folders, routes, rerun)
+    if not found:
+        return code
+    analyses = [analysis for analysis, _ in found if analysis is not None]
+    subjects = [subject for _, subject in found if subject is not None]
+    results = document(analyses, {**(others or {}), **errors}, subjects)
+    to_stdout = json is not None and str(json) == "-"
+    if json is not None and not to_stdout:
+        # Before anything is said: the streams may take nothing.
+        write_new(json, document_text(results))
+    console = Console(stderr=to_stdout, highlight=False)
+    if not console.is_terminal:
+        console = Console(stderr=to_stdout, highlight=False, width=120)
+    _print_tables(console, analyses, subjects, single=len(files) == 1)
+    _say(console, "")
+    for file, folder in zip(files, folders, strict=True):
+        if str(file) not in errors:
+            _say(console, f"Report of {file}: {folder}")
+    if rerun is not None:
+        _say(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
+    if to_stdout:
+        typer.echo(document_text(results, ascii_only=True), nl=False)
+    elif json is not None:
+        _say(console, f"All results as JSON: {json}")
+    return code
+
+
+def _print_tables(
+    console: Console,
+    analyses: Sequence[WelchAnalysis],
+    subjects: Sequence[Subject],
+    *,
+    single: bool,
+) -> None:
+    """Print all of a single file, of several what the paper's route has together."""
+    from analysis.report._text import analysis_tables, record_text, summary_table
+
+    if single or not analyses:
+        for subject in subjects:
+            console.print(record_text(subject))
+    if single and analyses:
+        withheld = subjects[0].unsupported if subjects else frozenset()
+        console.print(analysis_tables(analyses[0], withheld))
+    elif analyses:
+        console.print(summary_table(analyses))
+
+
+def _analyse_all(
+    files: Sequence[Path], folders: Sequence[Path], routes: Routes, rerun: Path | None
+) -> tuple[list[_Found], dict[str, str], int]:
+    """Analyse and report every file; return results, message by failed file, and exit code."""
+    from numpy.linalg import LinAlgError
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from analysis.identify import MeasurementError
+    from analysis.paper import EstimateError, SettingsError
+    from analysis.record import RecordError
+    from analysis.report._folder import OutputError
+    from rigd.session import SessionError
+
+    found: list[_Found] = []
+    errors: dict[str, str] = {}
+    code = 0
+    terminal = _standard_error()
+    tell = partial(terminal.print, markup=False, highlight=False, soft_wrap=True)
+    with Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=terminal,
+        transient=True,
+        disable=not terminal.is_terminal,
+    ) as progress:
+        steps = _steps(routes, rerun)
+        task = progress.add_task("", total=len(files) * steps)
+        for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
+
+            def on_step(done: str, name: str = file.name) -> None:
+                weight = _FIGURE_STEPS if done.startswith("figure") else 1
+                progress.update(task, advance=weight, description=f"{name}: {done}")
+
+            try:
+                found.append(_analyse_file(file, folder, routes, rerun, on_step, tell))
+            except (
+                SessionError, RecordError, EstimateError, MeasurementError, OutputError,
+                MemoryError, LinAlgError,
+            ) as error:  # fmt: skip
+                code = max(code, 2 if isinstance(error, SettingsError) else 1)
+                errors[str(file)] = message = _told(file, error)
+                progress.update(task, completed=number * steps)
+                tell(f"Error: {message}")
+    return found, errors, code
+
+
+def _told(file: Path, error: Exception) -> str:
+    from numpy.linalg import LinAlgError
+
+    if isinstance(error, MemoryError):
+        return f"{file}: there is not memory enough to analyse it."
+    if isinstance(error, LinAlgError):
+        return f"{file}: the estimate failed ({error}); is this a record of the rig?"
+    return str(error)
+
+
+def _steps(routes: Routes, rerun: Path | None) -> int:
+    from analysis.report._write import FIGURES as OF_RECORD
+    from analysis.report._write import figures_of_paper
+
+    figures = figures_of_paper(paper=routes.paper, whole_record=routes.whole_record)
+    pictures = len(figures) + routes.whole_record * len(OF_RECORD) + (rerun is not None)
+    steps = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
+    return steps + _FIGURE_STEPS * pictures
+
+
+def _analyse_file(
+    file: Path,
+    folder: Path,
+    routes: Routes,
+    rerun: Path | None,
+    on_step: Callable[[str], None],
+    warn: Callable[[str], None],
+) -> _Found:
+    from analysis.identify import MeasurementError
+    from analysis.record import load_record
+    from analysis.report._folder import new_folder
+    from analysis.report._write import write_report
+    from analysis.suited import check_record_band, remarks, welch_analysis
+
+    record = load_record(file)
+    record = _with_warnings(record, remarks(record, routes.band_hz))
+    on_step("read")
+    if not routes.paper:
+        check_record_band(record, routes.band_hz)
+    analysis, left_out = None, None
+    if routes.paper:
+        analysis, left_out = welch_analysis(
+            record, routes.settings, routes.band_hz,
+            optional=routes.whole_record and rerun is None, on_step=on_step,
+        )  # fmt: skip
+    if left_out:
+        warn(f"Warning: {file}: {left_out}")
+        record = _with_warnings(record, (left_out,))
+    subject = None
+    if routes.whole_record:
+        on_step("whole record")
+        try:
+            subject = _whole_record(record, routes, analysis)
+        except MeasurementError as error:
+            if analysis is None:
+                raise
+            warn(f"Warning: {error} Only the Welch fits were run.")
+    with new_folder(folder) as part:
+        write_report(analysis, part, on_step, subject)
+    if rerun is not None and analysis is not None:
+        from analysis.report._rerun_file import write_rerun_file
+
+        write_rerun_file(analysis, rerun)
+        on_step("figure for Rerun")
+    return analysis, subject
+
+
+def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
+    return replace(record, warnings=(*record.warnings, *more)) if more else record
+
+
+def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis | None) -> Subject:
+    from analysis.identify import Measurement, select
+    from analysis.results import Subject
+    from analysis.suited import record_band_hz
+
+    band_hz = record_band_hz(record, routes.band_hz)
+    selection = select(Measurement.of_record(record), fixed=routes.fixed, band_hz=band_hz)
+    return Subject.of(record, selection, band_hz, routes.fixed, welch)
+
+
+def _standard_error() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)

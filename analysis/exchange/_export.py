@@ -1,0 +1,124 @@
+"""A session's record or its frequency response into a new file for another program."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+from analysis.exchange._source import TargetError
+from analysis.exchange._table import frf_table, record_table
+from analysis.report._folder import OutputError, check_new_file
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from analysis.exchange._table import Table
+    from analysis.models import WelchSettings
+
+_UNIVERSAL: Final = (".uff", ".unv", ".uf58")
+SUFFIXES: Final = (".csv", ".mat", *_UNIVERSAL)
+"""Endings of the files that can be written."""
+
+
+def export_record(session: Path, target: Path, *, binary: bool = False) -> Table:
+    """Write the samples of a session as they were recorded.
+
+    Parameters
+    ----------
+    session : Path
+    target : Path
+        A new file; its ending, one of `SUFFIXES`, is its format.
+    binary : bool
+        Of a universal file: numbers as 8-byte floats instead of text.
+
+    Returns
+    -------
+    Table
+        What was written.
+
+    Raises
+    ------
+    TargetError
+        If the ending is unknown, or `binary` is not for it.
+    ExchangeError
+        If the record does not fit the format, or a library is missing.
+    analysis.report._folder.OutputExistsError, analysis.report._folder.OutputError
+        If the file exists or cannot be written.
+    rigd.session.SessionError
+        If the session cannot be read.
+    """
+    check_target(target, binary=binary)
+    table = record_table(session)
+    _write(table, target, binary=binary)
+    return table
+
+
+def export_frf(
+    session: Path,
+    target: Path,
+    settings: WelchSettings,
+    band_hz: tuple[float, float] | None = None,
+    *,
+    binary: bool = False,
+) -> Table:
+    """Write the frequency response that an analysis with these settings and band would fit.
+
+    Otherwise as `export_record`; the analysis' own errors come on top.
+    """
+    check_target(target, binary=binary)
+    table = frf_table(session, settings, band_hz)
+    _write(table, target, binary=binary)
+    return table
+
+
+def check_target(target: Path, *, binary: bool) -> None:
+    """Refuse what cannot be written, before anything is computed."""
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise TargetError(
+            f"{target}: the ending says what is written; choose one of {', '.join(SUFFIXES)}."
+        )
+    if binary and suffix not in _UNIVERSAL:
+        raise TargetError(
+            f"{target}: --binary is for universal files ({', '.join(_UNIVERSAL)}); leave it out."
+        )
+    check_new_file(target, "The file")
+
+
+def _write(table: Table, target: Path, *, binary: bool) -> None:
+    with _new_file(target) as stream:
+        match target.suffix.lower():
+            case ".csv":
+                from analysis.exchange._csv_format import write_csv
+
+                write_csv(table, stream)
+            case ".mat":
+                from analysis.exchange._matlab_format import write_mat
+
+                write_mat(table, stream)
+            case _:
+                from analysis.exchange._uff_format import write_uff58
+
+                write_uff58(table, stream, binary=binary)
+
+
+@contextmanager
+def _new_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a new file that vanishes again if it cannot be completed."""
+    try:
+        stream = path.open("xb")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error
+    try:
+        with stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+    except BaseException as error:
+        path.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error
+        raise

@@ -1,0 +1,477 @@
+"""A measurement of another program becomes a session file, and is checked on the way."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+import rigd
+from analysis.exchange._channels import (
+    canonical_unit,
+    from_time_stamps,
+    uniform,
+    unit_in_brackets,
+    unit_in_suffix,
+)
+from analysis.exchange._session_file import write_session
+from analysis.exchange._source import ExchangeError, read_source
+from analysis.record_checks import too_much_unknown
+from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
+from rigd.printable import printable
+from rigd.session import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from analysis.exchange._channels import ChannelChoice, Timebase
+    from analysis.exchange._source import SourceChannel
+    from analysis.exchange._specimen import Specimen
+
+_FLAGS: Final = {
+    "angle_rad": Status.ANGLE_STALE,
+    "coupling_torque_nm": Status.WRENCH_STALE,
+}
+"""Field of a sample → the flag that says its value is that of the sample before."""
+
+
+def hold(
+    path: Path, names: Mapping[str, str], columns: Mapping[str, NDArray[np.float64]]
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
+    """Replace values that are not finite as the session format does: by the last good one.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    names : mapping of str to str
+        Field → name of its channel in the file, for messages.
+    columns : mapping of str to ndarray of float, shape (n,)
+        Field → values.
+
+    Returns
+    -------
+    columns : dict of str to ndarray of float, shape (n - first,)
+    status : ndarray of uint32, shape (n - first,)
+        Bits of `rigd.session.Status`.
+    first : int
+        Samples at the beginning that had to be left out, having nothing to hold.
+
+    Raises
+    ------
+    ExchangeError
+        If it is too many values, or those of a channel that cannot be flagged.
+    """
+    bad = {name: ~np.isfinite(values) for name, values in columns.items()}
+    for name, mask in bad.items():
+        count = int(mask.sum())
+        if count and name not in _FLAGS:
+            raise ExchangeError(
+                f"{path}: '{names[name]}' is not finite in {count} of {len(mask)} samples, first "
+                f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
+                "analysis needs it."
+            )
+        much = too_much_unknown(f"'{names[name]}'", count, len(mask))
+        if much:
+            raise ExchangeError(
+                f"{path}: {much} Or choose another channel, or cut the session out of the file."
+            )
+    first = max(int(np.argmin(mask)) for mask in bad.values())
+    held = {name: _held(values, bad[name])[first:] for name, values in columns.items()}
+    status = np.zeros(len(next(iter(held.values()))), dtype=np.uint32)
+    for name, flag in _FLAGS.items():
+        if name in bad:
+            status[bad[name][first:]] |= np.uint32(flag)
+    return held, status, first
+
+
+def _held(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    if not bad.any():
+        return values
+    last_good = np.maximum.accumulate(np.where(bad, 0, np.arange(len(values))))
+    return values[last_good]
+
+
+_RATE_TOLERANCE: Final = 2e-5
+"""Largest relative difference between the rate stated and the file's own, of which UFF58 has six
+digits."""
+
+_NO_UNIT: Final = ("", "NONE", "none", "-")
+
+
+def check_units(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> list[str]:
+    """Compare the units stated with those that the file has beside its channels.
+
+    Returns
+    -------
+    list of str
+        Warnings, where the file says something that is not understood.
+
+    Raises
+    ------
+    ExchangeError
+        If the file clearly says another unit.
+    """
+    warnings = []
+    for choice in plan.choices:
+        label = channels[choice.channel].unit_label.strip()
+        said = canonical_unit(label) if label else unit_in_brackets(choice.channel)
+        if said is not None and said != choice.unit:
+            raise ExchangeError(
+                f"{path}: the file says that '{choice.channel}' is in {said}, and {choice.unit} "
+                f"was stated; state '{choice.channel}:{said}', or correct the file."
+            )
+        if said is None and label not in _NO_UNIT:
+            warnings.append(
+                f"The file says '{printable(label, 20)}' of '{choice.channel}', which was taken "
+                f"to be in {choice.unit} as stated."
+            )
+        suffix = unit_in_suffix(choice.channel)
+        if said is None and suffix not in (None, choice.unit):
+            warnings.append(
+                f"The name '{choice.channel}' sounds like {suffix}; it was taken to be in "
+                f"{choice.unit} as stated."
+            )
+    return warnings
+
+
+def timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
+    """Place the samples in time, by the channel of times or by the rate stated.
+
+    Raises
+    ------
+    ExchangeError
+        If the times are no time base, or the file has another rate than was stated.
+    """
+    if plan.time is not None:
+        time_s = channels[plan.time.channel].values * plan.time.factor
+        found = from_time_stamps(path, plan.time.channel, time_s)
+    else:
+        samples = len(next(iter(channels.values())).values)
+        found = uniform(path, samples, plan.rate_hz or 0.0)
+    for name, channel in channels.items():
+        own_hz = channel.rate_hz
+        if own_hz is not None and abs(own_hz / found.rate_hz - 1) > _RATE_TOLERANCE:
+            raise ExchangeError(
+                f"{path}: the file says that '{name}' was sampled at {own_hz:.6g} Hz, and "
+                f"{found.rate_hz:.6g} Hz was stated; state the true rate with --rate-hz."
+            )
+    return found
+
+
+REQUIRED: Final = ("angle_rad", "coupling_torque_nm")
+"""Fields of a sample without which nothing can be analysed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportPlan:
+    """Channels, units and circumstances; nothing of it is guessed.
+
+    Attributes
+    ----------
+    channels : mapping of str to ChannelChoice
+        Field of a sample (`analysis.exchange._channels.QUANTITIES`) → channel and unit; those of
+        `REQUIRED` must be among them.
+    specimen : Specimen
+    time : ChannelChoice, optional
+        Channel with the time of each sample.
+    rate_hz : float, optional
+        Samples per second of a record without gaps; this or `time`.
+    segments_s : mapping of str to (float, float)
+        Name (rest, sweep, ring_down) → begin and end in s after the first sample.
+    angle_delay_s, torque_delay_s : float
+        Age of either value at its time stamp.
+    reverse_torque : bool
+        Whether the coupling torque counts against the angle's sense, as a reaction does.
+    note, label, operator : str
+        From the operator; the label is what they call the specimen.
+    """
+
+    channels: Mapping[str, ChannelChoice]
+    specimen: Specimen
+    time: ChannelChoice | None = None
+    rate_hz: float | None = None
+    segments_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    angle_delay_s: float = 0.0
+    torque_delay_s: float = 0.0
+    reverse_torque: bool = False
+    note: str = ""
+    label: str = ""
+    operator: str = ""
+
+    def __post_init__(self) -> None:
+        if any(name not in self.channels for name in REQUIRED):
+            raise ValueError(f"a plan needs channels for {' and '.join(REQUIRED)}")
+        if (self.time is None) == (self.rate_hz is None):
+            raise ValueError("a plan needs either a channel of times or a rate")
+
+    @property
+    def choices(self) -> tuple[ChannelChoice, ...]:
+        """Every channel that is to be read."""
+        return (*self.channels.values(), *(() if self.time is None else (self.time,)))
+
+
+_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
+"""In first natural frequencies: on either side of the first resonance, far enough from it and from
+the first antiresonance (at 4.4) for damping not to matter, and above the frequencies at which the
+paper's external damping outweighs the inertia."""
+
+_CERTAIN: Final = 6.0
+"""Standard deviations from zero that the factor between torque and model must have to judge at
+all: a motion that does not reach these frequencies tells nothing."""
+
+_TAPER: Final = 0.05
+"""Share of the record at either end over which it is faded: a record may begin and end in motion,
+and the paper's chirp passes these frequencies early."""
+
+_FACTOR: Final = 3.0
+"""Largest factor between torque and model that damping and a wrong mass may account for. The units
+that are easily mixed up differ by more than ten."""
+
+
+def unlikely_torque(
+    angle_rad: NDArray[np.float64],
+    torque_nm: NDArray[np.float64],
+    rate_hz: float,
+    specimen: Specimen,
+) -> str | None:
+    """Compare the torque with what the undamped beam would ask for, beside its first resonance.
+
+    Parameters
+    ----------
+    angle_rad, torque_nm : ndarray of float, shape (n,)
+        Of the whole record, finite.
+    rate_hz : float
+    specimen : Specimen
+
+    Returns
+    -------
+    str or None
+        What is odd and what to check; None if nothing is, or the motion does not tell.
+    """
+    frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
+    first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
+    band = np.zeros(frequency_hz.shape, dtype=np.bool_)
+    for low, high in _BANDS:
+        band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
+    s = 2j * np.pi * frequency_hz[band]
+    place = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
+    window = np.sin(np.pi / 2 * np.minimum((1 - place) / (2 * _TAPER), 1)) ** 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        angle, torque = (
+            np.fft.rfft(window * (values - values.mean()))[band]
+            for values in (angle_rad, torque_nm)
+        )
+        model = (transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2) * angle
+        power, total = (float(np.vdot(each, each).real) for each in (model, torque))
+        if not (0.0 < power < np.inf and 0.0 < total < np.inf):
+            return None
+        ratio = complex(np.vdot(model, torque) / power)
+    size = abs(ratio)
+    explained = size**2 * power
+    unexplained_per_bin = max(total - explained, 0.0) / np.count_nonzero(band)
+    if explained < _CERTAIN**2 * unexplained_per_bin:
+        return None
+    if not 1 / _FACTOR < size < _FACTOR:
+        return (
+            f"The torque is {size:.3g} times what this beam asks for: check the units of "
+            "angle and torque, and the beam's length and density."
+        )
+    if ratio.real < 0.0:
+        return (
+            "The torque has the opposite sign of what this beam asks for: a sensor that reports "
+            "the reaction is imported with --reverse-torque."
+        )
+    return None
+
+
+_JITTER_TOLD: Final = 0.01
+"""Distance of a time stamp from its tick, in periods, from which on it is worth a word."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedRecord:
+    """What became of a file.
+
+    Attributes
+    ----------
+    path : Path
+        The session file.
+    samples : int
+    rate_hz : float
+    segments : mapping of str to (int, int)
+        Name → first tick and end, as stated.
+    warnings : tuple of str
+        Sentences to be read before any result; the session has them as events.
+    """
+
+    path: Path
+    samples: int
+    rate_hz: float
+    segments: Mapping[str, tuple[int, int]]
+    warnings: tuple[str, ...]
+
+
+def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
+    """Read channels of a file and write them as a new session.
+
+    Gaps in the time become missing ticks. Values that are not finite are held from the sample
+    before and flagged as stale, which every analysis masks. Nothing is resampled.
+
+    Parameters
+    ----------
+    source : Path
+        A file that `analysis.exchange._source.read_source` reads.
+    target : Path
+        The session, ``NAME.mcap``, which must not exist.
+    plan : ImportPlan
+
+    Raises
+    ------
+    ExchangeError
+        If the file cannot be read, is no record, or contradicts the plan.
+    rigd.session.SessionError
+        If the session exists or cannot be written.
+    """
+    names = list(dict.fromkeys(choice.channel for choice in plan.choices))
+    file_format, channels = read_source(source, names)
+    remarks = dict.fromkeys(channel.remark for channel in channels.values() if channel.remark)
+    warnings = [*remarks, *check_units(source, plan, channels)]
+    base = timebase(source, plan, channels)
+    segments = _segments(source, plan.segments_s, base.rate_hz, int(base.ticks[-1]) + 1)
+    columns = _columns(plan, channels)
+    del channels  # of the largest files, a quarter of a gigabyte
+    titles = {name: choice.channel for name, choice in plan.channels.items()}
+    columns, status, first = hold(source, titles, columns)
+    ticks = base.ticks[first:]
+    after_gap = np.diff(ticks, prepend=-1) > 1
+    if base.jitter > _JITTER_TOLD:
+        warnings.append(
+            f"The time stamps lie up to {base.jitter:.2g} periods from equidistant ones."
+        )
+    warnings += _told(titles, status, first, ticks)
+    odd = unlikely_torque(
+        _on_grid(ticks, columns["angle_rad"]),
+        _on_grid(ticks, columns["coupling_torque_nm"]),
+        base.rate_hz,
+        plan.specimen,
+    )
+    warnings += [odd] if odd else []
+    status[after_gap] |= np.uint32(Status.AFTER_LOST)
+    write_session(
+        target,
+        {**columns, "tick": ticks, "status": status},
+        base.rate_hz,
+        max(source.stat().st_mtime_ns, 0),
+        _metadata(source, target, file_format, plan, base.rate_hz),
+        segments,
+        warnings,
+    )
+    return ImportedRecord(target, len(ticks), base.rate_hz, segments, tuple(warnings))
+
+
+def _columns(
+    plan: ImportPlan, channels: Mapping[str, SourceChannel]
+) -> dict[str, NDArray[np.float64]]:
+    """Fields of the samples in their units; what becomes infinite is for others to judge."""
+    columns = {}
+    with np.errstate(over="ignore"):
+        for name, choice in plan.channels.items():
+            reverse = plan.reverse_torque and name == "coupling_torque_nm"
+            size = -choice.factor if reverse else choice.factor
+            values = channels[choice.channel].values
+            columns[name] = values if size == 1.0 else values * size
+    return columns
+
+
+def _segments(
+    path: Path, segments_s: Mapping[str, tuple[float, float]], rate_hz: float, ticks: int
+) -> dict[str, tuple[int, int]]:
+    """Segments in ticks, all of them inside the record."""
+    found = {}
+    for name, (begin_s, end_s) in segments_s.items():
+        first, end = round(begin_s * rate_hz), round(end_s * rate_hz)
+        if not 0 <= first < end <= ticks:
+            raise ExchangeError(
+                f"{path}: the segment {name} from {begin_s:g} to {end_s:g} s is not inside the "
+                f"record, which lasts {ticks / rate_hz:g} s; count from the first sample."
+            )
+        found[name] = (first, end)
+    return found
+
+
+def _told(
+    titles: Mapping[str, str], status: NDArray[np.uint32], first: int, ticks: NDArray[np.int64]
+) -> list[str]:
+    """Sentences on what of the record is missing."""
+    found = []
+    if first:
+        found.append(
+            f"The first {first} samples were left out: angle or torque is not finite there."
+        )
+    for flag, name in (
+        (Status.ANGLE_STALE, titles["angle_rad"]),
+        (Status.WRENCH_STALE, titles["coupling_torque_nm"]),
+    ):
+        count = int(np.count_nonzero(status & flag))
+        if count:
+            found.append(f"{count} samples of '{name}' are not finite; they were flagged as stale.")
+    steps = np.diff(ticks)
+    missing = int(steps.sum()) - len(steps)
+    if missing:
+        found.append(
+            f"{missing} samples are missing in {np.count_nonzero(steps > 1)} gaps of the time, the "
+            f"longest of {int(steps.max()) - 1}."
+        )
+    return found
+
+
+def _on_grid(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    if ticks[-1] - ticks[0] + 1 == len(ticks):
+        return values
+    return np.interp(np.arange(ticks[0], ticks[-1] + 1), ticks, values)
+
+
+def _metadata(
+    source: Path, target: Path, file_format: str, plan: ImportPlan, rate_hz: float
+) -> dict[str, str]:
+    """Everything that the session is to say of itself and of where it came from."""
+    beam = plan.specimen.beam
+    numbers = {
+        "rate_hz": rate_hz,
+        "beam_length_m": beam.length_m,
+        "beam_density_kg_per_m": beam.density_kg_per_m,
+        "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
+        "tool_inertia_kg_m2": plan.specimen.tool_inertia_kg_m2,
+        "angle_delay_s": plan.angle_delay_s,
+        "torque_delay_s": plan.torque_delay_s,
+    }
+    with source.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    mapping = {f"import_{name}": str(choice) for name, choice in plan.channels.items()}
+    if plan.reverse_torque:
+        mapping["import_coupling_torque_nm"] += ", reversed"
+    return {
+        "id": target.stem,
+        **{name: repr(float(value)) for name, value in numbers.items()},
+        **{
+            key: text
+            for key, text in (
+                ("operator", plan.operator),
+                ("specimen", plan.label),
+                ("note", plan.note),
+            )
+            if text
+        },
+        "software": f"rigd {rigd.__version__}",
+        "imported_from": source.name.encode("utf-8", "replace").decode("utf-8"),
+        "import_format": file_format,
+        "import_sha256": digest,
+        "import_time": "rate stated" if plan.time is None else str(plan.time),
+        **mapping,
+    }

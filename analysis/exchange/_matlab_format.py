@@ -1,0 +1,186 @@
+"""MATLAB files: channels of variables and structs, and a table as a file of version 5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from analysis.exchange._source import (
+    ExchangeError,
+    SourceChannel,
+    as_column,
+    bounded_memory,
+    check_samples,
+    missing_library,
+    no_such_channel,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Mapping, Sequence
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from numpy.typing import NDArray
+
+    from analysis.exchange._table import Table
+
+_HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
+_HDF5_AT: Final = (0, 512)  # MATLAB puts its own header of 512 bytes before it
+
+
+def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+    """Read vectors of a MATLAB file, as `analysis.exchange._source.read_source` asks for.
+
+    A channel is a variable ``angle``, a field of a struct ``log.angle``, or a column of a matrix
+    ``data#2``, counted from 1 as MATLAB does.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(max(_HDF5_AT) + len(_HDF5_MAGIC))
+    if any(head[at : at + len(_HDF5_MAGIC)] == _HDF5_MAGIC for at in _HDF5_AT):
+        return _read_hdf5(path, names)
+    return _read_mat(path, names)
+
+
+def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+    try:
+        from scipy.io import loadmat, whosmat
+    except ImportError as error:
+        raise missing_library(path, "scipy") from error
+    try:
+        with bounded_memory():
+            return _vectors(path, names, whosmat(path), loadmat)
+    except (ExchangeError, OSError, MemoryError):
+        raise
+    except Exception as error:  # scipy lets through whatever a damaged file provokes
+        raise ExchangeError(
+            f"{path}: is not a MATLAB file of version 4 to 7, or is damaged ({error}); save it "
+            "again with save('-v7', …)."
+        ) from error
+
+
+def _vectors(
+    path: Path,
+    names: Sequence[str],
+    listed: Sequence[tuple[str, tuple[int, ...], str]],
+    load: Callable[..., Mapping[str, Any]],
+) -> dict[str, SourceChannel]:
+    """Load the variables that are asked for, once their sizes as listed have been looked at."""
+    shapes = {name: shape for name, shape, _ in listed}
+    variables = {name: _split(name, shapes)[0] for name in names}
+    for name, variable in variables.items():
+        if variable not in shapes:
+            raise no_such_channel(path, name, shapes)
+        check_samples(path, f"The variable '{variable}'", max(shapes[variable], default=0))
+    contents = load(path, variable_names=sorted(set(variables.values())))
+    return {name: SourceChannel(_vector(path, name, contents)) for name in names}
+
+
+def _split(name: str, variables: Container[str]) -> tuple[str, list[str], int | None]:
+    """Take ``log.angle#2`` apart into variable, fields and column (from 0)."""
+    column = None
+    if name not in variables:
+        whole, mark, number = name.rpartition("#")
+        if mark and number.isdecimal() and int(number) > 0:
+            name, column = whole, int(number) - 1
+    variable, *fields = name.split(".")
+    return variable, fields, column
+
+
+def _vector(path: Path, name: str, contents: Mapping[str, Any]) -> NDArray[Any]:
+    variable, fields, column = _split(name, contents)
+    value = contents[variable]
+    for field in fields:
+        found = getattr(value, "dtype", None)
+        if found is None or found.names is None or value.size != 1:
+            raise ExchangeError(
+                f"{path}: '{name}' asks for the field '{field}' of what is no single struct."
+            )
+        if field not in found.names:
+            raise no_such_channel(path, name, (f"{variable}.{each}" for each in found.names))
+        value = value.reshape(-1)[0][field]
+    return _column(path, name, value, column)
+
+
+def _column(path: Path, name: str, value: Any, column: int | None) -> NDArray[Any]:  # noqa: ANN401
+    shape = getattr(value, "shape", None)
+    names = getattr(getattr(value, "dtype", None), "names", None)
+    if names:
+        listed = ", ".join(f"{name}.{each}" for each in names[:12])
+        raise ExchangeError(f"{path}: '{name}' is a struct; choose one of its fields: {listed}.")
+    if shape is None or getattr(value, "dtype", None) is None or hasattr(value, "tocoo"):
+        raise ExchangeError(f"{path}: '{name}' is no full array of numbers; save it as one.")
+    check_samples(path, f"'{name}'", max(shape, default=0))
+    if column is None:
+        if value.size != max(shape, default=0):
+            size = "×".join(map(str, shape))
+            raise ExchangeError(
+                f"{path}: '{name}' is a matrix of {size}; name one of its columns, such as "
+                f"{name}#1."
+            )
+        return as_column(path, name, value.reshape(-1))
+    if value.ndim != 2 or column >= value.shape[1]:
+        size = "×".join(map(str, shape))
+        raise ExchangeError(f"{path}: '{name}' is no column of it, its size is {size}.")
+    return as_column(path, name, value[:, column])
+
+
+def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+    try:
+        import h5py
+    except ImportError as error:
+        raise ExchangeError(
+            f"{path}: is a MATLAB file of version 7.3; save it with save('-v7', …), or install the "
+            "package h5py."
+        ) from error
+    try:
+        with bounded_memory(), h5py.File(path, "r") as file:
+            return {name: SourceChannel(_hdf5_vector(path, file, name, h5py)) for name in names}
+    except (ExchangeError, MemoryError):
+        raise
+    except Exception as error:  # h5py lets through whatever a damaged file provokes
+        raise ExchangeError(
+            f"{path}: cannot be read as a MATLAB file of version 7.3 ({error}); save it with "
+            "save('-v7', …)."
+        ) from error
+
+
+def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
+    variable, fields, column = _split(name, file)
+    place = "/".join([variable, *fields])
+    dataset = file.get(place)
+    if dataset is None:
+        raise no_such_channel(path, name, (each for each in file if not each.startswith("#")))
+    if not isinstance(dataset, h5py.Dataset):
+        listed = ", ".join(f"{name}.{each}" for each in list(dataset)[:12])
+        raise ExchangeError(f"{path}: '{name}' is a struct; choose one of its fields: {listed}.")
+    check_samples(path, f"'{name}'", max(dataset.shape, default=0))
+    # MATLAB's columns are the rows of HDF5, which counts its dimensions from the other end.
+    return _column(path, name, dataset[()].T, column)
+
+
+def write_mat(table: Table, stream: BinaryIO) -> None:
+    """Write each column as a variable of its name, n×1, and ``information``, a struct of texts.
+
+    Raises
+    ------
+    ExchangeError
+        If scipy is not installed.
+    """
+    try:
+        from scipy.io import savemat
+    except ImportError as error:
+        raise missing_library(Path(table.source), "scipy") from error
+    variables = {column.name: column.values for column in (table.axis, *table.columns)}
+    savemat(
+        stream,
+        {**variables, "information": {_identifier(k): v for k, v in table.information.items()}},
+        long_field_names=True,
+        do_compression=True,
+        oned_as="column",
+    )
+
+
+def _identifier(key: str) -> str:
+    """Make a key of any file a field name that MATLAB takes."""
+    name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in key)
+    return (name if name[:1].isalpha() else f"x{name}")[:63]

@@ -1,0 +1,237 @@
+"""A measurement file of another program as named channels, read within bounds."""
+
+from __future__ import annotations
+
+import stat
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from rigd.printable import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+class ExchangeError(Exception):
+    """A file that cannot be imported or exported; the message names file, cause and remedy."""
+
+
+class TargetError(ExchangeError):
+    """A name under which nothing can be written."""
+
+
+MAX_MEMORY: Final = 800_000_000
+"""Most memory that reading a file may take, bytes."""
+
+
+@contextmanager
+def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
+    """Let the process grow by so much and no further: what asks for more gets a MemoryError.
+
+    Formats such as MATLAB's are compressed and nested, and their readers believe what a file says
+    of its sizes; a kilobyte can ask for all the memory there is. The kernel's own limit holds for
+    every library alike. Where there is none (Windows, macOS) nothing is limited. Libraries are to
+    be imported before, as the address space that they reserve would count too.
+    """
+    try:
+        import resource
+    except ImportError:
+        yield
+        return
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except OSError:
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    ceiling = pages * resource.getpagesize() + extra_bytes
+    bounds = [limit for limit in (soft, hard, ceiling) if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_AS, (min(bounds), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+MAX_SAMPLES: Final = 3_000_000
+"""Most samples of a channel: 50 minutes at 1 kHz. Ten such channels are a quarter of a gigabyte."""
+
+_NAMES_SHOWN: Final = 12
+"""Channel names that a message lists."""
+_NAME_SHOWN: Final = 60
+"""Characters of each."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceChannel:
+    """One channel as it stands in the file.
+
+    Attributes
+    ----------
+    values : ndarray of float, shape (n,)
+        In the unit that the user states; NaN and infinities as they are.
+    unit_label : str
+        What the file itself says of the unit, "" if nothing.
+    rate_hz : float or None
+        Samples per second by the file's own word, None if it says nothing.
+    remark : str
+        What the user should know of the file, "" if nothing.
+    """
+
+    values: NDArray[np.float64]
+    unit_label: str = ""
+    rate_hz: float | None = None
+    remark: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Format:
+    """How files of one kind are read: by ``read(path, names)`` of a module of this package."""
+
+    name: str
+    module: str
+    max_bytes: int
+    """Larger files are refused: what reads them needs up to ten times as much memory."""
+
+
+_MB: Final = 1_000_000
+
+_FORMATS: Final = {
+    ".csv": _Format("CSV", "csv_source", 512 * _MB),
+    ".txt": _Format("CSV", "csv_source", 512 * _MB),
+    ".dat": _Format("CSV", "csv_source", 512 * _MB),
+    ".mat": _Format("MATLAB", "mat_source", 512 * _MB),
+    ".tdms": _Format("TDMS", "tdms_source", 512 * _MB),
+    ".uff": _Format("UFF58", "uff_source", 128 * _MB),
+    ".unv": _Format("UFF58", "uff_source", 128 * _MB),
+    ".uf58": _Format("UFF58", "uff_source", 128 * _MB),
+}
+
+
+def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, SourceChannel]]:
+    """Read some channels of a file.
+
+    Parameters
+    ----------
+    path : Path
+        Its ending says what it is: .csv, .txt, .dat, .mat, .tdms, .uff, .unv or .uf58.
+    names : sequence of str
+        The channels, as the format has them (docs/exchange.md).
+
+    Returns
+    -------
+    format_name : str
+    channels : mapping
+        Each name with its channel, all of the same length.
+
+    Raises
+    ------
+    ExchangeError
+        If the file cannot be read, or has no such channel of numbers.
+    """
+    kind = _FORMATS.get(path.suffix.lower())
+    if kind is None:
+        raise ExchangeError(
+            f"{path}: what kind of file this is, is told by its ending; known are "
+            f"{', '.join(_FORMATS)}."
+        )
+    _check_file(path, kind)
+    read: Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]
+    read = import_module(f"analysis.exchange.{kind.module}").read
+    try:
+        channels = read(path, names)
+    except OSError as error:
+        raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    except MemoryError as error:
+        raise ExchangeError(
+            f"{path}: would take more than {MAX_MEMORY / _MB:.0f} MB of memory to read, so it is "
+            "damaged or holds far more than a session; export the session's channels alone."
+        ) from error
+    _check_lengths(path, channels)
+    return kind.name, channels
+
+
+def _check_file(path: Path, kind: _Format) -> None:
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    if not stat.S_ISREG(status.st_mode):
+        raise ExchangeError(f"{path}: is not a file; give a file of measurements.")
+    if status.st_size > kind.max_bytes:
+        raise ExchangeError(
+            f"{path}: has {status.st_size / _MB:.0f} MB, more than the {kind.max_bytes / _MB:.0f} "
+            f"MB of {kind.name} that are read; export the session's channels alone."
+        )
+
+
+def _check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
+    lengths = {name: len(channel.values) for name, channel in channels.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ExchangeError(
+            f"{path}: the channels have different numbers of samples ({listed}); choose channels "
+            "that were sampled together, or cut them to the same samples."
+        )
+    length = min(lengths.values())
+    if length < 2:
+        raise ExchangeError(f"{path}: has {length} samples, which is no record.")
+    check_samples(path, "The file", length)
+
+
+def check_samples(path: Path, what: str, samples: int) -> None:
+    """Refuse a channel that is, or claims to be, longer than `MAX_SAMPLES`."""
+    if samples > MAX_SAMPLES:
+        raise ExchangeError(
+            f"{path}: {what} has {samples} samples, more than the {MAX_SAMPLES} that are read; cut "
+            "the session out of the file first."
+        )
+
+
+def no_such_channel(path: Path, name: str, available: Iterable[str]) -> ExchangeError:
+    """Make the error for a channel that is not there, with the names of those that are."""
+    names = list(available)
+    listed = ", ".join(repr(printable(each, _NAME_SHOWN)) for each in names[:_NAMES_SHOWN])
+    more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+    return ExchangeError(
+        f"{path}: has no channel '{name}'; it has {listed}{more}."
+        if names
+        else f"{path}: has no channel '{name}', and no other either."
+    )
+
+
+def as_column(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Return real numbers (n,) as floats; anything else is refused."""
+    if values.dtype.kind == "c":
+        raise not_in_time(path, name)
+    if values.dtype.kind not in "iuf":
+        raise ExchangeError(
+            f"{path}: the channel '{name}' does not hold real numbers but {values.dtype.name}; "
+            "choose a channel of measured values."
+        )
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def not_in_time(path: Path, name: str) -> ExchangeError:
+    """Make the error for a complex channel."""
+    return ExchangeError(
+        f"{path}: '{name}' is complex, so it is a frequency response or a spectrum. A session is "
+        "made of measured samples: give angle and torque over time; from a frequency response "
+        "alone no record can be had back."
+    )
+
+
+def missing_library(path: Path, library: str) -> ExchangeError:
+    """Make the error for a library that is not installed."""
+    return ExchangeError(
+        f"{path}: needs the package {library}, which is not installed; get all that import and "
+        "export can use with `pip install 'rigd[exchange]'`."
+    )

@@ -1,0 +1,97 @@
+"""Beam and clamp from a TOML file: a rig's profile, or one with nothing else in it."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from analysis.exchange._source import ExchangeError
+from rigd.beam import Beam
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+_MOST_BYTES: Final = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Specimen:
+    """What is moved.
+
+    Attributes
+    ----------
+    beam : Beam
+    tool_inertia_kg_m2 : float
+        Inertia about the motor's axis of what sits between torque sensor and beam.
+    """
+
+    beam: Beam
+    tool_inertia_kg_m2: float = 0.0
+
+
+def read_specimen(path: Path) -> Specimen:
+    """Read ``[beam]`` and, if it is there, ``[sensor] tool_inertia_kg_m2``.
+
+    A number stands by itself or, as in a profile, as ``{ value = 0.98, source = "measured" }``.
+    Nothing else of a profile is used: delays, rate and limits are those of the rig's own recorder.
+
+    Raises
+    ------
+    ExchangeError
+        If the file cannot be read, or a number of the beam is missing or not positive.
+    """
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(_MOST_BYTES + 1)
+        if len(text) > _MOST_BYTES:
+            raise ExchangeError(f"{path}: is too large for a profile; give a TOML file.")
+        content = tomllib.loads(text.decode("utf-8"))
+    except OSError as error:
+        raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ExchangeError(f"{path}: is not a TOML file ({error}).") from error
+    beam, sensor = (_section(path, content, name) for name in ("beam", "sensor"))
+    tool_inertia_kg_m2 = 0.0
+    if "tool_inertia_kg_m2" in sensor:
+        tool_inertia_kg_m2 = _number(path, "sensor", sensor, "tool_inertia_kg_m2", "kg·m²")
+        if tool_inertia_kg_m2 < 0.0:
+            raise ExchangeError(
+                f"{path}: sensor.tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg·m², but an "
+                "inertia cannot be negative."
+            )
+    return Specimen(
+        Beam(
+            length_m=_positive(path, beam, "length_m", "m"),
+            density_kg_per_m=_positive(path, beam, "density_kg_per_m", "kg/m"),
+            bending_stiffness_n_m2=_positive(path, beam, "bending_stiffness_n_m2", "N·m²"),
+        ),
+        tool_inertia_kg_m2,
+    )
+
+
+def _section(path: Path, content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    section = content.get(name, {})
+    if not isinstance(section, dict):
+        raise ExchangeError(f"{path}: {name} is not a section; write [{name}] with its keys below.")
+    return section
+
+
+def _positive(path: Path, section: Mapping[str, Any], key: str, unit: str) -> float:
+    value = _number(path, "beam", section, key, unit)
+    if not value > 0.0:
+        raise ExchangeError(f"{path}: beam.{key} is {value:g} {unit}, but must be positive.")
+    return value
+
+
+def _number(path: Path, name: str, section: Mapping[str, Any], key: str, unit: str) -> float:
+    value = section.get(key)
+    if isinstance(value, dict):
+        value = value.get("value")
+    if value is None:
+        raise ExchangeError(f"{path}: has no {name}.{key}; state it in {unit} in section [{name}].")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ExchangeError(f"{path}: {name}.{key} is {value!r}, but must be a number in {unit}.")
+    return float(value)

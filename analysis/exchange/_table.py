@@ -1,0 +1,166 @@
+"""What is exported: named columns with units over one axis, the same for every format."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+import rigd
+from analysis.exchange._source import ExchangeError
+from analysis.paper import estimate
+from analysis.record import load_record
+from analysis.suited import welch_settings
+from rigd.session import SAMPLE_FIELDS, read_session
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from analysis.models import WelchSettings
+
+_UNITS: Final = {"_rad": "rad", "_nm": "N.m", "_n": "N"}
+"""Suffix of a field → its unit as it is written into files, in ASCII."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One quantity.
+
+    Attributes
+    ----------
+    name : str
+        With the unit as its suffix.
+    title : str
+        What it is, in ASCII; of a ratio, both sides of " / " in at most 20 characters each.
+    unit : str
+        "" without a unit.
+    values : ndarray, shape (n,)
+        Integers, floats or complex numbers.
+    """
+
+    name: str
+    title: str
+    unit: str
+    values: NDArray[np.generic]
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Columns over a common axis.
+
+    Attributes
+    ----------
+    source : str
+        Name of the session file.
+    axis : Column
+        Time or frequency, increasing.
+    columns : tuple of Column
+    information : mapping of str to str
+        How it came about, for formats that have room for it.
+    """
+
+    source: str
+    axis: Column
+    columns: tuple[Column, ...]
+    information: Mapping[str, str]
+
+
+_TITLES: Final = {
+    "tick": "Tick",
+    "angle_reference_rad": "Angle reference",
+    "angle_rad": "Angle",
+    "torque_command_nm": "Torque command",
+    "coupling_torque_nm": "Coupling torque",
+    **{f"f{axis}_n": f"Force {axis}" for axis in "xyz"},
+    **{f"t{axis}_nm": f"Torque {axis}" for axis in "xyz"},
+    "status": "Status bits",
+}
+
+
+def record_table(path: Path) -> Table:
+    """Read the samples of a session as recorded: gaps stay, and flags stand beside the values.
+
+    Raises
+    ------
+    rigd.session.SessionError
+        If the file cannot be read.
+    ExchangeError
+        If it has no sample or no rate.
+    """
+    session = read_session(path)
+    rate_hz = session.number("rate_hz")
+    if len(session.samples) == 0 or not rate_hz > 0.0:
+        raise ExchangeError(
+            f"{path}: the session has {len(session.samples)} samples at {rate_hz:g} Hz; there is "
+            "nothing to export."
+        )
+    samples = session.samples
+    return Table(
+        path.name,
+        Column("time_s", "Time", "s", samples["tick"] / rate_hz),
+        tuple(
+            Column(name, _TITLES[name], _unit(name), np.ascontiguousarray(samples[name]))
+            for name in SAMPLE_FIELDS
+            if name in _TITLES
+        ),
+        {**session.metadata, **_segment_texts(session.segments), **_origin(path)},
+    )
+
+
+def frf_table(
+    path: Path, settings: WelchSettings, band_hz: tuple[float, float] | None = None
+) -> Table:
+    """Estimate the response from angle to coupling torque, as the analysis does that fits it.
+
+    The channels' delays are taken out of it; the tool's inertia is not. Without a band it is what
+    the record's rate holds of that of the settings.
+
+    Raises
+    ------
+    rigd.session.SessionError, analysis.record.RecordError, analysis.paper._estimate.EstimateError
+        As the analysis raises them.
+    """
+    record = load_record(path)
+    settings = welch_settings(record, settings, band_hz)
+    response, _ = estimate(record, settings)
+    columns = [
+        Column("response_nm_per_rad", "Coupling torque / Angle", "N.m/rad", response.response)
+    ]
+    if response.coherence is not None:
+        columns.append(Column("coherence", "Coherence", "", response.coherence))
+    segmentation = settings.segmentation(record.rate_hz)
+    used = {} if settings.estimator == "fft" else asdict(segmentation)
+    return Table(
+        path.name,
+        Column("frequency_hz", "Frequency", "Hz", response.frequency_hz),
+        tuple(columns),
+        {
+            "estimator": response.estimator,
+            "segments": str(response.segments),
+            **{f"{name}_samples": str(value) for name, value in used.items()},
+            "rate_hz": repr(record.rate_hz),
+            "angle_delay_removed_s": repr(record.angle_delay_s),
+            "torque_delay_removed_s": repr(record.torque_delay_s),
+            "tool_inertia_included_kg_m2": repr(record.tool_inertia_kg_m2),
+            "beam_length_m": repr(record.beam.length_m),
+            "beam_density_kg_per_m": repr(record.beam.density_kg_per_m),
+            "beam_bending_stiffness_n_m2": repr(record.beam.bending_stiffness_n_m2),
+            **_origin(path),
+        },
+    )
+
+
+def _unit(name: str) -> str:
+    return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
+
+
+def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    return {f"segment_{name}_ticks": f"{first},{end}" for name, (first, end) in segments.items()}
+
+
+def _origin(path: Path) -> dict[str, str]:
+    return {"session_file": path.name, "exported_by": f"rigd {rigd.__version__}"}

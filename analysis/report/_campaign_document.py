@@ -1,0 +1,138 @@
+"""A campaign as one JSON document, without NaN: what is not known is null."""
+
+from __future__ import annotations
+
+import math
+import platform
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import rigd
+from analysis.campaigns._headlines import headlines
+from analysis.models import STRUCTURES
+from analysis.report._campaign_rows import all_tables
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from analysis.campaigns._campaign import Campaign
+    from analysis.campaigns._estimates import RecordEstimate, WelchFit
+    from analysis.campaigns._session import SessionResult
+    from analysis.identify import ModeEstimate
+
+
+def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Any]:
+    """Collect everything.
+
+    Returns
+    -------
+    dict
+        ``headlines`` of each session and, with ``file`` null, of all together; ``verdict`` on all
+        sessions (null without whole-record estimates), ``files`` with each one's own, ``errors``
+        (files left out, and why), ``one_specimen`` and the ``groups`` in which sessions lie if they
+        are not, ``trials`` of the validation asked, done and lost, ``fits`` and ``modes`` as of
+        single sessions, and the tables by the names of their CSV files. Finite numbers only.
+    """
+    leading = campaign.homogeneity.leading
+    content: dict[str, Any] = _plain(
+        {
+            "versions": {
+                "rigd": rigd.__version__,
+                "python": platform.python_version(),
+                "numpy": np.__version__,
+            },
+            "headlines": headlines(campaign),
+            "verdict": None if campaign.verdict is None else asdict(campaign.verdict),
+            "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
+            "files": [
+                {
+                    "file": str(each.path),
+                    "warnings": each.warnings,
+                    "verdict": None if each.verdict is None else each.verdict.as_json(),
+                }
+                for each in campaign.sessions
+            ],
+            "one_specimen": campaign.homogeneity.one_specimen,
+            "groups": leading and {"quantity": leading.quantity, "files": leading.groups},
+            "trials": {
+                "asked": campaign.trials,
+                "done": campaign.trials - len(campaign.lost_trials),
+                "lost": [
+                    {"file": str(each.path), "reason": each.reason} for each in campaign.lost_trials
+                ],
+            },
+            "errors": [
+                {"file": str(each.path), "message": each.message} for each in campaign.failures
+            ],
+            "fits": [
+                fit
+                for each in campaign.sessions
+                for fit in (
+                    *(_welch_fit(each, welch) for welch in each.welch_fits),
+                    *(_record_fit(each, estimate) for estimate in each.record_estimates),
+                )
+            ],
+            "modes": [
+                _mode(each, estimate, mode)
+                for each in campaign.sessions
+                for estimate in each.record_estimates
+                if estimate.name == each.selected
+                for mode in estimate.modes
+            ],
+            **all_tables(campaign, with_paper=with_paper),
+        }
+    )
+    return content
+
+
+def _name(session: SessionResult, estimator: str, structure: str) -> dict[str, Any]:
+    return {
+        "file": str(session.path), "estimator": estimator, "type": structure, "weighting": None,
+    }  # fmt: skip
+
+
+def _welch_fit(session: SessionResult, fit: WelchFit) -> dict[str, Any]:
+    return {
+        **_name(session, "welch", fit.structure),
+        "weighting": fit.weighting,
+        "parameters": fit.parameters,
+        "std": fit.std and _of_free(fit.std, STRUCTURES[fit.structure].free),
+        "cost": fit.cost,
+        "at_bounds": fit.at_bounds,
+        "indices": None if fit.indices is None else asdict(fit.indices),
+    }
+
+
+def _record_fit(session: SessionResult, fit: RecordEstimate) -> dict[str, Any]:
+    return {
+        **_name(session, "record", fit.structure),
+        "candidate": fit.name,
+        "parameters": fit.parameters,
+        "std": _of_free(fit.std, fit.free),
+        "cost": fit.cost,
+        "at_bounds": fit.at_bounds,
+        "indices": asdict(fit.indices),
+    }
+
+
+def _of_free(std: Mapping[str, float | None], free: Collection[str]) -> dict[str, float | None]:
+    """Put None for what a structure fixes: that is not known exactly, it was not asked for."""
+    return {name: value if name in free else None for name, value in std.items()}
+
+
+def _mode(session: SessionResult, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
+    values = asdict(mode)
+    return _name(session, "record", fit.structure) | {"mode": values.pop("number"), **values}
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+    """Copy a JSON value with null for what is not finite."""
+    if isinstance(value, dict):
+        return {str(key).rstrip("_"): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

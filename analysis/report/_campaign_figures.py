@@ -1,0 +1,393 @@
+"""Figures of a campaign: distances, pooled estimates, responses, validation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from analysis.campaigns._sentences import MIXTURE_MARK, label, probability, title, with_unit
+from analysis.campaigns._statistics import best_models
+from analysis.campaigns._validation import by_model
+from analysis.models import ESTIMATOR_WORDS, STRUCTURES
+from analysis.report import _style as style
+from analysis.report._campaign_tables import used
+from analysis.report._frf_figure import line_styles
+from analysis.report._table import MARK, unreported
+from rigd.view import magnitude_db, phase_deg
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from numpy.typing import NDArray
+
+    from analysis.campaigns._campaign import Campaign
+    from analysis.campaigns._pooling import PooledParameter
+    from analysis.campaigns._statistics import NominalModel
+
+_PANELS: Final = (
+    ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),
+    ("wmse", "(b) Mean square error, weighted with 1/ω", "WMSE ((N·m/rad)²)"),
+    ("md", "(c) Maximum deviation", "MD (N·m/rad)"),
+)
+_FLIER_SIZE: Final = 3.0
+
+
+def index_figure(campaign: Campaign) -> Figure:
+    """Draw MSE, WMSE and MD of every nominal model over the sessions (Eqs. 28-30)."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    types = list(dict.fromkeys(model.structure for model in campaign.nominal))
+    weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
+    colors = {name: look["color"] for name, look in line_styles(tuple(weightings)).items()}
+    width_in, height_in = 13.0, 4.9
+    figure = style.new_figure(
+        width_in, height_in,
+        f"{len(campaign.sessions)} sessions — how far each is from the nominal models",
+        "boxes: quartiles over the sessions, whiskers to 1.5 times their distance",
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        1, 3, left=0.055, right=0.99, top=1 - 1.2 / height_in, bottom=0.45 / height_in, wspace=0.2
+    )
+    width = 0.72 / len(weightings)
+    for column, (index, heading, axis_label) in enumerate(_PANELS):
+        axes = figure.add_subplot(grid[column])
+        for model in campaign.nominal:
+            offset = weightings.index(model.weighting) - (len(weightings) - 1) / 2
+            place = types.index(model.structure) + offset * width
+            values = np.array([getattr(each, index) for each in model.indices])
+            color = colors[model.weighting]
+            axes.boxplot(
+                [values], positions=[place], widths=0.8 * width, patch_artist=True,
+                showmeans=True, manage_ticks=False,
+                boxprops={"facecolor": "white", "edgecolor": color},
+                whiskerprops={"color": color}, capprops={"color": color},
+                medianprops={"color": "#C00000", "linewidth": 1.2},
+                meanprops={
+                    "marker": "o", "markerfacecolor": style.GREEN, "markeredgecolor": style.GREEN,
+                    "markersize": _FLIER_SIZE,
+                },
+                flierprops={
+                    "marker": "x", "markeredgecolor": color, "markersize": _FLIER_SIZE,
+                },
+            )  # fmt: skip
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_xticks(range(len(types)), [f"Type {name}" for name in types])
+        axes.grid(visible=False, axis="x")
+        axes.set_title(heading)
+        axes.set_ylabel(axis_label)
+    keys = [Patch(facecolor="white", edgecolor=colors[w], label=f"weights {w}") for w in weightings]
+    marks = [
+        Line2D([], [], color="#C00000", label="median"),
+        Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=4, label="mean"),
+    ]
+    figure.legend(
+        handles=[*keys, *marks], loc="upper left", ncols=len(keys) + 2, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
+    )  # fmt: skip
+    return figure
+
+
+_COLUMNS: Final = 4
+_POOLED: Final = "#C3DCED"
+"""Of an interval: the pooled line's blue, but light and opaque."""
+
+
+def pooled_figure(campaign: Campaign) -> Figure:
+    """Draw each session's estimate with its 95 % interval over the pooled one, freest structure."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    estimate = campaign.headline
+    assert estimate is not None
+    withheld = campaign.verdict.withheld if campaign.verdict else ()
+    doubtful = unreported(STRUCTURES[estimate.structure], withheld)
+    note = f"  ·  {MARK} not reported: the data do not support it" if doubtful else ""
+    if any(campaign.homogeneity.is_mixed(each.name) for each in estimate.parameters):
+        note += f"  ·  {MIXTURE_MARK} mean of a mixture"
+    rows = -(-len(estimate.parameters) // _COLUMNS)
+    width_in, height_in = 13.0, 2.6 * rows + 1.35
+    figure = style.new_figure(
+        width_in, height_in,
+        title(
+            f"{used(estimate, campaign)} — pooled whole-record estimate, type {estimate.name}",
+            campaign.homogeneity,
+        ),
+        f"freest type that the sessions support, residual {estimate.misfit:.3g} times the noise ·  "
+        "p: probability of so much scatter if sessions differed by their own uncertainty alone"
+        f"{note}",
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        rows, _COLUMNS, left=0.06, right=0.99, top=1 - 1.2 / height_in, bottom=0.5 / height_in,
+        wspace=0.42, hspace=0.4,
+    )  # fmt: skip
+    for number, parameter in enumerate(estimate.parameters):
+        axes = figure.add_subplot(grid[number // _COLUMNS, number % _COLUMNS])
+        _panel(campaign, estimate.name, parameter, axes, reported=parameter.name not in doubtful)
+        if number + _COLUMNS >= len(estimate.parameters):
+            axes.set_xlabel("Session", labelpad=1)
+    figure.legend(
+        handles=[
+            Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
+                   label="session, ± 1.96 of its standard deviation"),
+            Line2D([], [], color=style.BLUE, label="pooled"),
+            Patch(facecolor=_POOLED, label="its 95 % interval"),
+            Patch(facecolor=style.SHADE, label="true value in one more session, 95 %"),
+        ],
+        loc="upper left", ncols=4, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
+    )  # fmt: skip
+    return figure
+
+
+def _panel(
+    campaign: Campaign, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
+) -> None:
+    symbol, factor, _ = label(parameter.name)
+    places, values, spreads = [], [], []
+    for number, session in enumerate(campaign.sessions, start=1):
+        for each in session.record_estimates:
+            std = each.std.get(parameter.name)
+            if each.name == name and std is not None:
+                places.append(number)
+                values.append(factor * each.parameters[parameter.name])
+                spreads.append(1.96 * factor * std)
+    axes.axhspan(*(factor * end for end in parameter.next_interval), color=style.SHADE, zorder=0.5)
+    axes.axhspan(
+        *(factor * end for end in parameter.interval),
+        color=_POOLED if reported else style.FAINT,
+        zorder=0.6,
+    )
+    ink, line = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
+    axes.axhline(factor * parameter.value, color=line)
+    axes.errorbar(places, values, yerr=spreads, fmt="o", markersize=2.6, color=ink, linewidth=0.8)
+    mark = "" if reported else MARK
+    mark += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
+    chance = f"p = {probability(parameter.chance)}".replace("= <", "<")
+    axes.set_title(f"{symbol}{mark}   {chance}")
+    axes.set_ylabel(with_unit(parameter.name))
+    axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
+    axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
+    axes.ticklabel_format(axis="y", useOffset=False)
+
+
+_MOST_POINTS: Final = 500
+_WIDE_COLUMNS: Final = 1500
+_MOST_LINES: Final = 40
+"""Most sessions drawn: more would not be told apart."""
+_SYMBOLS: Final = {"zeta": "ζ", "alpha": "α", "gamma": "γ", "lambda": "λ"}
+_MEASURED: Final[dict[str, Any]] = {
+    "color": "#A8A8A8", "linewidth": 0.5, "alpha": 0.7, "rasterized": True,
+}  # fmt: skip
+_PAIR: Final[tuple[dict[str, Any], ...]] = (
+    {"color": style.BLUE, "linestyle": "-"},
+    {"color": style.VERMILION, "linestyle": (0, (4, 2))},
+)
+
+
+def nominal_figure(campaign: Campaign) -> Figure:
+    """Draw every type's nominal models over all measured responses (Figure 6)."""
+    types = list(dict.fromkeys(model.structure for model in campaign.nominal))
+    columns = min(len(types), 4 if len(types) > 6 else 3)
+    rows = -(-len(types) // columns)
+    width_in, height_in = max(4.4 * columns, 9.0), 3.75 * rows + 1.35
+    figure = _figure(campaign, width_in, height_in, "frequency responses and nominal models")
+    grid = figure.add_gridspec(
+        rows, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
+        top=1 - 1.15 / height_in, bottom=0.55 / height_in, wspace=0.12, hspace=0.24,
+    )  # fmt: skip
+    lines = line_styles(campaign.settings.weightings)
+    limits = _db_limits(campaign, campaign.nominal)
+    handles: dict[str, Line2D] = {}
+    for number, name in enumerate(types):
+        row, column = divmod(number, columns)
+        cell = grid[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
+        magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
+        models = [model for model in campaign.nominal if model.structure == name]
+        looks = [(f"nominal, weights {m.weighting}", lines[m.weighting]) for m in models]
+        handles |= _response_panel(campaign, magnitude, phase, models, looks, _MOST_POINTS)
+        free = ", ".join(_SYMBOLS[p] for p in STRUCTURES[name].free)
+        magnitude.set_title(f"Type {name}   {free}")
+        _dress(campaign, magnitude, phase, limits, bottom=number >= len(types) - columns)
+        for axes in (magnitude, phase):
+            axes.tick_params(labelleft=column == 0)
+            if column:
+                axes.set_ylabel("")
+    _legend(figure, handles, width_in, height_in)
+    return figure
+
+
+def best_figure(campaign: Campaign) -> Figure:
+    """Draw the two best nominal models over all measured responses (Figure 8)."""
+    models = best_models(campaign.nominal)
+    width_in, height_in = 10.0, 6.6
+    names = " and ".join(f"type {m.structure} ({m.weighting})" for m in models)
+    figure = _figure(campaign, width_in, height_in, f"nominal models of {names}")
+    grid = figure.add_gridspec(
+        2, 1, left=0.62 / width_in, right=1 - 0.2 / width_in, top=1 - 0.95 / height_in,
+        bottom=0.55 / height_in, height_ratios=(2.2, 1.0), hspace=0.07,
+    )  # fmt: skip
+    magnitude, phase = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    looks = [
+        (f"nominal type {m.structure}, weights {m.weighting}", look)
+        for m, look in zip(models, _PAIR, strict=False)
+    ]
+    handles = _response_panel(campaign, magnitude, phase, models, looks, _WIDE_COLUMNS)
+    _dress(campaign, magnitude, phase, _db_limits(campaign, models), bottom=True)
+    _legend(figure, handles, width_in, height_in)
+    return figure
+
+
+def _figure(campaign: Campaign, width_in: float, height_in: float, what: str) -> Figure:
+    count = len(campaign.sessions)
+    drawn = "" if count <= _MOST_LINES else f", {_MOST_LINES} of them drawn"
+    estimator = ESTIMATOR_WORDS[campaign.settings.estimator]
+    return style.new_figure(
+        width_in, height_in, f"{count} sessions — {what}",
+        f"coupling torque over motor angle, {estimator}{drawn}  ·  "
+        "a nominal model has the mean of the sessions' parameters",
+    )  # fmt: skip
+
+
+def _response_panel(
+    campaign: Campaign,
+    magnitude: Axes,
+    phase: Axes,
+    models: Sequence[NominalModel],
+    looks: Sequence[tuple[str, dict[str, Any]]],
+    columns: int,
+) -> dict[str, Line2D]:
+    handles: dict[str, Line2D] = {}
+    sessions = campaign.sessions
+    frequency_hz = sessions[0].frequency_hz
+    chosen = np.unique(np.linspace(0, len(sessions) - 1, _MOST_LINES).round().astype(int))
+    few = style.spread(frequency_hz, 2 * columns)
+    for number in chosen:
+        response = sessions[number].response
+        (handles["measured, every session"],) = magnitude.plot(
+            *_line(frequency_hz, magnitude_db(response), columns), **_MEASURED
+        )
+        # Dots: a line would run up and down wherever noise wraps the phase.
+        phase.plot(
+            frequency_hz[few], phase_deg(response[few]), ".", markersize=0.8,
+            color=_MEASURED["color"], rasterized=True,
+        )  # fmt: skip
+    for model, (name, look) in zip(models, looks, strict=True):
+        (handles[name],) = magnitude.plot(
+            *_line(frequency_hz, magnitude_db(model.response), columns), **look, linewidth=1.3
+        )
+        phase.plot(*_line(frequency_hz, phase_deg(model.response), columns), **look, linewidth=1.3)
+    return handles
+
+
+def _line(
+    frequency_hz: NDArray[np.float64], values: NDArray[np.float64], columns: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return style.envelope(frequency_hz, values, columns, logarithmic=True)
+
+
+def _dress(
+    campaign: Campaign,
+    magnitude: Axes,
+    phase: Axes,
+    limits: tuple[float, float],
+    *,
+    bottom: bool,
+) -> None:
+    band = campaign.settings.band_hz
+    magnitude.set_ylim(limits)
+    phase.set_ylim(-60, 240)
+    phase.set_yticks((0, 90, 180))
+    style.frequency_axis(magnitude, band, labels=False)
+    style.frequency_axis(phase, band, labels=bottom)
+    magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
+    phase.set_ylabel("Phase (°)")
+    if bottom:
+        phase.set_xlabel("Frequency (Hz)", labelpad=1)
+
+
+def _legend(figure: Figure, handles: dict[str, Line2D], width_in: float, height_in: float) -> None:
+    legend = figure.legend(
+        list(handles.values()), list(handles), loc="upper left",
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in), ncols=len(handles),
+        borderaxespad=0.0,
+    )  # fmt: skip
+    legend.get_lines()[0].set_linewidth(1.5)
+
+
+def _db_limits(campaign: Campaign, models: Sequence[NominalModel]) -> tuple[float, float]:
+    """Limits that hold the measured responses and the models' peaks, not every zero's depth."""
+    measured = np.concatenate([magnitude_db(s.response) for s in campaign.sessions])
+    peaks = max(float(magnitude_db(model.response).max()) for model in models)
+    top = float(measured.max())
+    return float(np.quantile(measured, 0.002)) - 4.0, min(max(peaks, top), top + 15.0) + 3.0
+
+
+_ROW_IN: Final = 0.27
+
+
+def validation_figure(campaign: Campaign) -> Figure:
+    """Draw every left-out session's error, model by model, the best at the top."""
+    from matplotlib.lines import Line2D
+
+    models = by_model(campaign.validation)
+    weightings = campaign.settings.weightings
+    colors = {w: look["color"] for w, look in line_styles(weightings).items()}
+    width_in, height_in = 9.0, _ROW_IN * len(models) + 1.75
+    figure = style.new_figure(
+        width_in, height_in, f"{_predicted(campaign)} sessions — each predicted from the others",
+        "rms of predicted minus measured torque over that of the measured torque, "
+        f"{campaign.record_band_hz[0]:g} to {campaign.record_band_hz[1]:g} Hz",
+    )  # fmt: skip
+    axes = figure.add_axes(
+        (2.0 / width_in, 0.5 / height_in, 1 - 2.2 / width_in, _ROW_IN * len(models) / height_in)
+    )
+    rng = np.random.default_rng(0)  # so that equal errors lie side by side
+    for row, (_, _, weighting, errors) in enumerate(models):
+        color = style.GREEN if weighting is None else colors[weighting]
+        values = 100 * np.array([each.error for each in errors])
+        axes.plot(
+            values, row + rng.uniform(-0.18, 0.18, values.size), "o", color=color, markersize=2.6,
+            alpha=0.6,
+        )  # fmt: skip
+        own = [each.own_error for each in errors if each.own_error is not None]
+        if own:
+            axes.plot([100 * float(np.mean(own))], [row], "|", color=style.INK, markersize=11)
+    axes.set_yticks(range(len(models)), [_name(*model[:3]) for model in models])
+    axes.set_ylim(len(models) - 0.4, -0.6)
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    ticks = [t for t in (d * 10.0**e for e in range(-3, 4) for d in (1, 2, 5)) if low <= t <= high]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
+    axes.set_xlabel("Error (%)", labelpad=1)
+    handles = [
+        Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=3.5,
+               label="pooled whole-record estimate"),
+        Line2D([], [], color=style.INK, marker="|", linestyle="", markersize=9,
+               label="mean of the sessions' own fits"),
+        *(Line2D([], [], color=colors[w], marker="o", linestyle="", markersize=3.5,
+                 label=f"nominal model, weights {w}") for w in weightings),
+    ]  # fmt: skip
+    figure.legend(
+        handles=handles, loc="upper left", ncols=2, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.6 / height_in),
+    )  # fmt: skip
+    return figure
+
+
+def _predicted(campaign: Campaign) -> str:
+    done = campaign.trials - len(campaign.lost_trials)
+    return f"{done} of {campaign.trials}" if campaign.lost_trials else str(done)
+
+
+def _name(_method: str, structure: str, weighting: str | None) -> str:
+    return f"{structure}: {'whole record' if weighting is None else f'Welch, {weighting}'}"

@@ -1,0 +1,142 @@
+"""A campaign's folder: the page, figures as PNG and SVG, tables as CSV, text and JSON."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from analysis.report._campaign_document import campaign_document
+from analysis.report._campaign_rows import all_tables, csv_text
+from analysis.report._document import document_text
+from analysis.report._folder import OutputError, write_new
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+    from analysis.campaigns._campaign import Campaign
+
+_CROWDED: Final = frozenset({"figure5_signals", "figure6_nominal", "figure8_best"})
+
+
+def write_campaign(
+    campaign: Campaign,
+    folder: Path,
+    *,
+    with_paper: bool = False,
+    on_step: Callable[[str], None] = lambda _done: None,
+) -> None:
+    """Write the page ``report.html``, every figure and every table.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    folder : Path
+        An existing folder without these files.
+    with_paper : bool
+        Whether the paper's numbers stand beside these.
+    on_step : callable, optional
+        Called with a figure's name after each.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    """
+    from analysis.report import _style as style
+    from analysis.report._campaign_page import campaign_page
+    from analysis.report._campaign_tables import tables_text
+    from analysis.report._html import drawing, photograph, svg_text
+
+    shown = {}
+    for name, (draw, description) in _figures(campaign).items():
+        with style.styled():
+            figure = draw()
+            png = io.BytesIO()
+            figure.savefig(png, format="png")
+            svg = svg_text(figure)
+        _write_bytes(folder / f"{name}.png", png.getvalue())
+        write_new(folder / f"{name}.svg", svg)
+        # Of many sessions' responses a picture is the smaller one.
+        shown[name] = (
+            photograph(png.getvalue(), name, description)
+            if name in _CROWDED
+            else drawing(svg, name, description)
+        )
+        on_step(f"figure {name}")
+    for name, rows in all_tables(campaign, with_paper=with_paper).items():
+        write_new(folder / f"{name}.csv", csv_text(rows))
+    text = document_text(campaign_document(campaign, with_paper=with_paper))
+    write_new(folder / "campaign.json", text)
+    write_new(folder / "tables.txt", tables_text(campaign, with_paper=with_paper))
+    made_at = datetime.now().astimezone()
+    write_new(
+        folder / "report.html", campaign_page(campaign, shown, made_at, with_paper=with_paper)
+    )
+
+
+def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
+    """Drawings by name, with what is seen in them: those for which there are data."""
+    from analysis.report._campaign_figures import (
+        best_figure,
+        index_figure,
+        nominal_figure,
+        pooled_figure,
+        validation_figure,
+    )
+
+    found: dict[str, tuple[Callable[[], Figure], str]] = {}
+    if campaign.headline is not None:
+        found["pooled"] = (
+            partial(pooled_figure, campaign),
+            "Whole-record estimate of each session with its 95 % interval, and the pooled one.",
+        )
+    if campaign.validation:
+        found["validation"] = (
+            partial(validation_figure, campaign),
+            "Each session's torque predicted from the other sessions: error by model.",
+        )
+    if not campaign.nominal:
+        return found
+    return found | {
+        "figure5_signals": (
+            partial(_signals, campaign),
+            "Reference, angle and torque of the first session (Figure 5 of the paper).",
+        ),
+        "figure6_nominal": (
+            partial(nominal_figure, campaign),
+            "Measured responses of all sessions, and the nominal models of each type (Figure 6).",
+        ),
+        "figure7_indices": (
+            partial(index_figure, campaign),
+            "Mean square error, its weighted kind and maximum deviation of each nominal model "
+            "over the sessions (Figure 7).",
+        ),
+        "figure8_best": (
+            partial(best_figure, campaign),
+            "Measured responses of all sessions, and the two best nominal models (Figure 8).",
+        ),
+    }
+
+
+def _signals(campaign: Campaign) -> Figure:
+    """Draw the first session's signals as an example, as the paper does."""
+    from analysis.paper import analyse
+    from analysis.record import load_record
+    from analysis.report._signal_figures import paper_signals_figure as signals_figure
+
+    record = load_record(campaign.sessions[0].path)
+    return signals_figure(analyse(record, replace(campaign.settings, types=())))
+
+
+def _write_bytes(path: Path, content: bytes) -> None:
+    try:
+        with path.open("xb") as stream:
+            stream.write(content)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error

@@ -1,0 +1,203 @@
+"""Measured and fitted frequency responses, one panel a model type, as the paper's Figure 6."""
+
+from __future__ import annotations
+
+from itertools import cycle
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from analysis.models import ESTIMATOR_WORDS
+from analysis.report import _style as style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from numpy.typing import NDArray
+
+    from analysis.paper import FittedModel, WelchAnalysis
+
+_COLUMNS: Final = 500
+_LEGEND_COLUMNS: Final = 4
+_LINES: Final[dict[str, dict[str, Any]]] = {
+    "const": {"color": style.BLUE, "linestyle": "-"},
+    "omega": {"color": style.VERMILION, "linestyle": (0, (4, 2))},
+}
+_MORE_LINES: Final[tuple[dict[str, Any], ...]] = (
+    {"color": style.GREEN, "linestyle": (0, (1, 1.2))},
+    {"color": style.PURPLE, "linestyle": (0, (5, 1.5, 1, 1.5))},
+    {"color": style.ORANGE, "linestyle": "-"},
+)
+_DAMPINGS: Final = {"zeta": "ζ", "alpha": "α", "gamma": "γ", "lambda": "λ"}
+
+
+def frf_figure(analysis: WelchAnalysis) -> Figure:
+    """Draw magnitude and phase of the measured response and of every fit, and the coherence."""
+    settings = analysis.settings
+    types = settings.types
+    columns = min(len(types), 4 if len(types) > 6 else 3)
+    rows = -(-len(types) // columns)
+    legend_rows = -(-(len(settings.weightings) + 2) // _LEGEND_COLUMNS)
+    width_in = max(4.4 * columns, 10.0)
+    head_in = 1.0 + 0.2 * legend_rows
+    height_in = 3.75 * rows + 1.15 + head_in
+    figure = style.new_figure(
+        width_in, height_in, f"{analysis.record.path.name} — frequency response",
+        f"coupling torque over motor angle  ·  {_estimate_text(analysis)}  ·  "
+        "MSE, WMSE in (N·m/rad)²",
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        rows + 1, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
+        top=1 - head_in / height_in, bottom=0.5 / height_in, wspace=0.12, hspace=0.26,
+        height_ratios=(*(1.0,) * rows, 0.22),
+    )  # fmt: skip
+    lines = line_styles(settings.weightings)
+    db_limits = _db_limits(analysis)
+    handles: dict[str, Line2D] = {}
+    for number, name in enumerate(types):
+        row, column = divmod(number, columns)
+        cell = grid[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
+        magnitude, phase = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
+        models = [m for m in analysis.models if m.fit.structure.name == name]
+        handles |= _panel(analysis, models, magnitude, phase, lines)
+        free = models[0].fit.structure.free
+        magnitude.set_title(f"Type {name}   {', '.join(_DAMPINGS[p] for p in free)}")
+        _scores(magnitude, models, lines)
+        magnitude.set_ylim(db_limits)
+        phase.set_ylim(-60, 240)
+        phase.set_yticks((0, 90, 180))
+        style.frequency_axis(magnitude, settings.band_hz, labels=False)
+        style.frequency_axis(phase, settings.band_hz, labels=number >= len(types) - columns)
+        for axes in (magnitude, phase):
+            axes.tick_params(labelleft=column == 0)
+        if column == 0:
+            magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
+            phase.set_ylabel("Phase (°)")
+    strip = figure.add_subplot(grid[rows, :])
+    _coherence(strip, analysis)
+    figure.legend(
+        list(handles.values()), list(handles), loc="upper left",
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.66 / height_in),
+        ncols=min(len(handles), _LEGEND_COLUMNS), borderaxespad=0.0,
+    )  # fmt: skip
+    return figure
+
+
+def line_styles(weightings: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Colour and dash of each weighting: the paper's two as in the paper, others after them."""
+    others = cycle(_MORE_LINES)
+    return {name: _LINES.get(name) or next(others) for name in weightings}
+
+
+def _estimate_text(analysis: WelchAnalysis) -> str:
+    settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
+    band = f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
+    if settings.estimator == "fft":
+        return f"{ESTIMATOR_WORDS['fft']}  ·  {band}"
+    return (
+        f"{ESTIMATOR_WORDS[settings.estimator]}, {response.segments} Hamming segments of "
+        f"{segmentation.segment_length}, overlap {segmentation.overlap}, "
+        f"nfft {segmentation.nfft}  ·  {band}"
+    )
+
+
+def _panel(
+    analysis: WelchAnalysis,
+    models: list[FittedModel],
+    magnitude: Axes,
+    phase: Axes,
+    lines: dict[str, dict[str, Any]],
+) -> dict[str, Line2D]:
+    """Draw one type's curves; return the lines by what they show, for a legend."""
+    handles = {}
+    curves: list[tuple[str, NDArray[np.float64], NDArray[np.complex128], dict[str, Any]]] = []
+    if analysis.settings.estimator != "fft":
+        whole = analysis.whole_record
+        curves.append(
+            (
+                f"measured, {ESTIMATOR_WORDS['fft']}", whole.frequency_hz, whole.response,
+                {"color": style.FAINT, "linewidth": 0.6},
+            )
+        )  # fmt: skip
+    measured = analysis.response
+    curves.append(
+        (
+            f"measured, {ESTIMATOR_WORDS[analysis.settings.estimator]}", measured.frequency_hz,
+            measured.response, {"color": style.GREY, "linewidth": 1.3},
+        )
+    )  # fmt: skip
+    curves.extend(
+        (
+            f"model, weights {model.fit.weighting}", measured.frequency_hz, model.response,
+            {**lines[model.fit.weighting], "linewidth": 1.2},
+        )
+        for model in models
+    )  # fmt: skip
+    for label, frequency_hz, response, look in curves:
+        known = np.isfinite(response) & (response != 0)
+        at_hz, values = frequency_hz[known], response[known]
+        magnitude_db, phase_deg = 20 * np.log10(np.abs(values)), _phase_deg(values)
+        (handles[label],) = magnitude.plot(
+            *style.envelope(at_hz, magnitude_db, _COLUMNS, logarithmic=True), **look
+        )
+        if label.startswith("measured"):
+            # Dots: a line would run up and down wherever noise wraps the phase.
+            few = style.spread(at_hz, 2 * _COLUMNS)
+            phase.plot(at_hz[few], phase_deg[few], ".", markersize=1.6, color=look["color"])
+        else:
+            phase.plot(*style.envelope(at_hz, phase_deg, _COLUMNS, logarithmic=True), **look)
+    for peak in analysis.peaks:
+        if peak is not None:
+            for axes in (magnitude, phase):
+                axes.axvline(peak.frequency_hz, color="#B8B8B8", linewidth=0.6, zorder=0.5)
+    return handles
+
+
+def _phase_deg(response: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Phase from −90° to 270°: a torque over an angle lies between 0 and 180°, well inside."""
+    return np.asarray(np.degrees(np.angle(response * -1j)) + 90.0)
+
+
+def _scores(axes: Axes, models: list[FittedModel], lines: dict[str, dict[str, Any]]) -> None:
+    """Write MSE and WMSE of each weighting in its colour, above the panel on the right."""
+    for number, model in enumerate(models):
+        axes.annotate(
+            f"MSE {model.indices.mse:.3g}  WMSE {model.indices.wmse:.3g}",
+            (1.0, 1.0), xycoords="axes fraction", xytext=(-3, -3 - 9.5 * number),
+            textcoords="offset points", ha="right", va="top", fontsize=7,
+            color=lines[model.fit.weighting]["color"],
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+        )  # fmt: skip
+
+
+def _db_limits(analysis: WelchAnalysis) -> tuple[float, float]:
+    """Limits that hold the measured response and the models' peaks, not the depth of every zero."""
+    measured_db = 20 * np.log10(np.abs(analysis.response.response) + 1e-300)
+    top = max(
+        float(measured_db.max()),
+        *(float(20 * np.log10(np.abs(model.response).max())) for model in analysis.models),
+    )
+    bottom = float(np.quantile(measured_db, 0.002))
+    # Room for the scores above the highest peak.
+    scores = 5.0 * len(analysis.settings.weightings)
+    return bottom - 4.0, min(top, float(measured_db.max()) + 15.0) + scores
+
+
+def _coherence(axes: Axes, analysis: WelchAnalysis) -> None:
+    response = analysis.response
+    axes.set_title("Coherence")
+    style.frequency_axis(axes, analysis.settings.band_hz)
+    axes.set_ylim(0.0, 1.05)
+    axes.set_yticks((0.0, 0.5, 1.0))
+    axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    if response.coherence is None:
+        axes.text(
+            0.5, 0.5, "none: it takes at least two segments", transform=axes.transAxes,
+            ha="center", va="center", color="#606060",
+        )  # fmt: skip
+        return
+    axes.plot(
+        *style.envelope(response.frequency_hz, response.coherence, 1200, logarithmic=True),
+        color=style.GREY, linewidth=0.8,
+    )  # fmt: skip

@@ -1,0 +1,423 @@
+"""Figures of a whole-record fit: frequency response, loss factor, residual.
+
+Loss factor against frequency with its 95 % band: the damping as a function, not as parameters.
+
+The parameters of a fractional damping are correlated and hard to compare; what they make together
+at one frequency is neither.
+
+What a fit leaves of the torque: its spectrum, whether it is white, and when it is large.
+
+A model that is right leaves noise. What is left at a resonance, or while the sweep passes one, is
+what the model lacks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from analysis.report import _style as style
+from analysis.report._bands import NORMAL_95, loss_factors, response_band
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from analysis.identify import ModeEstimate, RecordAnalysis, RecordFit
+    from analysis.report._bands import ResponseBand
+    from rigd.spectral import FrequencyResponse
+
+
+def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
+    """Make the vertical axis logarithmic from `low` to `high`, with as many labels as it bears."""
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    if high < 5 * low:
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+    else:
+        digits = (1.0, 2.0, 5.0) if high < 1000 * low else (1.0,)
+        axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=12))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+_BAND: Final = "#8CC4E8"
+_PALE: Final = "#BDBDBD"
+_POINTS: Final = 900
+_DETAIL_POINTS: Final = 161
+_DETAIL_WIDTHS: Final = 6.0
+"""Half-widths of a resonance that its detail shows to either side."""
+
+_NARROWEST: Final = 0.006
+"""Least half of a detail, relative to the mode's frequency."""
+
+
+def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure:
+    """Draw magnitude, phase, the band's width, and a detail of every mode.
+
+    Parameters
+    ----------
+    name : str
+        What the title calls the record.
+    measured : FrequencyResponse
+        Ratio of the whole record's transforms, with the delay between the channels in it.
+    fit : RecordFit
+    """
+    first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
+    shown = [mode for mode in fit.modes if first_hz < mode.frequency_hz < last_hz]
+    grid_hz = _grid(first_hz, last_hz, [mode.frequency_hz for mode in shown])
+    band = response_band(fit, grid_hz)
+    seen = measured.response * np.exp(
+        2j * np.pi * fit.parameters["delay_s"] * measured.frequency_hz
+    )
+    figure = style.new_figure(
+        11.0, 8.2, f"{name} — frequency response",
+        f"coupling torque over motor angle  ·  measured: ratio of the whole record's transforms, "
+        f"delay removed  ·  model: type {fit.structure.name}",
+    )  # fmt: skip
+    count = max(len(shown), 1)
+    grid = figure.add_gridspec(
+        2, count, left=0.075, right=0.985, top=0.885, bottom=0.06, hspace=0.25, wspace=0.2,
+        height_ratios=(3.4, 1.0),
+    )  # fmt: skip
+    whole = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
+    magnitude, phase, width = (figure.add_subplot(whole[row]) for row in range(3))
+    _magnitude(magnitude, measured.frequency_hz, seen, band, _PALE)
+    magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
+    modelled_db = _db(band.response)
+    bottom = min(float(np.quantile(_db(seen), 0.005)), float(np.quantile(modelled_db, 0.05)))
+    magnitude.set_ylim(bottom - 5, float(modelled_db.max()) + 5)
+    few = style.spread(measured.frequency_hz, _POINTS)
+    phase.plot(
+        measured.frequency_hz[few], _phase_deg(seen[few]), ".", markersize=2.0, color=style.GREY
+    )
+    phase.plot(band.frequency_hz, _phase_deg(band.response), color=style.BLUE)
+    phase.set_ylabel("Phase (°)")
+    phase.set_ylim(-60, 240)
+    phase.set_yticks((0, 90, 180))
+    half_percent = 100 * NORMAL_95 * band.log_magnitude_std
+    width.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
+    plain_logarithmic(width, 0.8 * half_percent.min(), 1.4 * half_percent.max())
+    width.set_ylabel("Band (± %)")
+    width.set_xlabel("Frequency (Hz)", labelpad=1)
+    for axes in (magnitude, phase, width):
+        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
+    for column, mode in enumerate(shown):
+        detail = figure.add_subplot(grid[1, column])
+        limits = _detail(mode, measured.frequency_hz)
+        near = (measured.frequency_hz >= limits[0]) & (measured.frequency_hz <= limits[1])
+        close = response_band(fit, np.linspace(*limits, _DETAIL_POINTS))
+        _magnitude(detail, measured.frequency_hz[near], seen[near], close, style.GREY)
+        detail.set_xlim(limits)
+        detail.set_ylim(style.limits(_db(seen[near]), _db(close.response)))
+        detail.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
+        detail.set_facecolor("#FCFAF4")
+        detail.set_xlabel("Frequency (Hz)", labelpad=1)
+        if column == 0:
+            detail.set_ylabel("Magnitude (dB)")
+    figure.legend(
+        *magnitude.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.925),
+        ncols=3, borderaxespad=0.0,
+    )  # fmt: skip
+    return figure
+
+
+def _magnitude(
+    axes: Axes,
+    frequency_hz: NDArray[np.float64],
+    measured: NDArray[np.complex128],
+    band: ResponseBand,
+    color: str,
+) -> None:
+    """Draw the measured magnitude, the model's over it, and its band."""
+    axes.plot(
+        *style.envelope(frequency_hz, _db(measured), _POINTS, logarithmic=True),
+        color=color, linewidth=0.8, label="measured",
+    )  # fmt: skip
+    low, high = band.magnitude_limits()
+    axes.fill_between(
+        band.frequency_hz, _db(low), _db(high), color=_BAND, linewidth=0, alpha=0.6,
+        label="95 % band of the model",
+    )  # fmt: skip
+    axes.plot(band.frequency_hz, _db(band.response), color=style.BLUE, linewidth=1.1, label="model")
+
+
+def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
+    """Choose what is shown of a mode: so much that a bin of a short record lies inside, too."""
+    spacing_hz = float(np.diff(frequency_hz).max())
+    share = max(_DETAIL_WIDTHS * mode.damping_ratio, _NARROWEST)
+    half_hz = max(share * mode.frequency_hz, spacing_hz)
+    lowest_hz = float(frequency_hz[0]) / 2
+    return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
+
+
+def _grid(first_hz: float, last_hz: float, peaks_hz: list[float]) -> NDArray[np.float64]:
+    """Frequencies that are dense over the band and denser at the peaks, which are narrow."""
+    everywhere = np.geomspace(first_hz, last_hz, _POINTS)
+    offsets = np.geomspace(1e-4, 0.1, 40)
+    near = [peak * (1 + np.r_[-offsets, 0.0, offsets]) for peak in peaks_hz]
+    grid = np.unique(np.concatenate([everywhere, *near]))
+    return np.asarray(grid[(grid >= first_hz) & (grid <= last_hz)])
+
+
+def _db(values: NDArray[np.complex128] | NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(20 * np.log10(np.maximum(np.abs(values), 1e-300)))
+
+
+def _phase_deg(response: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Phase from −90° to 270°: a torque over an angle lies between 0 and 180°, well inside."""
+    return np.asarray(np.degrees(np.angle(response * -1j)) + 90.0)
+
+
+_LOSS_POINTS: Final = 400
+_LOOKS: Final = {
+    "internal (material)": (style.VERMILION, (0, (4, 2))),
+    "external (surroundings)": (style.GREEN, (0, (1, 1.2))),
+    "total": (style.BLUE, "-"),
+}
+_SPAN: Final = 300.0
+"""Largest ratio of the axis's ends: what is smaller yet does not matter beside the total."""
+
+
+def loss_figure(
+    name: str,
+    fit: RecordFit,
+    axis_hz: tuple[float, float],
+    supported_hz: tuple[float, float] | None,
+    *,
+    withheld: Collection[str] = (),
+) -> Figure:
+    """Draw internal, external and total loss factor, and twice the damping ratio of each mode.
+
+    Parameters
+    ----------
+    name : str
+        What the title calls the record.
+    fit : RecordFit
+        With the modes that are drawn.
+    axis_hz : tuple of float
+        First and last frequency of the axis, positive.
+    supported_hz : tuple of float or None
+        Band in which the data support the curves: there are none beyond. None: nowhere.
+    withheld : collection of str
+        Orders that the data do not support: then the total is not split into its parts.
+    """
+    modes = fit.modes
+    figure = style.new_figure(
+        11.0, 4.8, f"{name} — loss factor",
+        f"type {fit.structure.name}  ·  shaded: 95 % bands  ·  points: twice the damping ratio of "
+        f"each mode with its 95 % interval  ·  grey: {_grey(withheld)}",
+    )  # fmt: skip
+    axes = figure.add_axes((0.075, 0.105, 0.91, 0.70))
+    drawn = _curves(axes, fit, axis_hz, supported_hz, withheld)
+    if modes:
+        axes.errorbar(
+            [mode.frequency_hz for mode in modes], [2 * mode.damping_ratio for mode in modes],
+            [2 * NORMAL_95 * mode.damping_ratio_std for mode in modes],
+            fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
+            label="modes", zorder=5,
+        )  # fmt: skip
+    for edge_hz, end_hz in _beyond(axis_hz, supported_hz, [mode.frequency_hz for mode in modes]):
+        axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
+    style.frequency_axis(axes, axis_hz)
+    points = [2 * mode.damping_ratio for mode in modes]
+    # Of curves what they mostly are: a total may rise without bound towards an end.
+    top = max([*points, *(float(np.nanquantile(value, 0.98)) for value in drawn)], default=1.0)
+    low = min([*points, *(float(np.nanmin(value)) for value in drawn)], default=top)
+    plain_logarithmic(axes, max(low / 2, 3 * top / _SPAN), 3 * top)
+    axes.set_ylabel("Loss factor (1)")
+    axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles, labels, loc="upper left", bbox_to_anchor=(0.075, 0.875), ncols=4,
+            borderaxespad=0.0,
+        )  # fmt: skip
+    return figure
+
+
+def _grey(withheld: Collection[str]) -> str:
+    """Say what the shaded parts of the axis are."""
+    if withheld:
+        return "not drawn, an order that the data do not support would decide there"
+    return "outside the modes, extrapolated; no curve where nothing was excited"
+
+
+def _curves(
+    axes: Axes,
+    fit: RecordFit,
+    axis_hz: tuple[float, float],
+    supported_hz: tuple[float, float] | None,
+    withheld: Collection[str],
+) -> list[NDArray[np.float64]]:
+    """Draw the loss factors where the data support them; return the values drawn."""
+    if supported_hz is None:
+        return []
+    first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
+    if first_hz >= last_hz:
+        return []
+    factors = loss_factors(fit, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
+    curves = dict(zip(_LOOKS, (factors.internal, factors.external, factors.total), strict=True))
+    both = None not in curves.values()
+    drawn = []
+    for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
+        # Parts of which one is not known are not told apart; alone, a part is the total.
+        if factor is None or (order is not None and (not both or withheld)):
+            continue
+        color, dash = _LOOKS[label]
+        axes.fill_between(
+            factors.frequency_hz, *factor.limits(), color=color, alpha=0.2, linewidth=0
+        )
+        axes.plot(factors.frequency_hz, factor.value, color=color, linestyle=dash, label=label)
+        drawn.append(factor.value)
+    return drawn
+
+
+def _beyond(
+    axis_hz: tuple[float, float],
+    supported_hz: tuple[float, float] | None,
+    modes_hz: list[float],
+) -> list[tuple[float, float]]:
+    """Parts of the axis outside the modes, or outside of what is drawn if that is less."""
+    if not modes_hz:
+        return [axis_hz]
+    first_hz, last_hz = modes_hz[0], modes_hz[-1]
+    if supported_hz is not None:
+        first_hz, last_hz = max(first_hz, supported_hz[0]), min(last_hz, supported_hz[1])
+    return [(axis_hz[0], first_hz), (last_hz, axis_hz[1])]
+
+
+_KOLMOGOROV_95: Final = 1.358
+"""95 % quantile of Kolmogorov's distribution: the bounds' half-width is that over √bins."""
+
+_BINS_A_POINT: Final = 24
+_SMOOTH_POINTS: Final = 600
+_STRETCHES: Final = 120
+"""At most: a short record has fewer independent values."""
+
+
+def residual_figure(name: str, analysis: RecordAnalysis, fit: RecordFit) -> Figure:
+    """Draw the residual's spectrum, its cumulative periodogram, and its power in time.
+
+    Parameters
+    ----------
+    name : str
+        What the title calls the record.
+    analysis : RecordAnalysis
+        That the fit belongs to.
+    fit : RecordFit
+    """
+    figure = style.new_figure(
+        11.0, 6.4, f"{name} — residual",
+        f"measured torque minus that of the model, type {fit.structure.name}  ·  sum of squares "
+        f"{fit.cost:.6g} for {fit.degrees_of_freedom} degrees of freedom",
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        2, 2, left=0.075, right=0.985, top=0.855, bottom=0.075, hspace=0.42, wspace=0.17,
+    )  # fmt: skip
+    _spectrum(figure.add_subplot(grid[0, :]), analysis, fit)
+    _cumulative(figure.add_subplot(grid[1, 0]), analysis, fit)
+    _in_time(figure.add_subplot(grid[1, 1]), analysis, fit)
+    return figure
+
+
+def _spectrum(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
+    frequency_hz = analysis.frequency_hz
+    density = analysis.noise_nm2_per_hz * np.abs(fit.residual) ** 2 / 2
+    counted = analysis.compared
+    bins = np.flatnonzero(counted)
+    blocks = np.array_split(bins, max(bins.size // _BINS_A_POINT, 1))
+    middle_hz = [float(frequency_hz[block].mean()) for block in blocks]
+    rms = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
+    axes.plot(
+        middle_hz, rms, ".", color=style.VERMILION, markersize=3.5,
+        label=f"residual, mean of {_BINS_A_POINT} bins",
+    )  # fmt: skip
+    few = slice(None, None, max(frequency_hz.size // _SMOOTH_POINTS, 1))
+    axes.plot(
+        frequency_hz[few], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[few]), color=style.BLUE,
+        label="taken for noise",
+    )  # fmt: skip
+    for mode in fit.modes:
+        axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
+    for line in analysis.lines:
+        axes.annotate(
+            f"{line.frequency_hz:.4g} Hz hum", (line.frequency_hz, 1.0),
+            xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
+            ha="center", fontsize=7.5, color=style.PURPLE,
+        )  # fmt: skip
+        axes.axvline(line.frequency_hz, color=style.PURPLE, linewidth=1.0, linestyle=":")
+    plain_logarithmic(axes, min(rms) / 1.6, max(rms) * 1.6)
+    axes.set_xlim(0.0, frequency_hz[-1])
+    axes.set_title("Spectrum (grey: modes)")
+    axes.set_ylabel("Torque (mN·m/√Hz)")
+    axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.1)
+
+
+def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
+    counted = analysis.compared
+    power = np.abs(fit.residual[counted]) ** 2
+    share = np.cumsum(power) / power.sum()
+    uniform = np.arange(1, power.size + 1) / power.size
+    frequency_hz = analysis.frequency_hz[counted]
+    half = 100 * _KOLMOGOROV_95 / np.sqrt(power.size)
+    axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
+    difference = 100 * (share - uniform)
+    axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
+    axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
+    for mode in fit.modes:
+        axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
+    reach = 1.25 * max(half, float(np.abs(difference).max()))
+    axes.set_ylim(-reach, reach)
+    axes.set_xlim(0.0, frequency_hz[-1])
+    axes.set_title("Cumulative periodogram less that of white noise")
+    axes.set_ylabel("Difference (% of power)")
+    axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    axes.legend(loc="lower right", borderaxespad=0.1)
+
+
+def _in_time(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
+    times_s, power = residual_power(analysis, fit)
+    half = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
+    axes.axhspan(
+        max(1 - half, 0.0), 1 + half, color=style.SHADE, linewidth=0, zorder=0,
+        label="95 % of white noise",
+    )  # fmt: skip
+    axes.plot(times_s, power, ".-", color=style.VERMILION, linewidth=0.7, markersize=3.0)
+    axes.set_xlim(0.0, times_s[-1] + times_s[0])
+    axes.set_ylim(0.0, 1.15 * max(float(power.max()), 1 + half))
+    axes.set_title("Power in time, whitened")
+    axes.set_ylabel("Over the mean of noise (1)")
+    axes.set_xlabel("Time from the record's start (s)", labelpad=1)
+    axes.legend(loc="lower right", borderaxespad=0.1)
+
+
+def residual_power(
+    analysis: RecordAnalysis, fit: RecordFit
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Power of the whitened residual in stretches of the record, 1 if chance is all that remains.
+
+    The residual's spectrum in the band, transformed back, is the complex envelope of the whitened
+    residual; K bins give K independent values over the record.
+
+    Returns
+    -------
+    times_s, power : ndarray, shape (stretches,)
+        Middles of the stretches from the first sample compared on, and mean power in them.
+    """
+    spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
+    bins = fit.residual.size
+    envelope = np.abs(np.fft.ifft(fit.residual)) ** 2 * bins / 2
+    envelope *= bins / np.count_nonzero(analysis.compared)
+    stretches = min(_STRETCHES, bins)
+    power: NDArray[np.float64] = np.array(
+        [part.mean() for part in np.array_split(envelope, stretches)]
+    )
+    times_s = (np.arange(stretches, dtype=np.float64) + 0.5) / (stretches * spacing_hz)
+    return times_s, power
