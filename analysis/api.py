@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
-    from analysis.welch_aware import WelchAwareFit
     from rigd.spectral import FrequencyResponse
 
 __all__ = ["campaign", "fit", "frf", "load", "select"]
@@ -97,27 +96,15 @@ def fit(
 ) -> WelchAnalysis: ...
 
 
-@overload
 def fit(
     record: Record,
     types: Sequence[str] | None = None,
     *,
-    method: Literal["welch-aware"],
+    method: Literal["record", "welch"] = "record",
     fixed: Iterable[Setting] = (),
     weightings: Sequence[str] | None = None,
     band_hz: tuple[float, float] | None = None,
-) -> tuple[WelchAwareFit, ...]: ...
-
-
-def fit(
-    record: Record,
-    types: Sequence[str] | None = None,
-    *,
-    method: Literal["record", "welch", "welch-aware"] = "record",
-    fixed: Iterable[Setting] = (),
-    weightings: Sequence[str] | None = None,
-    band_hz: tuple[float, float] | None = None,
-) -> RecordAnalysis | WelchAnalysis | tuple[WelchAwareFit, ...]:
+) -> RecordAnalysis | WelchAnalysis:
     """Fit model types to a record.
 
     Parameters
@@ -125,22 +112,20 @@ def fit(
     record : Record
     types : sequence of str, optional
         Of "I" to "VII"; by default all seven, with "welch" the paper's six.
-    method : {"record", "welch", "welch-aware"}
-        Output error on the whole record, the paper's fit to Welch's estimate, or a fit to that
-        estimate with the model put through the same estimator.
+    method : {"record", "welch"}
+        Output error on the whole record, or the paper's fit to Welch's estimate.
     fixed : iterable of str
-        Not with "welch": settings of beam and rig that stay at the file's values, of
+        With "record" only: settings of beam and rig that stay at the file's values, of
         `analysis.identify.SETTINGS`.
     weightings : sequence of str, optional
-        Not with "record": "const", "omega", "omega^K"; by default the first two, with
-        "welch-aware" the second.
+        With "welch" only: "const", "omega", "omega^K"; by default the first two.
     band_hz : tuple of float, optional
-        First and last frequency; by default 0 to 50 Hz, else than with "record" the paper's band,
-        either up to 0.4 of the record's rate.
+        First and last frequency; by default 0 to 50 Hz, with "welch" the paper's band, either up
+        to 0.4 of the record's rate.
 
     Returns
     -------
-    RecordAnalysis, WelchAnalysis or tuple of WelchAwareFit
+    RecordAnalysis or WelchAnalysis
         By method.
 
     Raises
@@ -179,17 +164,7 @@ def fit(
             weightings=tuple(weightings or PAPER_WEIGHTINGS),
         )
         return analyse(record, welch_settings(record, settings, band_hz))
-    if method == "welch-aware":
-        from analysis.models import PAPER_BAND_HZ, WelchSettings
-        from analysis.welch_aware import fit_record_welch_aware
-
-        settings = WelchSettings(
-            band_hz=band_hz or PAPER_BAND_HZ,
-            types=tuple(types or STRUCTURES),
-            weightings=tuple(weightings or ("omega",)),
-        )
-        return fit_record_welch_aware(record, settings, fixed=fixed)
-    raise ValueError(f"There is no method {method!r}; choose 'record', 'welch' or 'welch-aware'.")
+    raise ValueError(f"There is no method {method!r}; choose 'record' or 'welch'.")
 
 
 def select(

@@ -8,24 +8,22 @@ move the motor and once in the torque alone. For every estimator and parameter a
 * loop: mean difference of the two, which is what the feedback did, nothing else being different;
 * mean error, of the session under the controller;
 
-both in standard deviations between sessions. Plain fits are those of the paper with 1/omega
-weights, beam and clamp being known; Welch-aware ones have density, stiffness, delay and clamp free.
-The motor (2e-3 kg m², a loop of 80 rad/s, one tick late) is that of tests/whole_record.
+both in standard deviations between sessions. The fits are those of the paper with 1/omega weights,
+beam and clamp being known. The motor (2e-3 kg m², a loop of 80 rad/s, one tick late) is that of
+tests/whole_record.
 """
 
 import argparse
 from dataclasses import dataclass, field
 
 import numpy as np
-from bench_welch_aware import PLANTS
-from exact_sessions import BAND_HZ, LINK, RATE_HZ, SWEEP
+from exact_sessions import BAND_HZ, LINK, PLANTS, RATE_HZ, SWEEP
 from numpy.typing import NDArray
 
 from analysis.identify import Plant, ResponseGrid
 from analysis.models import STRUCTURES
 from analysis.paper import fit_frf
-from analysis.welch_aware import fit_welch_aware
-from rigd.spectral import FrequencyResponse, Segmentation, instrumental_response, welch_response
+from rigd.spectral import FrequencyResponse, instrumental_response, welch_response
 
 SAMPLES = 136_000
 NOISE_NM = 1e-2
@@ -111,24 +109,16 @@ class Found:
             self.values.setdefault((estimator, name), []).append(parameters[name])
 
 
-def fit_all(records: Records, name: str, found: Found, only: str | None) -> None:
-    """Fit one session every way, or in one kind of ways only."""
+def fit_all(records: Records, name: str, found: Found) -> None:
+    """Fit one session by every estimator."""
     structure = STRUCTURES[name]
-    for estimator in () if only == "aware" else ("h1", "h2", "hv", "iv"):
+    for estimator in ("h1", "h2", "hv", "iv"):
         frf = records.response(estimator)
         fit = fit_frf(
             frf.frequency_hz, frf.response, LINK, structure, "omega",
             tool_inertia_kg_m2=CLAMP_KG_M2,
         )  # fmt: skip
         found.add(estimator, dict(fit.parameters), structure.free)
-    for estimator in () if only == "plain" else ("h1", "iv"):
-        frf = records.response(estimator)
-        (fit,) = fit_welch_aware(
-            records.angle_rad, RATE_HZ, frf.frequency_hz, frf.response, Segmentation(), LINK,
-            [structure], tool_inertia_kg_m2=CLAMP_KG_M2, estimated_from=SWEEP,
-            reference_rad=records.reference_rad if estimator == "iv" else None,
-        )  # fmt: skip
-        found.add(f"aware {estimator}", dict(fit.parameters), tuple(fit.std))
 
 
 def main() -> None:
@@ -137,13 +127,12 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=40)
     parser.add_argument("--plant", choices=PLANTS, default="VI")
     parser.add_argument("--multisine", action="store_true", help="in place of the chirp")
-    parser.add_argument("--only", choices=("plain", "aware"), help="one kind of fits")
     given = parser.parse_args()
     rig = Rig(given.plant, multisine=given.multisine)
     fed, apart = Found(), Found()
     for seed in range(given.sessions):
-        fit_all(rig.session(seed, fed_back=True), given.plant, fed, given.only)
-        fit_all(rig.session(seed, fed_back=False), given.plant, apart, given.only)
+        fit_all(rig.session(seed, fed_back=True), given.plant, fed)
+        fit_all(rig.session(seed, fed_back=False), given.plant, apart)
     print(f"Type {given.plant}, {'multisine' if given.multisine else 'chirp'}, ", end="")
     print(f"{given.sessions} sessions; in standard deviations between sessions:")
     for (estimator, name), values in fed.values.items():

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from analysis.identify import Plant, RecordFit, ResponseGrid, Selection, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.paper import fit_many
-from analysis.welch_aware import WelchAwareFit
 from rigd.beam import Beam, Damping, modes
 from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, segment_count
 
@@ -110,12 +109,11 @@ def record_method(count: int) -> tuple[list[Selection], list[RecordFit]]:
         fit_record(made.noisy(seed).measurement(), [STRUCTURES["VI"]], uniform=False).fits[0]
         for seed in range(count)
     ]
-    aware = [made.noisy(seed).aware("VII", uniform=False) for seed in range(count)]
     truth = NOT_UNIFORM.parameters
-    print(f"{'parameter':26}{'truth':>10}  selected          VI, modes free    Welch-aware VII")
+    print(f"{'parameter':26}{'truth':>10}  selected          VI, modes free")
     for parameter in truth:
         cells = []
-        for kind in ([each.fit for each in found], fits, aware):
+        for kind in ([each.fit for each in found], fits):
             values = np.array([each.parameters.get(parameter, np.nan) for each in kind])
             cells.append(f"{np.nanmean(values):9.4g} ± {np.nanstd(values, ddof=1):6.2g}")
         print(f"{parameter:26}{truth[parameter]:10.4g}  " + "  ".join(cells))
@@ -147,7 +145,6 @@ class FirstPeak:
     welch: FrequencyResponse
     true_ratio: float
     welch_ratio: dict[str, float]
-    aware: WelchAwareFit
     record: RecordFit
 
 
@@ -172,9 +169,7 @@ def first_peaks() -> list[FirstPeak]:
     fine_hz = np.linspace(2.0, 3.2, 240_001)
     found = []
     print("\nFirst peak: dB and half-power width, true and of Welch's estimate (no noise); damping")
-    print(
-        "ratio in %: true, type VI by the paper's route (const, omega), Welch-aware, whole record"
-    )
+    print("ratio in %: true, type VI by the paper's route (const, omega), whole record")
     for share in EXTERNAL:
         damping = Damping(DAMPING.zeta, 1.0, DAMPING.gamma * share, DAMPING.lambda_)
         plant = Plant(LINK, damping)
@@ -191,20 +186,16 @@ def first_peaks() -> list[FirstPeak]:
             welch_ratio={
                 fit.weighting: modes(LINK, fit.damping, 1)[0].damping_ratio for fit in plain
             },
-            aware=noisy.aware("VI", uniform=True),
             record=fit_record(noisy.measurement(), [STRUCTURES["VI"]]).fits[0],
         )
         found.append(each)
-        ratios = [
-            f"{100 * mode.damping_ratio:.3f} ± {100 * mode.damping_ratio_std:.3f}"
-            for mode in (each.aware.modes[0], each.record.modes[0])
-        ]
+        mode = each.record.modes[0]
         print(
             "  {:5.2f} dB {:.4f} Hz".format(*each.true_peak),
             "  {:5.2f} dB {:.4f} Hz".format(*each.welch_peak),
             f"  {100 * each.true_ratio:.3f} ",
             " ".join(f"{100 * ratio:.3f}" for ratio in each.welch_ratio.values()),
-            *ratios,
+            f"{100 * mode.damping_ratio:.3f} ± {100 * mode.damping_ratio_std:.3f}",
         )  # fmt: skip
     return found
 

@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify import Measurement, Plant, ResponseGrid
-from analysis.models import STRUCTURES
-from analysis.welch_aware import WelchAwareFit, fit_welch_aware
-from rigd.beam import Beam
-from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, Segmentation, welch_response
+from rigd.beam import Beam, Damping
+from rigd.spectral import PAPER_OVERLAP, FrequencyResponse, welch_response
 
 RATE_HZ = 1000.0
 SWEEP = slice(1000, 121_000)
 BAND_HZ = (0.5875, 50.0)
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+PLANTS = {
+    "VI": Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
+    "III": Damping(zeta=0.54e-4, alpha=1.0, gamma=0.02, lambda_=1.0),
+    "IV": Damping(zeta=2.49e-4, alpha=0.8, gamma=0.0, lambda_=0.0),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +50,6 @@ class Session:
         """As the whole-record estimator gets it."""
         known = np.ones(self.angle_rad.size, dtype=bool)
         return Measurement("session", self.angle_rad, self.torque_nm, RATE_HZ, LINK, known, known)
-
-    def aware(self, name: str, *, uniform: bool) -> WelchAwareFit:
-        """Fit one type to the estimate through the estimator."""
-        h1 = self.h1()
-        (fit,) = fit_welch_aware(
-            self.angle_rad, RATE_HZ, h1.frequency_hz, h1.response, Segmentation(), LINK,
-            [STRUCTURES[name]], estimated_from=SWEEP, uniform=uniform,
-        )  # fmt: skip
-        return fit
 
 
 def session(plant: Plant) -> Session:

@@ -102,16 +102,13 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
                 true_percent, [100 * peak.welch_ratio[weighting] for peak in peaks], marker="o",
                 markersize=4, label=f"paper's route, type VI, {NAMES[weighting]}", **line,
             )  # fmt: skip
-        for name, marker, colour in (("aware", "s", style.GREEN), ("record", "D", style.PURPLE)):
-            modes = [getattr(peak, name).modes[0] for peak in peaks]
-            right.errorbar(
-                true_percent,
-                [100 * mode.damping_ratio for mode in modes],
-                [196 * mode.damping_ratio_std for mode in modes],
-                fmt=marker, markersize=6 if name == "aware" else 3.5, color=colour,
-                markerfacecolor="none" if name == "aware" else colour, linewidth=1,
-                label={"aware": "Welch-aware", "record": "whole record"}[name],
-            )  # fmt: skip
+        modes = [peak.record.modes[0] for peak in peaks]
+        right.errorbar(
+            true_percent,
+            [100 * mode.damping_ratio for mode in modes],
+            [196 * mode.damping_ratio_std for mode in modes],
+            fmt="D", markersize=3.5, color=style.PURPLE, linewidth=1, label="whole record",
+        )  # fmt: skip
         for axis in (right.xaxis, right.yaxis):
             axis.set_minor_locator(NullLocator())
         right.set_xscale("log")

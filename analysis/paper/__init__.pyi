@@ -1,7 +1,6 @@
 from ._estimate import EstimateError as EstimateError
 from ._estimate import SettingsError as SettingsError
 from ._estimate import estimate as estimate
-from ._estimate import moving_reference_rad as moving_reference_rad
 from ._fit import FrfFit as FrfFit
 from ._fit import fit_frf as fit_frf
 from ._fit import fit_many as fit_many

@@ -70,7 +70,7 @@ def estimate(
             response = whole_record
         elif settings.estimator == "iv":
             response = instrumental_response(
-                moving_reference_rad(record)[record.sweep],
+                _moving_reference_rad(record)[record.sweep],
                 angle[record.sweep],
                 record.torque_nm[record.sweep],
                 record.rate_hz,
@@ -104,7 +104,7 @@ def estimate(
     return response, whole_record
 
 
-def moving_reference_rad(record: Record) -> NDArray[np.float64]:
+def _moving_reference_rad(record: Record) -> NDArray[np.float64]:
     """Movement asked for, from where it began, shape (n,); `EstimateError` if there is none.
 
     An imported record may lack it.

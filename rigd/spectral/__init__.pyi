@@ -14,7 +14,6 @@ from ._frf import segment_count as segment_count
 from ._frf import segment_lengths as segment_lengths
 from ._frf import segmentation_of as segmentation_of
 from ._frf import welch_response as welch_response
-from ._frf import window_named as window_named
 from ._running import RunningEstimate as RunningEstimate
 from ._running import RunningResponse as RunningResponse
 from ._spectrogram import RunningSpectrogram as RunningSpectrogram

@@ -24,7 +24,6 @@ methods of system identification", Automatica 17 (1981) 55-69.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -137,27 +136,6 @@ def checked_records(
             "so there is no frequency response to estimate."
         )
     return x, y
-
-
-# All symmetric, as MATLAB's are by default; scipy's are periodic unless told otherwise.
-_WINDOWS: Final[dict[str, Callable[[int], NDArray[np.float64]]]] = {
-    "hamming": np.hamming,
-    "hann": np.hanning,
-    "rectangular": np.ones,
-}
-
-
-def window_named(name: str) -> Callable[[int], NDArray[np.float64]]:
-    """Return the function from a length n to the symmetric window (n,) of that name.
-
-    Raises
-    ------
-    SpectralError
-        If there is none.
-    """
-    if name not in _WINDOWS:
-        raise SpectralError(f"There is no window {name!r}; choose one of {', '.join(_WINDOWS)}.")
-    return _WINDOWS[name]
 
 
 PAPER_RATE_HZ: Final = 1000.0
@@ -345,10 +323,11 @@ def welch_response(
     segment_length: int = PAPER_SEGMENT_LENGTH,
     overlap: int = PAPER_OVERLAP,
     nfft: int = PAPER_NFFT,
-    window: str = "hamming",
     estimator: Literal["h1", "h2", "hv"] = "h1",
 ) -> FrequencyResponse:
     """Frequency response from averaged cross- and auto-spectra of windowed segments.
+
+    The window is Hamming's, symmetric as MATLAB's is. No trend is removed from the segments.
 
     Parameters
     ----------
@@ -360,8 +339,6 @@ def welch_response(
     nfft : int
         Length of the transform in samples, at least `segment_length`: segments are padded with
         zeros, which puts bins closer together without resolving more.
-    window : {"hamming", "hann", "rectangular"}
-        Symmetric. No trend is removed from the segments.
     estimator : {"h1", "h2", "hv"}
         H1 = Sxy/Sxx is biased low by noise on the input, H2 = Syy/Syx high by noise on the
         output. Hv, their geometric mean, has the phase of both and lies between them; unlike
@@ -381,7 +358,7 @@ def welch_response(
     check_segmentation(segment_length, overlap, nfft)
     if estimator not in ("h1", "h2", "hv"):
         raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
-    taper = window_named(window)(segment_length)
+    taper = np.hamming(segment_length)
     count = segment_count(x.size, segment_length, overlap)
     if count == 0:
         raise SpectralError(
@@ -456,7 +433,6 @@ def instrumental_response(
     segment_length: int = PAPER_SEGMENT_LENGTH,
     overlap: int = PAPER_OVERLAP,
     nfft: int = PAPER_NFFT,
-    window: str = "hamming",
 ) -> FrequencyResponse:
     """Frequency response ``Hiv = Sry / Srx`` from input to output.
 
@@ -465,7 +441,7 @@ def instrumental_response(
     reference : array_like, shape (n,)
         What the loop was asked for, in any unit and with any delay: both cancel.
     input_, output : array_like, shape (n,)
-    rate_hz, segment_length, overlap, nfft, window
+    rate_hz, segment_length, overlap, nfft
         See `rigd.spectral.welch_response`.
 
     Returns
@@ -485,11 +461,10 @@ def instrumental_response(
         )
     of_input, of_output = (
         welch_response(
-            reference, values, rate_hz,
-            segment_length=segment_length, overlap=overlap, nfft=nfft, window=window,
+            reference, values, rate_hz, segment_length=segment_length, overlap=overlap, nfft=nfft
         )
         for values in (input_, output)
-    )  # fmt: skip
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         response = of_output.response / of_input.response
     return FrequencyResponse(

@@ -27,7 +27,7 @@ def record(workspace):
 def test_the_document_s_example_runs_as_written(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     blocks = re.findall(r"^```python\n(.*?)^```$", DOCUMENT, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 8
+    assert len(blocks) == 7
     exec("\n".join(blocks), {"__name__": "__main__"})
     printed = capsys.readouterr().out
     assert "21500 samples at 1000 Hz, outcome complete" in printed
@@ -68,9 +68,7 @@ def test_fit_by_either_method(record):
 def test_wrong_use_is_told(record, workspace):
     with pytest.raises(ValueError, match="no model type 'VIII', 'x'; choose from I, II"):
         api.fit(record, ["III", "VIII", "x"])
-    with pytest.raises(
-        ValueError, match="no method 'bayes'; choose 'record', 'welch' or 'welch-aware'"
-    ):
+    with pytest.raises(ValueError, match="no method 'bayes'; choose 'record' or 'welch'"):
         api.fit(record, method="bayes")
     with pytest.raises(ValueError, match="cannot be fixed"):
         api.fit(record, ["I"], fixed=("alpha",))
