@@ -27,20 +27,18 @@ from pathlib import Path
 marks = [("", 0.0)]
 mark = lambda name: marks.append((name, time.process_time()))
 mark("interpreter")
-import analysis.cli.app, analysis.record, analysis.identify, analysis.paper._route, rich.progress
+import analysis.cli.app, analysis.record, analysis.identify, analysis.paper, rich.progress
 from analysis.models import WelchSettings
 from analysis.identify import BAND_HZ, Measurement
 mark("imports of the analysis")
 record = analysis.record.load_record(Path(sys.argv[1]))
 mark("reading")
-welch = analysis.paper._route.analyse(record, WelchSettings())
+welch = analysis.paper.analyse(record, WelchSettings())
 mark("the paper's route")
-selection = analysis.identify._select(Measurement.of_record(record))
+selection = analysis.identify.select(Measurement.of_record(record))
 mark("whole record")
-from analysis.report.html import Subject
-from analysis.report._record_page import illustrations
-from analysis.report._frf_figure import frf_figure
-from analysis.report._write import write_report
+from analysis.results import Subject
+from analysis.report import frf_figure, illustrations, write_report
 mark("imports of matplotlib")
 subject = Subject.of(record, selection, BAND_HZ, (), welch)
 write_report(welch, Path(sys.argv[2]), mark, subject)

@@ -25,13 +25,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.campaigns import campaign
-from analysis.campaigns._session import SessionTask, analyse_session
-from analysis.campaigns._workers import process_pool
+from analysis.campaigns import SessionTask, analyse_session, campaign, process_pool
 from analysis.identify import BAND_HZ
 from analysis.models import STRUCTURES, FrequencyResponseModel, Unknowns, WelchSettings, weights
 from analysis.paper import fit_many
-from analysis.report._campaign_write import write_campaign
+from analysis.report import write_campaign
 
 SESSIONS = 20
 JOBS = 2

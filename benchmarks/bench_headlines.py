@@ -42,6 +42,7 @@ from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import numpy as np
+from analysis.report.html import Subject
 from headline_scores import (
     Scored,
     Told,
@@ -69,13 +70,11 @@ from independent_records import (
     exact,
 )
 
-from analysis.exchange._session_file import write_session
+from analysis.exchange import write_session
 from analysis.identify import BAND_HZ, Measurement, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.record import Record, load_record
-from analysis.report._bands import loss_factors
-from analysis.report._document import document
-from analysis.report.html import Subject
+from analysis.report import document, loss_factors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -32,7 +32,7 @@ from rigd.runtime import raise_on
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.campaigns._experiment import LoneSessionError
+    from analysis.campaigns import LoneSessionError
     from analysis.identify import Setting
 
 DEFAULT: Final = "default"
@@ -213,8 +213,8 @@ def analyze(
     Estimates the frequency response from motor angle to coupling torque, fits the fractional
     damping models to it, and prints and draws the results.
     """
-    from analysis.campaigns._experiment import CampaignError, LoneSessionError
-    from analysis.report._folder import OutputError, OutputExistsError, check_new_file
+    from analysis.campaigns import CampaignError, LoneSessionError
+    from analysis.report import OutputError, OutputExistsError, check_new_file
 
     is_campaign = len(files) > 1 and not each
     if not is_campaign:
@@ -334,7 +334,7 @@ def _fixed(text: str) -> tuple[Setting, ...]:
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
-    from analysis.report._rerun_file import check_rerun_file
+    from analysis.report import check_rerun_file
 
     if len(files) > 1:
         raise typer.BadParameter(

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from analysis.campaigns._campaign import Campaign
+    from analysis.campaigns import Campaign
     from analysis.identify import Setting
     from analysis.models import WelchSettings
 
@@ -73,11 +73,14 @@ def campaign_command(
     """
     from rich.console import Console
 
-    from analysis.campaigns._campaign import campaign
-    from analysis.report._campaign_document import campaign_document
-    from analysis.report._campaign_tables import campaign_tables
-    from analysis.report._document import document_text
-    from analysis.report._folder import report_folders, write_new
+    from analysis.campaigns import campaign
+    from analysis.report import (
+        campaign_document,
+        campaign_tables,
+        document_text,
+        report_folders,
+        write_new,
+    )
 
     first = files[0] if report is not None else files[0].with_name(_NAME)
     (folder,) = report_folders([first], report)
@@ -110,9 +113,8 @@ def _analysed(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from analysis.campaigns._experiment import LoneSessionError
-    from analysis.report._campaign_write import write_campaign
-    from analysis.report._folder import new_folder
+    from analysis.campaigns import LoneSessionError
+    from analysis.report import new_folder, write_campaign
 
     terminal = Console(stderr=True, highlight=False)
     with Progress(

@@ -22,7 +22,7 @@ from analysis.cli.welch_options import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from analysis.exchange._channels import ChannelChoice
+    from analysis.exchange import ChannelChoice
 
 export_app = typer.Typer(
     help="Write a session's record or frequency response for another program: .csv, .mat, .uff.",
@@ -127,9 +127,7 @@ def import_command(
     title in CSV and UFF58, Group/Channel in TDMS, struct.field or matrix#column in MATLAB), or #3
     for the third of a CSV or UFF58 file.
     """
-    from analysis.exchange._channels import QUANTITIES
-    from analysis.exchange._import_record import ImportPlan, import_record
-    from analysis.exchange._specimen import read_specimen
+    from analysis.exchange import QUANTITIES, ImportPlan, import_record, read_specimen
 
     if (time is None) == (rate_hz is None):
         raise typer.BadParameter(
@@ -197,7 +195,7 @@ def import_command(
 @export_app.command("record", epilog=_EXPORT_EPILOG)
 def export_record_command(session: _Session, target: _Target, binary: _Binary = False) -> None:
     """Write the samples as recorded: time, angles, torques, wrench, status bits."""
-    from analysis.exchange._export import export_record
+    from analysis.exchange import export_record
 
     def run() -> None:
         table = export_record(session, target, binary=binary)
@@ -218,7 +216,7 @@ def export_frf_command(
     nfft: Nfft = None,
 ) -> None:
     """Write the frequency response from angle to coupling torque, as an analysis estimates it."""
-    from analysis.exchange._export import export_frf
+    from analysis.exchange import export_frf
 
     settings = welch_settings("I", "const", frf, segment, overlap, nfft)
     asked_hz = band_hz(band)
@@ -232,10 +230,10 @@ def export_frf_command(
 
 def _explained(run: Callable[[], None]) -> int:
     """Run a command and return its exit code; what went wrong is said in a sentence or two."""
-    from analysis.exchange._source import ExchangeError, TargetError
+    from analysis.exchange import ExchangeError, TargetError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
-    from analysis.report._folder import OutputError, OutputExistsError
+    from analysis.report import OutputError, OutputExistsError
     from rigd.session import SessionError, SessionExistsError
 
     try:
@@ -253,8 +251,7 @@ def _explained(run: Callable[[], None]) -> int:
 
 
 def _choice(option: str, text: str, quantity: str) -> ChannelChoice:
-    from analysis.exchange._channels import parse_choice
-    from analysis.exchange._source import ExchangeError
+    from analysis.exchange import ExchangeError, parse_choice
 
     try:
         return parse_choice(text, quantity)

@@ -83,8 +83,7 @@ def session_command(
     """
     from rich.console import Console
 
-    from analysis.report._document import document, document_text
-    from analysis.report._folder import report_folders, write_new
+    from analysis.report import document, document_text, report_folders, write_new
 
     folders = report_folders(files, report)
     found, errors, code = _analyse_all(files, folders, routes, rerun)
@@ -122,7 +121,7 @@ def _print_tables(
     single: bool,
 ) -> None:
     """Print all of a single file, of several what the paper's route has together."""
-    from analysis.report._text import analysis_tables, record_text, summary_table
+    from analysis.report import analysis_tables, record_text, summary_table
 
     if single or not analyses:
         for subject in subjects:
@@ -144,7 +143,7 @@ def _analyse_all(
     from analysis.identify import MeasurementError
     from analysis.paper import EstimateError, SettingsError
     from analysis.record import RecordError
-    from analysis.report._folder import OutputError
+    from analysis.report import OutputError
     from rigd.session import SessionError
 
     found: list[_Found] = []
@@ -192,8 +191,8 @@ def _told(file: Path, error: Exception) -> str:
 
 
 def _steps(routes: Routes, rerun: Path | None) -> int:
-    from analysis.report._write import FIGURES as OF_RECORD
-    from analysis.report._write import figures_of_paper
+    from analysis.report import FIGURES as OF_RECORD
+    from analysis.report import figures_of_paper
 
     figures = figures_of_paper(paper=routes.paper, whole_record=routes.whole_record)
     pictures = len(figures) + routes.whole_record * len(OF_RECORD) + (rerun is not None)
@@ -211,8 +210,7 @@ def _analyse_file(
 ) -> _Found:
     from analysis.identify import MeasurementError
     from analysis.record import load_record
-    from analysis.report._folder import new_folder
-    from analysis.report._write import write_report
+    from analysis.report import new_folder, write_report
     from analysis.suited import check_record_band, remarks, welch_analysis
 
     record = load_record(file)
@@ -241,7 +239,7 @@ def _analyse_file(
     with new_folder(folder) as part:
         write_report(analysis, part, on_step, subject)
     if rerun is not None and analysis is not None:
-        from analysis.report._rerun_file import write_rerun_file
+        from analysis.report import write_rerun_file
 
         write_rerun_file(analysis, rerun)
         on_step("figure for Rerun")

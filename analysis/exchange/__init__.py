@@ -1,1 +1,5 @@
 """Records of other programs in, records and frequency responses out."""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.exchange._source import TargetError
 from analysis.exchange._table import frf_table, record_table
-from analysis.report._folder import OutputError, check_new_file
+from analysis.report import OutputError, check_new_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

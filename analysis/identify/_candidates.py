@@ -14,7 +14,7 @@ from analysis.identify._fit import fit_record
 from analysis.identify._leakage import without_leakage
 from analysis.identify._noise import Noise
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._predictor import SETTINGS
+from analysis.identify._plant import SETTINGS
 from analysis.identify._problem import Comparison
 from analysis.identify._refit import Refit, adapted, resonances_kept, vector
 from analysis.identify._residual_tests import whiteness
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._drag import DragEstimate
     from analysis.identify._finding import Finding
-    from analysis.identify._predictor import Plant, Setting
+    from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit
     from analysis.models import Structure
 

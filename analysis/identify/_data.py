@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._predictor import Plant
+from analysis.identify._plant import Plant
 from analysis.record_checks import too_much_unknown
 from rigd.beam import Damping
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidates import Field
     from analysis.identify._nonlinear import NonlinearForce
-    from analysis.identify._predictor import Setting
+    from analysis.identify._plant import Setting
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.identify._result import ModeEstimate
 

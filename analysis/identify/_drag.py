@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidates import Field
     from analysis.identify._noise import Noise
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.models import Structure
 

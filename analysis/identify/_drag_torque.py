@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]

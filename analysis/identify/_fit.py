@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._predictor import SETTINGS
+from analysis.identify._plant import SETTINGS
 from analysis.identify._problem import Comparison, Objective
 from analysis.identify._result import RecordAnalysis, RecordFit
 from analysis.identify._search import Descent, RoughResponse, Search
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._data import Measurement
     from analysis.identify._noise import Noise
-    from analysis.identify._predictor import Setting
+    from analysis.identify._plant import Setting
     from analysis.identify._problem import Objective, Projected
     from analysis.models import Structure
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
 
 
 _HARDLY: Final = 1e-6

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._free_decay import Pole
     from analysis.identify._noise import Noise
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
 
 _RESONANCE: Final = 3.0

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidates import Candidate, Field
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
 
 Kind = Literal["cubic stiffness", "quadratic stiffness", "quadratic drag"]

@@ -40,14 +40,8 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
-from analysis.identify._predictor import (
-    EXTRAS,
-    FIRST_OFFSET,
-    SETTINGS,
-    Plant,
-    eigenvalues,
-    offset_name,
-)
+from analysis.identify._plant import EXTRAS, SETTINGS, Plant
+from analysis.identify._predictor import FIRST_OFFSET, eigenvalues, offset_name
 from analysis.models import ORDER_RANGE, SIZE_RANGE
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
@@ -56,7 +50,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._predictor import Setting
+    from analysis.identify._plant import Setting
     from analysis.models import Structure
 
 _SHARE: Final = 0.5

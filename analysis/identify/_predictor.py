@@ -21,122 +21,19 @@ kappa is the clamp's compliance, between tool and beam; with a tip mass G is tha
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from analysis.identify._data import fast_length
+from analysis.identify._plant import Plant
 from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, loaded_response
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import ArrayLike, NDArray
-
-    from rigd.beam import Beam, Damping
-
-Setting = Literal[
-    "density_over_stiffness", "bending_stiffness_n_m2", "delay_s", "tool_inertia_kg_m2"
-]
-SETTINGS: Final[tuple[Setting, ...]] = (
-    "density_over_stiffness",
-    "bending_stiffness_n_m2",
-    "delay_s",
-    "tool_inertia_kg_m2",
-)
-"""What is free beside the damping unless it is fixed: rho/EI in s²/m⁴, EI in N·m², by how much the
-torque is older than the angle, and the inertia between torque sensor and beam."""
-
-Extra = Literal[
-    "root_compliance_rad_per_nm",
-    "tip_mass_kg",
-    "filter_time_constant_s",
-    "second_order_filter_time_constant_s",
-    "clock_rate_difference",
-]
-EXTRAS: Final[tuple[Extra, ...]] = (
-    "root_compliance_rad_per_nm",
-    "tip_mass_kg",
-    "filter_time_constant_s",
-    "second_order_filter_time_constant_s",
-    "clock_rate_difference",
-)
-"""What a rig may have beside a rigid clamp, a bare beam and ideal channels. Neutral at 0, and free
-only in candidates that carry them."""
-
-LOGARITHMIC: Final = frozenset(
-    {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
-)
-"""Parameters that are positive and uncertain by a factor: their logarithm is what is estimated."""
-
-
-@dataclass(frozen=True, slots=True)
-class Plant:
-    """One point of the search: everything the predicted torque depends on.
-
-    Attributes
-    ----------
-    beam : Beam
-    damping : Damping
-    delay_s : float
-        By how much the torque is older than the angle.
-    tool_inertia_kg_m2 : float
-    stiffness_offsets : tuple of float
-        By how much the stiffness of modes 2, 3, … differs from the uniform beam's, relatively.
-    root_compliance_rad_per_nm : float
-        By how much the clamp turns for a torque on the beam's root. The tool's inertia is on the
-        motor's side of it: what is bolted to the sensor is stiff, what yields is the grip on the
-        beam.
-    tip_mass_kg : float
-        Point mass at the beam's tip.
-    filter_time_constant_s : float
-        Of a low-pass filter of first order in the torque's channel.
-    second_order_filter_time_constant_s : float
-        Reciprocal corner frequency (rad/s) of a Butterworth low-pass filter of second order there.
-    clock_rate_difference : float
-        By how much the torque's samples lie farther apart than the angle's, relatively: the torque
-        with time stamp t is that of t (1 + difference), t from the record's first sample.
-    """
-
-    beam: Beam
-    damping: Damping
-    delay_s: float = 0.0
-    tool_inertia_kg_m2: float = 0.0
-    stiffness_offsets: tuple[float, ...] = ()
-    root_compliance_rad_per_nm: float = 0.0
-    tip_mass_kg: float = 0.0
-    filter_time_constant_s: float = 0.0
-    second_order_filter_time_constant_s: float = 0.0
-    clock_rate_difference: float = 0.0
-
-    @property
-    def extras(self) -> dict[str, float]:
-        """Values of all `EXTRAS`."""
-        return {name: getattr(self, name) for name in EXTRAS}
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Values by name: zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, ….
-
-        Of the `EXTRAS` those that are not neutral.
-        """
-        return {
-            "zeta": self.damping.zeta,
-            "alpha": self.damping.alpha,
-            "gamma": self.damping.gamma,
-            "lambda": self.damping.lambda_,
-            "density_over_stiffness": self.beam.density_over_stiffness,
-            "bending_stiffness_n_m2": self.beam.bending_stiffness_n_m2,
-            "delay_s": self.delay_s,
-            "tool_inertia_kg_m2": self.tool_inertia_kg_m2,
-            **{
-                f"stiffness_offset_{mode}": offset
-                for mode, offset in enumerate(self.stiffness_offsets, start=2)
-            },
-            **{name: value for name, value in self.extras.items() if value},
-        }
 
 
 _FILTERS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from analysis.identify._free_decay import Pole
     from analysis.identify._hum import Hum
     from analysis.identify._parametrization import Unknowns
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
 
 _MEMORY_S: Final = 0.4
 """Standard deviation of the window over the lags of the correlations, that is how long the loop may

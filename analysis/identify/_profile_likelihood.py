@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidates import Candidate, Field
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.models import Structure
 
 _FAR: Final = 25.0

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._parametrization import Unknowns
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.identify._result import ModeEstimate, RecordFit
     from analysis.models import Structure

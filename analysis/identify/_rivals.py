@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from analysis.identify._candidates import Candidate
 from analysis.identify._finding import Finding
 from analysis.identify._parametrization import ln_stiffness_with_tip
-from analysis.identify._predictor import EXTRAS
+from analysis.identify._plant import EXTRAS
 from analysis.identify._refit import adapted
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._verdict import STRONG

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from analysis.identify._hum import Hum
     from analysis.identify._noise import Noise
     from analysis.identify._parametrization import Unknowns
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.optimizer import Minimum
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._headline import Headline, Quantity, Simpler
-    from analysis.identify._predictor import Setting
+    from analysis.identify._plant import Setting
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import Change
     from analysis.identify._verdict import OrderVerdict

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidates import Candidate, Field
     from analysis.identify._finding import Kind
-    from analysis.identify._predictor import Plant
+    from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
 
 _PADDED: Final = 1.5

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._predictor import LOGARITHMIC
+from analysis.identify._plant import LOGARITHMIC
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
 
 if TYPE_CHECKING:

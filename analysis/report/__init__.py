@@ -1,7 +1,5 @@
 """What people and programs are shown of an analysis: tables, figures, a JSON document."""
 
-import logging
+import lazy_loader as lazy
 
-# Of its cache of fonts, which is slow to make or just being made by another process: no figure
-# suffers, and nobody who reads it in a log can tell.
-logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

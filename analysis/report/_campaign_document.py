@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
-from analysis.campaigns._headlines import headlines
+from analysis.campaigns import headlines
 from analysis.models import STRUCTURES
 from analysis.report._campaign_rows import all_tables
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from analysis.campaigns._campaign import Campaign
-    from analysis.campaigns._estimates import RecordEstimate, WelchFit
-    from analysis.campaigns._session import SessionResult
+    from analysis.campaigns import Campaign, RecordEstimate, SessionResult, WelchFit
     from analysis.identify import ModeEstimate
 
 

@@ -6,9 +6,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.campaigns._sentences import MIXTURE_MARK, label, probability, title, with_unit
-from analysis.campaigns._statistics import best_models
-from analysis.campaigns._validation import by_model
+from analysis.campaigns import (
+    MIXTURE_MARK,
+    best_models,
+    by_model,
+    label,
+    probability,
+    title,
+    with_unit,
+)
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
 from analysis.report._campaign_tables import used
@@ -24,9 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.campaigns._campaign import Campaign
-    from analysis.campaigns._pooling import PooledParameter
-    from analysis.campaigns._statistics import NominalModel
+    from analysis.campaigns import Campaign, NominalModel, PooledParameter
 
 _PANELS: Final = (
     ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),

@@ -10,17 +10,17 @@ import matplotlib as mpl
 import numpy as np
 
 import rigd
-from analysis.campaigns import _sentences as sentences
-from analysis.campaigns._sentences import (
+from analysis.campaigns import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
+    best_models,
+    by_model,
     label,
+    lost_trials,
     probability,
     title,
     with_unit,
 )
-from analysis.campaigns._statistics import best_models
-from analysis.campaigns._validation import by_model
 from analysis.models import STRUCTURES
 from analysis.report import _campaign_rows as paper
 from analysis.report import _campaign_tables as homogeneity_tables
@@ -50,11 +50,13 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
     from datetime import datetime
 
-    from analysis.campaigns._campaign import Campaign
-    from analysis.campaigns._homogeneity import Homogeneity
-    from analysis.campaigns._pooling import PooledEstimate
-    from analysis.campaigns._session import SessionResult
-    from analysis.campaigns._statistics import RankedStructure
+    from analysis.campaigns import (
+        Campaign,
+        Homogeneity,
+        PooledEstimate,
+        RankedStructure,
+        SessionResult,
+    )
     from analysis.report._table import Cell, Number
 
 _TABLE_3: Final = {"zeta": ("ζ (10⁻⁴)", 1e4), "alpha": ("α", 1.0), "gamma": ("γ (10⁻¹)", 10.0),
@@ -316,7 +318,7 @@ def validation_table(campaign: Campaign) -> Table:
         rows=tuple(rows),
         notes=(
             "The session's own fit has the noise in it, too: nothing predicts better.",
-            *sentences.lost_trials(campaign.lost_trials, campaign.trials),
+            *lost_trials(campaign.lost_trials, campaign.trials),
         ),
     )  # fmt: skip
 

@@ -16,7 +16,7 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from analysis.campaigns._statistics import best_models
+from analysis.campaigns import best_models
 from analysis.models import STRUCTURES
 from analysis.report._campaign_tables import session_list_rows
 from analysis.report._table import unreported
@@ -24,8 +24,7 @@ from analysis.report._table import unreported
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from analysis.campaigns._campaign import Campaign
-    from analysis.campaigns._pooling import PooledEstimate
+    from analysis.campaigns import Campaign, PooledEstimate
 
 
 @dataclass(frozen=True, slots=True)

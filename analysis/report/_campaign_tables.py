@@ -12,20 +12,21 @@ from rich.console import Console, Group
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from analysis.campaigns import _sentences as sentences
-from analysis.campaigns import _sentences as specimen_sentences
-from analysis.campaigns._experiment import in_dispute, told
-from analysis.campaigns._sentences import (
+from analysis.campaigns import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
+    best_models,
+    by_model,
+    in_dispute,
     label,
+    lost_trials,
     percent,
     probability,
+    specimens,
     title,
+    told,
     with_unit,
 )
-from analysis.campaigns._statistics import best_models
-from analysis.campaigns._validation import by_model
 from analysis.models import STRUCTURES
 from analysis.report import _campaign_rows as paper
 from analysis.report._table import MARK, Column, Table, count, footnotes, number, unreported
@@ -38,10 +39,13 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table as RichTable
 
-    from analysis.campaigns._campaign import Campaign
-    from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity
-    from analysis.campaigns._pooling import PooledEstimate
-    from analysis.campaigns._verdict import CampaignVerdict
+    from analysis.campaigns import (
+        Campaign,
+        CampaignVerdict,
+        Heterogeneity,
+        Homogeneity,
+        PooledEstimate,
+    )
 
 
 def text_table(title: str) -> RichTable:
@@ -175,9 +179,9 @@ def without_verdict(campaign: Campaign) -> list[str]:
     """Say what a verdict would have said first, and why there is none."""
     asked = any(each.record_estimates for each in campaign.sessions)
     return [
-        *specimen_sentences.specimens(campaign.homogeneity),
+        *specimens(campaign.homogeneity),
         *([NO_VERDICT] if asked else []),
-        *sentences.lost_trials(campaign.lost_trials, campaign.trials),
+        *lost_trials(campaign.lost_trials, campaign.trials),
     ]
 
 
@@ -377,7 +381,7 @@ def validation_table(campaign: Campaign) -> RichTable:
         )  # fmt: skip
     notes = [
         "own fit: of the session's own whole-record fit, noise included",
-        *sentences.lost_trials(campaign.lost_trials, campaign.trials),
+        *lost_trials(campaign.lost_trials, campaign.trials),
     ]
     table.caption = ". ".join(notes)
     return table

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from analysis.campaigns._campaign import Campaign
+    from analysis.campaigns import Campaign
 
 _CROWDED: Final = frozenset({"figure5_signals", "figure6_nominal", "figure8_best"})
 

@@ -6,6 +6,7 @@ lie on each other differ in dash as well as in colour.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
+
+# Of its cache of fonts, which is slow to make or just being made by another process: no figure
+# suffers, and nobody who reads it in a log can tell.
+logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)
 
 BLUE: Final = "#0072B2"
 VERMILION: Final = "#D55E00"

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.session._schema import EVENT_TOPIC, SAMPLE_SCHEMA, SAMPLE_TOPIC
-from rigd.view import APPLICATION_ID
-from rigd.view._plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
+from rigd.session import EVENT_TOPIC, SAMPLE_SCHEMA, SAMPLE_TOPIC
+from rigd.view import APPLICATION_ID, GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, VERMILION, Color
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

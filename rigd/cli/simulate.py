@@ -42,6 +42,7 @@ def simulate(
 
     Example: rigd simulate --profile antenna_can --fault drop,from=drive,frames=3@10
     """
+    from rigd.devices import DeviceError
     from rigd.devices import simulator as simulator_of
 
     simulator = simulator_of()
@@ -56,7 +57,7 @@ def simulate(
         code = simulator.run_simulator(profile_named(profile).rig, options)
     except simulator.WrongUseError as error:
         fail(str(error), EXIT_WRONG_USE)
-    except simulator.DeviceError as error:
+    except DeviceError as error:
         fail(str(error), EXIT_FAILED)
     raise typer.Exit(code)
 
@@ -96,6 +97,7 @@ def inject(
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
     """  # noqa: D301 - the mark that keeps lines apart is no raw text
+    from rigd.devices import DeviceError
     from rigd.devices import simulator as simulator_of
 
     simulator = simulator_of()
@@ -105,6 +107,6 @@ def inject(
         lines = simulator.inject(rig.name, fault or [])
     except simulator.WrongUseError as error:
         fail(str(error), EXIT_WRONG_USE)
-    except simulator.DeviceError as error:
+    except DeviceError as error:
         fail(str(error), EXIT_FAILED)
     typer.echo("\n".join(lines))

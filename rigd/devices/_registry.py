@@ -109,8 +109,8 @@ def objections(rig: RigParameters) -> list[str]:
 
 
 def simulator() -> ModuleType:
-    """Return the module that puts a simulated rig on the wire."""
-    return importlib.import_module("rigd.sim.wire._simulator")
+    """Return the package that puts a simulated rig on the wire."""
+    return importlib.import_module("rigd.sim.wire")
 
 
 def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:

@@ -41,6 +41,13 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 Message = dict[str, Any]
 
 
+def _is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
+    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
+    waiting = select.poll()
+    waiting.register(fd, event)
+    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
+
+
 class ChildError(Exception):
     """A child process ended, or answered something else than it was asked."""
 
@@ -165,7 +172,7 @@ class Child:
         """Wait until its output ends, which is noticed at once; waiting for a process polls."""
         deadline = time.monotonic() + patience_s
         while (left_s := deadline - time.monotonic()) > 0:
-            if select.select([self._stdout_fd], [], [], left_s)[0] and not os.read(
+            if _is_ready(self._stdout_fd, select.POLLIN, left_s) and not os.read(
                 self._stdout_fd, 65536
             ):
                 return True
@@ -186,7 +193,7 @@ class Child:
         deadline = time.monotonic() + _WRITE_PATIENCE_S
         while rest:
             patience_s = max(0.0, deadline - time.monotonic())
-            if not select.select([], [self._stdin_fd], [], patience_s)[1]:
+            if not _is_ready(self._stdin_fd, select.POLLOUT, patience_s):
                 raise ChildError(f"The {self.name} process does not listen.")
             try:
                 rest = rest[os.write(self._stdin_fd, rest) :]
@@ -216,7 +223,7 @@ class LineReader:
             If the other end is gone and nothing is left to read.
         """
         while b"\n" not in self._pending:
-            if not select.select([self._fd], [], [], timeout_s)[0]:
+            if not _is_ready(self._fd, select.POLLIN, timeout_s):
                 return None
             data = os.read(self._fd, 65536)
             if not data:

@@ -26,7 +26,9 @@ from ._reader import read_timings as read_timings
 from ._recovery import Recovery as Recovery
 from ._recovery import holds_samples as holds_samples
 from ._recovery import recover as recover
+from ._schema import EVENT_TOPIC as EVENT_TOPIC
 from ._schema import SAMPLE_SCHEMA as SAMPLE_SCHEMA
+from ._schema import SAMPLE_TOPIC as SAMPLE_TOPIC
 from ._schema import message_class as message_class
 from ._schema import schema_data as schema_data
 from ._writer import PART_SUFFIX as PART_SUFFIX

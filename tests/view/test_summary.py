@@ -1,7 +1,6 @@
 """The state of a session at one look."""
 
-from rigd.view._scene import summary
-from rigd.view._session_info import Health
+from rigd.view._session_info import Health, summary
 
 WELL = Health(
     missed_ticks=0, late_ticks=0, lost_ticks=0, recorder_lag_ticks=17, disk_free_mb=51_234.0,

@@ -8,7 +8,8 @@ import pytest
 from analysis.identify import EXTRAS, SETTINGS, Plant
 from analysis.identify._free_decay import mode_poles
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._predictor import LOGARITHMIC, Prediction
+from analysis.identify._plant import LOGARITHMIC
+from analysis.identify._predictor import Prediction
 from analysis.identify._refit import vector
 from analysis.models import STRUCTURES
 from rigd.beam import PARAMETERS, Beam, Damping

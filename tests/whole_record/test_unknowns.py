@@ -5,7 +5,7 @@ import pytest
 
 from analysis.identify import SETTINGS, Plant
 from analysis.identify._parametrization import Unknowns
-from analysis.identify._predictor import LOGARITHMIC
+from analysis.identify._plant import LOGARITHMIC
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
 

@@ -14,7 +14,6 @@ from enum import Enum, Flag, auto
 from math import ceil, tau
 from typing import TYPE_CHECKING, Final
 
-from rigd.devices import DeviceError
 from rigd.devices.cia402 import _protocol as protocol
 
 if TYPE_CHECKING:
@@ -559,6 +558,8 @@ def sync_period_us(rate_hz: float) -> int:
     """
     period_us = 1e6 / rate_hz
     if abs(period_us - round(period_us)) > _ROUNDING * period_us:
+        from rigd.devices import DeviceError  # which loads numpy
+
         raise DeviceError(
             f"rig.rate_hz = {rate_hz:g} Hz: its period is no whole number of microseconds, which "
             "a CANopen drive needs; choose another rate, such as 1000 Hz."
@@ -580,6 +581,8 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
         value = 10.0**-exponent / rate_hz
         if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING * value:
             return round(value), exponent
+    from rigd.devices import DeviceError
+
     raise DeviceError(
         f"rig.rate_hz = {rate_hz:g} Hz: its period cannot be told to a CANopen drive (object 60C2: "
         "1 to 255 times a power of ten of a second); choose another rate, such as 1000 Hz."

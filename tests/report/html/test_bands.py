@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement, fit_record
-from analysis.identify._predictor import LOGARITHMIC
+from analysis.identify._plant import LOGARITHMIC
 from analysis.models import STRUCTURES
 from analysis.report._bands import loss_factors, response_band
 from rigd.beam import Beam, Damping, transfer
