@@ -1,4 +1,4 @@
-from ._candidates import Candidate as Candidate
+from ._candidate import Candidate as Candidate
 from ._data import Decimation as Decimation
 from ._data import Measurement as Measurement
 from ._data import MeasurementError as MeasurementError

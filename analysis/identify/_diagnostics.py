@@ -11,7 +11,7 @@ from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._refit import vector
 from analysis.identify._residual_tests import SURE, of_chi_square
-from analysis.identify._rivals import of_rig
+from analysis.identify._rig_findings import of_rig
 from analysis.identify._verdict import EVEN, STRONG, rivals
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidates import Candidate
+from analysis.identify._candidate import Candidate
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
 from analysis.identify._refit import Refit, adapted, unexplained_part, vector
 from analysis.models import STRUCTURES

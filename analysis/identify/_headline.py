@@ -19,7 +19,8 @@ from analysis.models import COEFFICIENT_OF
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
 
-    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import Field
     from analysis.identify._finding import Finding
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._verdict import OrderVerdict

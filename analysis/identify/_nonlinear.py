@@ -38,7 +38,8 @@ from rigd.beam import clamped_free_eigenvalues, participation
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import Field
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
 

@@ -15,7 +15,8 @@ from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import Field
     from analysis.identify._plant import Plant
     from analysis.models import Structure
 

@@ -39,7 +39,8 @@ from analysis.identify._visible_modes import driven, visible_modes
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import Field
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
     from analysis.identify._headline import Headline, Quantity, Simpler

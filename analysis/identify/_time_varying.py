@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import Field
     from analysis.identify._finding import Kind
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison

@@ -12,7 +12,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from analysis.identify._candidates import Candidate, Field
+    from analysis.identify._candidate import Candidate
+    from analysis.identify._candidates import Field
     from analysis.identify._drag import DampingAt
     from analysis.identify._finding import Finding
     from analysis.identify._profile_likelihood import Order, Profile

@@ -22,8 +22,8 @@ from analysis.campaigns import (
     with_unit,
 )
 from analysis.models import STRUCTURES
-from analysis.report import _campaign_rows as paper
 from analysis.report import _campaign_tables as homogeneity_tables
+from analysis.report import _paper_numbers as paper
 from analysis.report._campaign_tables import (
     NOT_POOLED,
     likely_estimates,

@@ -11,67 +11,19 @@ from __future__ import annotations
 import csv
 import io
 import math
-from dataclasses import asdict, dataclass
-from functools import cache
-from importlib.resources import files
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from analysis.campaigns import best_models
 from analysis.models import STRUCTURES
 from analysis.report._campaign_tables import session_list_rows
+from analysis.report._paper_numbers import table3, table4, table5_wmse
 from analysis.report._table import unreported
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from analysis.campaigns import Campaign, PooledEstimate
-
-
-@dataclass(frozen=True, slots=True)
-class PaperStatistics:
-    """One row of Table 3."""
-
-    mean: float
-    median: float
-    std: float
-    min: float
-    max: float
-
-
-@cache
-def table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
-    """Statistics by type, weighting and parameter."""
-    return {
-        (row["type"], row["weighting"], row["parameter"]): PaperStatistics(
-            **{name: float(row[name]) for name in ("mean", "median", "std", "min", "max")}
-        )
-        for row in _rows("paper_table3.csv")
-    }
-
-
-@cache
-def table4() -> Mapping[tuple[str, str, str, int], float]:
-    """Mean deviations by type, weighting, quantity (as `MeanPeakDeviation` names it) and mode."""
-    names = ("quantity", "mode", "weighting")
-    return {
-        (structure, row["weighting"], row["quantity"], int(row["mode"])): float(value)
-        for row in _rows("paper_table4.csv")
-        for structure, value in row.items()
-        if structure not in names
-    }
-
-
-@cache
-def table5_wmse() -> Mapping[tuple[str, str], float]:
-    """Weighted mean square error of the two best models, by type and weighting."""
-    return {
-        (row["type"], row["weighting"]): float(row["wmse"]) for row in _rows("paper_table5.csv")
-    }
-
-
-def _rows(name: str) -> list[dict[str, str]]:
-    text = files("analysis.report").joinpath("data", name).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
 
 
 Row = dict[str, Any]

@@ -28,7 +28,7 @@ from analysis.campaigns import (
     with_unit,
 )
 from analysis.models import STRUCTURES
-from analysis.report import _campaign_rows as paper
+from analysis.report import _paper_numbers as paper
 from analysis.report._table import MARK, Column, Table, count, footnotes, number, unreported
 from analysis.report._text import with_spread
 

@@ -8,7 +8,7 @@ import pytest
 from analysis.identify._candidates import Field
 from analysis.identify._headline import structures
 from analysis.identify._profile_likelihood import Profile
-from analysis.identify._rivals import of_rig
+from analysis.identify._rig_findings import of_rig
 from analysis.identify._verdict import order_verdict
 from analysis.models import STRUCTURES
 

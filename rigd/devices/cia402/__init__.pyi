@@ -1,7 +1,7 @@
 from ._assignments import parse_assignment as parse_assignment
 from ._drive import Cia402Drive as Cia402Drive
-from ._protocol import MAX_SPEED_RPM as MAX_SPEED_RPM
-from ._protocol import RATED_TORQUE as RATED_TORQUE
+from ._objects import MAX_SPEED_RPM as MAX_SPEED_RPM
+from ._objects import RATED_TORQUE as RATED_TORQUE
 from ._requirements import ACCEPTABLE as ACCEPTABLE
 from ._requirements import TORQUE_FEEDBACK as TORQUE_FEEDBACK
 from ._requirements import TORQUE_LIMIT as TORQUE_LIMIT

@@ -11,15 +11,13 @@ from math import isnan
 from rigd.devices import DeviceError, LineHealth, RigParameters
 from rigd.devices.canbus import CanExchange, CanLink
 from rigd.devices.cia402._node import Inbox, Node
+from rigd.devices.cia402._objects import ACTUAL_TORQUE, HEARTBEAT_CONSUMER, HEARTBEAT_PRODUCER_MS
 from rigd.devices.cia402._protocol import (
-    ACTUAL_TORQUE,
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     ENABLED,
     FAULT_BIT,
     FOLLOWS_TARGET,
-    HEARTBEAT_CONSUMER,
-    HEARTBEAT_PRODUCER_MS,
     STATE_BITS,
     DriveState,
     NodeFrames,

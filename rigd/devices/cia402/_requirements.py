@@ -14,7 +14,7 @@ from enum import Enum, Flag, auto
 from math import ceil, tau
 from typing import TYPE_CHECKING, Final
 
-from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _objects as objects
 
 if TYPE_CHECKING:
     from rigd.devices import RigParameters, ServoDrive
@@ -156,11 +156,11 @@ _FROM_BEFORE: Final = "Set it to 0 with the drive's own tool, and store that."
 
 CORE: Final = (
     Requirement(
-        protocol.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
+        objects.CONTROLWORD, 0, "Controlword", True, _W | Access.RECEIVED, sentence=_NOT_USABLE
     ),
-    Requirement(protocol.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
+    Requirement(objects.STATUSWORD, 0, "Statusword", True, _R | Access.SENT, sentence=_NOT_USABLE),
     Requirement(
-        protocol.MODE,
+        objects.MODE,
         0,
         "Modes of operation",
         True,
@@ -168,10 +168,10 @@ CORE: Final = (
         sentence="It has to take 10, cyclic synchronous torque mode.",
     ),
     Requirement(
-        protocol.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
+        objects.MODE_DISPLAY, 0, "Modes of operation display", True, _R, sentence=_NOT_USABLE
     ),
     Requirement(
-        protocol.POSITION,
+        objects.POSITION,
         0,
         "Position actual value",
         True,
@@ -179,7 +179,7 @@ CORE: Final = (
         sentence="The loop runs on it.",
     ),
     Requirement(
-        protocol.TARGET_TORQUE,
+        objects.TARGET_TORQUE,
         0,
         "Target torque",
         True,
@@ -187,47 +187,43 @@ CORE: Final = (
         sentence="Without it the drive has no torque mode that rigd could use.",
     ),
     Requirement(
-        protocol.SUPPORTED_MODES,
+        objects.SUPPORTED_MODES,
         0,
         "Supported drive modes",
         True,
         _R,
         sentence="Its bit 9 has to say that the drive has cyclic synchronous torque mode.",
     ),
+    Requirement(objects.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC),
     Requirement(
-        protocol.RPDO_COMMUNICATION, 1, "COB-ID of RPDO1", True, _R | _W, sentence=_DYNAMIC
-    ),
-    Requirement(
-        protocol.RPDO_COMMUNICATION,
+        objects.RPDO_COMMUNICATION,
         2,
         "Transmission type of RPDO1",
         True,
         _R | _W,
         sentence="It has to be 1 (at_sync) or 255 (on_arrival), as cia402.torque_delivery says.",
     ),
-    Requirement(protocol.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(objects.RPDO_MAPPING, 0, "Mapping of RPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(objects.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC),
     Requirement(
-        protocol.TPDO_COMMUNICATION, 1, "COB-ID of TPDO1", True, _R | _W, sentence=_DYNAMIC
-    ),
-    Requirement(
-        protocol.TPDO_COMMUNICATION,
+        objects.TPDO_COMMUNICATION,
         2,
         "Transmission type of TPDO1",
         True,
         _R | _W,
         sentence="It has to be 1: an angle at every SYNC.",
     ),
-    Requirement(protocol.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
+    Requirement(objects.TPDO_MAPPING, 0, "Mapping of TPDO1", True, _R | _W, sentence=_DYNAMIC),
 )
 """No session without one of these. Mapping entries 1600 and 1A00 sub 1 and on go with sub 0."""
 
 OPTIONAL: Final = (
     # Identity and texts: told in reports, compared only where the profile names them.
     Requirement(
-        protocol.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
+        objects.IDENTITY, 1, "Vendor-ID", False, _R, "nothing: cia402.vendor_id = 0", fit=Fit.ANY
     ),
     Requirement(
-        protocol.IDENTITY,
+        objects.IDENTITY,
         2,
         "Product code",
         False,
@@ -235,13 +231,13 @@ OPTIONAL: Final = (
         "nothing: cia402.product_code = 0",
         fit=Fit.ANY,
     ),
-    Requirement(protocol.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
+    Requirement(objects.DEVICE_NAME, 0, "Device name", False, _R, "no name", fit=Fit.ANY),
     Requirement(
-        protocol.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
+        objects.ERROR_CODE, 0, "Error code", False, _R, "the emergency message", fit=Fit.ANY
     ),
     # SYNC.
     Requirement(
-        protocol.SYNC_COB_ID,
+        objects.SYNC_COB_ID,
         0,
         "COB-ID SYNC",
         False,
@@ -249,7 +245,7 @@ OPTIONAL: Final = (
         "0x080, which CiA 301 sets beforehand",
     ),
     Requirement(
-        protocol.SYNC_PERIOD_US,
+        objects.SYNC_PERIOD_US,
         0,
         "Communication cycle period",
         False,
@@ -259,7 +255,7 @@ OPTIONAL: Final = (
         Fit.EQUAL_OR_UNUSED,
     ),
     Requirement(
-        protocol.SYNC_WINDOW_US,
+        objects.SYNC_WINDOW_US,
         0,
         "Synchronous window length",
         False,
@@ -269,7 +265,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        protocol.SYNC_OVERFLOW,
+        objects.SYNC_OVERFLOW,
         0,
         "Synchronous counter overflow value",
         False,
@@ -279,7 +275,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        protocol.INTERPOLATION_TIME,
+        objects.INTERPOLATION_TIME,
         1,
         "Interpolation time period value",
         False,
@@ -288,7 +284,7 @@ OPTIONAL: Final = (
         "With 60C2:2 it has to be the period of rig.rate_hz.",
     ),
     Requirement(
-        protocol.INTERPOLATION_TIME,
+        objects.INTERPOLATION_TIME,
         2,
         "Interpolation time index",
         False,
@@ -298,7 +294,7 @@ OPTIONAL: Final = (
     ),
     # Who watches over whom.
     Requirement(
-        protocol.HEARTBEAT_CONSUMER,
+        objects.HEARTBEAT_CONSUMER,
         1,
         "Consumer heartbeat time",
         False,
@@ -309,15 +305,15 @@ OPTIONAL: Final = (
         accept=WATCHDOG,
     ),
     Requirement(
-        protocol.RPDO_COMMUNICATION,
-        protocol.EVENT_TIMER,
+        objects.RPDO_COMMUNICATION,
+        objects.EVENT_TIMER,
         "Event timer of RPDO1",
         False,
         _R | _W,
         "the heartbeat consumer (1016:1), which comes first",
     ),
     Requirement(
-        protocol.ABORT_OPTION,
+        objects.ABORT_OPTION,
         0,
         "Abort connection option code",
         False,
@@ -329,7 +325,7 @@ OPTIONAL: Final = (
         accept=ABORT_OPTION,
     ),
     Requirement(
-        protocol.COMMUNICATION_ERROR,
+        objects.COMMUNICATION_ERROR,
         1,
         "Error behaviour on communication error",
         False,
@@ -338,7 +334,7 @@ OPTIONAL: Final = (
         "It has to be cia402.communication_error_option.",
     ),
     Requirement(
-        protocol.HEARTBEAT_PRODUCER_MS,
+        objects.HEARTBEAT_PRODUCER_MS,
         0,
         "Producer heartbeat time",
         False,
@@ -347,7 +343,7 @@ OPTIONAL: Final = (
         "It has to be cia402.drive_heartbeat_period_s in milliseconds.",
     ),
     Requirement(
-        protocol.EMERGENCY_COB_ID,
+        objects.EMERGENCY_COB_ID,
         0,
         "COB-ID EMCY",
         False,
@@ -357,7 +353,7 @@ OPTIONAL: Final = (
     ),
     # Torque and speed.
     Requirement(
-        protocol.MAX_TORQUE,
+        objects.MAX_TORQUE,
         0,
         "Max torque",
         False,
@@ -381,13 +377,13 @@ OPTIONAL: Final = (
             Fit.AT_LEAST,
         )
         for index, name in zip(
-            protocol.TORQUE_LIMITS,
+            objects.TORQUE_LIMITS,
             ("Positive torque limit value", "Negative torque limit value"),
             strict=True,
         )
     ),
     Requirement(
-        protocol.TORQUE_OFFSET,
+        objects.TORQUE_OFFSET,
         0,
         "Torque offset",
         False,
@@ -397,7 +393,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        protocol.RATED_TORQUE,
+        objects.RATED_TORQUE,
         0,
         "Motor rated torque",
         False,
@@ -408,7 +404,7 @@ OPTIONAL: Final = (
         fit=Fit.ANY,
     ),
     Requirement(
-        protocol.ACTUAL_TORQUE,
+        objects.ACTUAL_TORQUE,
         0,
         "Torque actual value",
         False,
@@ -419,7 +415,7 @@ OPTIONAL: Final = (
         accept=TORQUE_FEEDBACK,
     ),
     Requirement(
-        protocol.MAX_SPEED_RPM,
+        objects.MAX_SPEED_RPM,
         0,
         "Max motor speed",
         False,
@@ -430,8 +426,8 @@ OPTIONAL: Final = (
     ),
     # What a drive may hold from before.
     Requirement(
-        protocol.TPDO_COMMUNICATION,
-        protocol.INHIBIT_TIME,
+        objects.TPDO_COMMUNICATION,
+        objects.INHIBIT_TIME,
         "Inhibit time of TPDO1",
         False,
         _R | _W,
@@ -440,7 +436,7 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        protocol.POLARITY,
+        objects.POLARITY,
         0,
         "Polarity",
         False,
@@ -451,10 +447,10 @@ OPTIONAL: Final = (
         zero=True,
     ),
     Requirement(
-        protocol.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
+        objects.QUICK_STOP_OPTION, 0, "Quick stop option code", False, _R, "–", fit=Fit.ANY
     ),
     Requirement(
-        protocol.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
+        objects.FAULT_REACTION_OPTION, 0, "Fault reaction option code", False, _R, "–", fit=Fit.ANY
     ),
 )
 """Objects that something else stands in for."""
@@ -462,13 +458,13 @@ OPTIONAL: Final = (
 REQUIREMENTS: Final = CORE + OPTIONAL
 
 MAY_BE_WRITE_ONLY: Final = (
-    protocol.MODE,
-    protocol.INTERPOLATION_TIME,
-    protocol.ABORT_OPTION,
-    protocol.COMMUNICATION_ERROR,
-    protocol.HEARTBEAT_PRODUCER_MS,
-    protocol.MAX_TORQUE,
-    protocol.MAX_SPEED_RPM,
+    objects.MODE,
+    objects.INTERPOLATION_TIME,
+    objects.ABORT_OPTION,
+    objects.COMMUNICATION_ERROR,
+    objects.HEARTBEAT_PRODUCER_MS,
+    objects.MAX_TORQUE,
+    objects.MAX_SPEED_RPM,
 )
 """Objects that are set whatever they held before, so that one that cannot be read is written and
 taken at its word. (6060 is write-only in the first editions of CiA 402; 6061 tells the mode.)"""
@@ -500,12 +496,12 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
     """
     return {
         **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},
-        (protocol.MODE, 0): protocol.CYCLIC_TORQUE,
-        (protocol.SYNC_COB_ID, 0): protocol.SYNC_ID,
-        (protocol.EMERGENCY_COB_ID, 0): 0x080 + node_id,
-        (protocol.TPDO_COMMUNICATION, 1): 0x180 + node_id,
-        (protocol.TPDO_COMMUNICATION, 2): protocol.AT_EVERY_SYNC,
-        (protocol.RPDO_COMMUNICATION, 1): 0x200 + node_id,
+        (objects.MODE, 0): objects.CYCLIC_TORQUE,
+        (objects.SYNC_COB_ID, 0): objects.SYNC_ID,
+        (objects.EMERGENCY_COB_ID, 0): 0x080 + node_id,
+        (objects.TPDO_COMMUNICATION, 1): 0x180 + node_id,
+        (objects.TPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC,
+        (objects.RPDO_COMMUNICATION, 1): 0x200 + node_id,
     }
 
 
@@ -531,20 +527,18 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     value, exponent = interpolation_time(rig.rate_hz)
     limit = torque_limit_per_mille(rig)
     wanted = fixed_values(settings.node_id) | {
-        (protocol.RPDO_COMMUNICATION, 2): protocol.AT_EVERY_SYNC
-        if at_sync
-        else protocol.ON_ARRIVAL,
-        (protocol.SYNC_PERIOD_US, 0): period_us,
-        (protocol.INTERPOLATION_TIME, 1): value,
-        (protocol.INTERPOLATION_TIME, 2): exponent,
-        (protocol.ABORT_OPTION, 0): settings.abort_option,
-        (protocol.COMMUNICATION_ERROR, 1): settings.communication_error_option,
-        (protocol.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
-        (protocol.MAX_TORQUE, 0): limit,
-        **{(index, 0): limit for index in protocol.TORQUE_LIMITS},
+        (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
+        (objects.SYNC_PERIOD_US, 0): period_us,
+        (objects.INTERPOLATION_TIME, 1): value,
+        (objects.INTERPOLATION_TIME, 2): exponent,
+        (objects.ABORT_OPTION, 0): settings.abort_option,
+        (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option,
+        (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
+        (objects.MAX_TORQUE, 0): limit,
+        **{(index, 0): limit for index in objects.TORQUE_LIMITS},
     }
     if settings.max_speed_rad_s > 0:
-        wanted[protocol.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
+        wanted[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
     return wanted
 
 

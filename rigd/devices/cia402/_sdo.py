@@ -26,7 +26,7 @@ from canopen.sdo.base import SdoVariable
 
 from rigd.devices import DeviceError, EdsError, read_eds
 from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _objects as objects
 from rigd.devices.cia402._assignments import Assignment
 from rigd.devices.cia402._protocol import NMT_PRE_OPERATIONAL
 
@@ -156,7 +156,7 @@ class SdoAccess:
         """
         self.tell_pre_operational()
         try:
-            self.read(protocol.IDENTITY, 1)
+            self.read(objects.IDENTITY, 1)
         except SdoRefusal:
             return
         except DeviceError as error:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from rigd.devices import DeviceError, RigParameters, ServoDrive
 from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _objects as objects
 from rigd.devices.cia402._assignments import parse_assignment
 from rigd.devices.cia402._requirements import (
     MAY_BE_WRITE_ONLY,
@@ -114,11 +114,9 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
         stands = work.configure_guards()
         work.configure_pdos(stands)
         work.look_at_the_rest(identity)
-        work.settle(requirement(protocol.MODE))
+        work.settle(requirement(objects.MODE))
         # Some drives show it only once they are enabled: it is looked at again then.
-        wait_for(
-            lambda: sdo.read(protocol.MODE_DISPLAY) == protocol.CYCLIC_TORQUE, _MODE_PATIENCE_S
-        )
+        wait_for(lambda: sdo.read(objects.MODE_DISPLAY) == objects.CYCLIC_TORQUE, _MODE_PATIENCE_S)
     return Outfit(
         identity,
         stands,
@@ -134,10 +132,10 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
 def _read_identity(sdo: SdoAccess) -> dict[str, object]:
     identity: dict[str, object] = {}
     for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
-        identity[key] = sdo.read_if_there(protocol.IDENTITY, sub)
-    identity["device_name"] = sdo.read_text(protocol.DEVICE_NAME)
-    identity["software_version"] = sdo.read_text(protocol.SOFTWARE_VERSION)
-    identity["supported_modes"] = sdo.read_if_there(protocol.SUPPORTED_MODES)
+        identity[key] = sdo.read_if_there(objects.IDENTITY, sub)
+    identity["device_name"] = sdo.read_text(objects.DEVICE_NAME)
+    identity["software_version"] = sdo.read_text(objects.SOFTWARE_VERSION)
+    identity["supported_modes"] = sdo.read_if_there(objects.SUPPORTED_MODES)
     return identity
 
 
@@ -159,7 +157,7 @@ def _check_identity(
                 "Check cia402.node_id, or write into the profile what is really there."
             )
     modes = identity["supported_modes"]
-    if not (isinstance(modes, int) and modes & protocol.SUPPORTS_CYCLIC_TORQUE):
+    if not (isinstance(modes, int) and modes & objects.SUPPORTS_CYCLIC_TORQUE):
         raise DeviceError(
             f"{name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
             f"{show_value(modes)}, bit 9 is not set); this drive or its firmware cannot be used."
@@ -254,9 +252,9 @@ class _SetUp:
     def check_torque(self, identity: dict[str, object], rig: RigParameters) -> None:
         """Compare the torque that 1000 per mille stand for with the profile's."""
         settings = self._settings
-        counts = self._sdo.read_if_there(protocol.RATED_TORQUE)
+        counts = self._sdo.read_if_there(objects.RATED_TORQUE)
         identity["rated_torque_counts"] = counts
-        row = requirement(protocol.RATED_TORQUE)
+        row = requirement(objects.RATED_TORQUE)
         if counts is None:
             self.lacks.append(row)
         if settings.rated_torque_unit_nm == 0:
@@ -277,18 +275,18 @@ class _SetUp:
 
     def configure_torque(self) -> None:
         """Have the drive exert what it is told: up to the limit, and nothing on top of it."""
-        self.settle(requirement(protocol.MAX_TORQUE))
-        for index in protocol.TORQUE_LIMITS:
+        self.settle(requirement(objects.MAX_TORQUE))
+        for index in objects.TORQUE_LIMITS:
             if self._sdo.read_if_there(index) is not None:
                 self.settle(requirement(index))
-        self._clear(requirement(protocol.TORQUE_OFFSET))
-        self._clear(requirement(protocol.POLARITY))
+        self._clear(requirement(objects.TORQUE_OFFSET))
+        self._clear(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
         """Have the drive not make the shaft ever faster, should nobody take a torque back."""
         if self._settings.max_speed_rad_s == 0:
             return
-        row = requirement(protocol.MAX_SPEED_RPM)
+        row = requirement(objects.MAX_SPEED_RPM)
         if not self.settle(row):
             raise DeviceError(
                 f"{self._name}: it has no object {row.place} ({row.name}). {row.sentence}"
@@ -297,19 +295,19 @@ class _SetUp:
     def configure_sync(self) -> None:
         """Have the drive go by a SYNC of this period, of no window and without a counter."""
         sdo = self._sdo
-        cob_id = sdo.read_if_there(protocol.SYNC_COB_ID)
-        row = requirement(protocol.SYNC_COB_ID)
-        if cob_id is not None and cob_id & ~protocol.PDO_DISABLED != self._wanted[row.index, 0]:
+        cob_id = sdo.read_if_there(objects.SYNC_COB_ID)
+        row = requirement(objects.SYNC_COB_ID)
+        if cob_id is not None and cob_id & ~objects.PDO_DISABLED != self._wanted[row.index, 0]:
             self.settle(row)
-        if sdo.read_if_there(protocol.SYNC_OVERFLOW):
+        if sdo.read_if_there(objects.SYNC_OVERFLOW):
             # It may be changed only while the period is 0 (CiA 301).
-            if sdo.read_if_there(protocol.SYNC_PERIOD_US):
-                self.settle(requirement(protocol.SYNC_PERIOD_US), 0)
-            self._clear(requirement(protocol.SYNC_OVERFLOW))
-        self._clear(requirement(protocol.SYNC_WINDOW_US))
-        self.settle(requirement(protocol.SYNC_PERIOD_US))
+            if sdo.read_if_there(objects.SYNC_PERIOD_US):
+                self.settle(requirement(objects.SYNC_PERIOD_US), 0)
+            self._clear(requirement(objects.SYNC_OVERFLOW))
+        self._clear(requirement(objects.SYNC_WINDOW_US))
+        self.settle(requirement(objects.SYNC_PERIOD_US))
         for sub in (1, 2):
-            self.settle(requirement(protocol.INTERPOLATION_TIME, sub))
+            self.settle(requirement(objects.INTERPOLATION_TIME, sub))
 
     def configure_guards(self) -> Watchdog:
         """Set what the drive does when this computer falls silent, and how it is heard itself.
@@ -320,28 +318,28 @@ class _SetUp:
             Which one stands.
         """
         settings, sdo = self._settings, self._sdo
-        deadline = requirement(protocol.RPDO_COMMUNICATION, protocol.EVENT_TIMER)
+        deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         heartbeat = self._configure_heartbeat_consumer()
         has_deadline = sdo.read_if_there(deadline.index, deadline.sub) is not None
         stands = watchdog(
             heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
-        row = requirement(protocol.HEARTBEAT_CONSUMER, 1)
+        row = requirement(objects.HEARTBEAT_CONSUMER, 1)
         if not heartbeat:
             self.lacks.append(row)
         if stands is Watchdog.NONE and not self._accepts(row):
             raise DeviceError(f"{self._name}: {row.missing()}")
         if stands in (Watchdog.HEARTBEAT, Watchdog.RPDO_DEADLINE):
             # The maker's own watchdog does what its maker says, whatever stands here.
-            self.settle(requirement(protocol.ABORT_OPTION))
-        row = requirement(protocol.COMMUNICATION_ERROR, 1)
+            self.settle(requirement(objects.ABORT_OPTION))
+        row = requirement(objects.COMMUNICATION_ERROR, 1)
         if not self.settle(row) and settings.communication_error_option:
             raise DeviceError(
                 f"{self._name}: it has no object {row.place} ({row.name}), so that it goes "
                 "pre-operational on a lost connection; set cia402.communication_error_option = 0."
             )
-        self.settle(requirement(protocol.HEARTBEAT_PRODUCER_MS))
-        row = requirement(protocol.EMERGENCY_COB_ID)
+        self.settle(requirement(objects.HEARTBEAT_PRODUCER_MS))
+        row = requirement(objects.EMERGENCY_COB_ID)
         if sdo.read_if_there(row.index) not in (None, self._wanted[row.index, 0]):
             self.settle(row)
         return stands
@@ -349,32 +347,32 @@ class _SetUp:
     def configure_pdos(self, stands: Watchdog) -> None:
         """Map one PDO each way and switch all others off."""
         settings, sdo = self._settings, self._sdo
-        for communication in (protocol.TPDO_COMMUNICATION, protocol.RPDO_COMMUNICATION):
+        for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
             _disable_others(sdo, communication)
-        entries: tuple[int, ...] = protocol.TPDO_ENTRIES
-        row = requirement(protocol.ACTUAL_TORQUE)
-        if sdo.read_if_there(protocol.ACTUAL_TORQUE) is None and self._accepts(row):
+        entries: tuple[int, ...] = objects.TPDO_ENTRIES
+        row = requirement(objects.ACTUAL_TORQUE)
+        if sdo.read_if_there(objects.ACTUAL_TORQUE) is None and self._accepts(row):
             self._do_without(row)
             entries = entries[:-1]
         self._configure_pdo(
-            protocol.TPDO_COMMUNICATION,
-            protocol.NO_REMOTE_REQUEST,
+            objects.TPDO_COMMUNICATION,
+            objects.NO_REMOTE_REQUEST,
             entries,
-            {protocol.INHIBIT_TIME: 0},
+            {objects.INHIBIT_TIME: 0},
         )
         deadline_ms = round(settings.heartbeat_timeout_s * 1000)
         self._configure_pdo(
-            protocol.RPDO_COMMUNICATION,
+            objects.RPDO_COMMUNICATION,
             0,
-            protocol.RPDO_ENTRIES,
-            {protocol.EVENT_TIMER: deadline_ms} if stands is Watchdog.RPDO_DEADLINE else {},
+            objects.RPDO_ENTRIES,
+            {objects.EVENT_TIMER: deadline_ms} if stands is Watchdog.RPDO_DEADLINE else {},
         )
 
     def look_at_the_rest(self, identity: dict[str, object]) -> None:
         """Report what is only read."""
         for key, index in (
-            ("quick_stop_option", protocol.QUICK_STOP_OPTION),
-            ("fault_reaction_option", protocol.FAULT_REACTION_OPTION),
+            ("quick_stop_option", objects.QUICK_STOP_OPTION),
+            ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
         ):
             value = self._sdo.read_if_there(index)
             if value is not None:
@@ -411,7 +409,7 @@ class _SetUp:
     def _configure_heartbeat_consumer(self) -> bool:
         """Have the drive watch over this computer's heartbeat; return whether it can."""
         settings, sdo = self._settings, self._sdo
-        index, host = protocol.HEARTBEAT_CONSUMER, settings.host_node_id
+        index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
         wanted = host << 16 | round(settings.heartbeat_timeout_s * 1000)
         found = sdo.read_if_there(index, 1)
         if found != wanted:
@@ -452,7 +450,7 @@ class _SetUp:
         sdo, mapping = self._sdo, communication + 0x200
         can_id = self._wanted[communication, 1] | flags
         transmission = self._wanted[communication, 2]
-        cob_id_bits = EVERY_BIT & ~protocol.NO_REMOTE_REQUEST
+        cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
         mapped = self._reads(mapping, (len(entries), *entries))
         typed = sdo.read_if_there(communication, 2) == transmission
         identified = sdo.read_if_there(communication, 1)
@@ -464,7 +462,7 @@ class _SetUp:
         right = identified is not None and not (identified ^ can_id) & cob_id_bits
         if right and mapped and typed and not others:
             return
-        sdo.configure(communication, 1, can_id | protocol.PDO_DISABLED, cob_id_bits)
+        sdo.configure(communication, 1, can_id | objects.PDO_DISABLED, cob_id_bits)
         if not mapped:
             self._map(communication, mapping, entries)
         if not typed:
@@ -475,7 +473,7 @@ class _SetUp:
 
     def _map(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
         sdo = self._sdo
-        what = "RPDO1" if communication == protocol.RPDO_COMMUNICATION else "TPDO1"
+        what = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
             sdo.configure(mapping, 0, 0)
         except SdoRefusal as refusal:
@@ -500,14 +498,14 @@ class _SetUp:
 
 def _disable_others(sdo: SdoAccess, communication: int) -> None:
     """Disable the PDOs that the rig does not use, as many as the drive has."""
-    for later in range(1, protocol.PDO_COUNT_AT_MOST):
+    for later in range(1, objects.PDO_COUNT_AT_MOST):
         cob_id = sdo.read_if_there(communication + later, 1)
         if cob_id is None:
             # Beyond those that CiA 301 sets beforehand there are no gaps.
-            if later >= protocol.PDO_COUNT:
+            if later >= objects.PDO_COUNT:
                 return
-        elif not cob_id & protocol.PDO_DISABLED:
-            sdo.configure(communication + later, 1, cob_id | protocol.PDO_DISABLED)
+        elif not cob_id & objects.PDO_DISABLED:
+            sdo.configure(communication + later, 1, cob_id | objects.PDO_DISABLED)
 
 
 def _words(refusal: SdoRefusal) -> str:

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 from rigd.devices import DeviceError, RigParameters
 from rigd.devices.canbus import CanPort
-from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _objects as objects
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
     FAULT_BIT,
@@ -64,7 +64,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
         sdo.to_pre_operational()
         with suppress(SdoRefusal):
             # Nobody sends a heartbeat now, whose absence would be the next fault.
-            sdo.write(protocol.HEARTBEAT_CONSUMER, 1, 0)
+            sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
         fault = _reset(sdo, name, patience_s) if _in_fault(sdo) else None
         _see_ready(sdo, name, patience_s, fault, f"rigd reset --profile {rig.name}")
@@ -75,7 +75,7 @@ def command_off(sdo: SdoAccess) -> None:
     """Send controlword 0 and do not care for the answer; never raises."""
     # An adapter's library may raise anything, and this is the way off.
     with suppress(Exception), sdo.hurried():
-        sdo.write(protocol.CONTROLWORD, 0, DISABLE_VOLTAGE)
+        sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
 def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
@@ -90,7 +90,7 @@ def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
     assert settings is not None
     ends = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
     wait_for(lambda: _state(sdo) in ends, settings.enable_timeout_s)
-    statusword = sdo.read(protocol.STATUSWORD)
+    statusword = sdo.read(objects.STATUSWORD)
     state = state_of(statusword)
     if state is DriveState.SWITCH_ON_DISABLED:
         return
@@ -109,7 +109,7 @@ def require_off(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
 def still_on(sdo: SdoAccess) -> str:
     """Return a sentence on a drive that was told to switch off and does not show it, or nothing."""
     try:
-        statusword = sdo.read(protocol.STATUSWORD)
+        statusword = sdo.read(objects.STATUSWORD)
     except DeviceError:
         return ""
     state = state_of(statusword)
@@ -154,7 +154,7 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
                     sdo.tell_pre_operational()
                     told = True
             with suppress(Exception):
-                statusword = sdo.read(protocol.STATUSWORD)
+                statusword = sdo.read(objects.STATUSWORD)
                 if state_of(statusword) in OFF:
                     return
             patience_s = _SILENT_S if statusword is None else _OFF_S
@@ -164,8 +164,8 @@ def _see_off(sdo: SdoAccess, name: str) -> None:
     if statusword is None:
         try:
             sdo.to_pre_operational()  # patiently, and it names what else is on the bus
-            sdo.write(protocol.CONTROLWORD, 0, DISABLE_VOLTAGE)
-            statusword = sdo.read(protocol.STATUSWORD)
+            sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
+            statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
             said = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
             raise DeviceError(
@@ -185,9 +185,9 @@ def _reset(sdo: SdoAccess, name: str, patience_s: float) -> str:
     """Reset the fault of a drive, and return what it was."""
     fault = _fault(sdo)
     for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
-        sdo.write(protocol.CONTROLWORD, 0, controlword)
+        sdo.write(objects.CONTROLWORD, 0, controlword)
     gone = wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
-    sdo.write(protocol.CONTROLWORD, 0, DISABLE_VOLTAGE)
+    sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
     if not gone:
         raise DeviceError(
             f"{name}: the fault cannot be reset: {_fault(sdo)}. It is in the state "
@@ -207,10 +207,10 @@ def _see_ready(
         If it does not: a session could not be started.
     """
     with suppress(SdoRefusal):
-        sdo.write(protocol.CONTROLWORD, 0, SHUTDOWN)
+        sdo.write(objects.CONTROLWORD, 0, SHUTDOWN)
     ready = wait_for(lambda: _state(sdo) is DriveState.READY, patience_s)
-    statusword = sdo.read(protocol.STATUSWORD)
-    sdo.write(protocol.CONTROLWORD, 0, DISABLE_VOLTAGE)
+    statusword = sdo.read(objects.STATUSWORD)
+    sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
     disabled = wait_for(lambda: _state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     if ready and disabled:
         return
@@ -235,17 +235,17 @@ def _see_ready(
 
 
 def _in_fault(sdo: SdoAccess) -> bool:
-    return bool(sdo.read(protocol.STATUSWORD) & FAULT_BIT)
+    return bool(sdo.read(objects.STATUSWORD) & FAULT_BIT)
 
 
 def _state(sdo: SdoAccess) -> DriveState:
-    return state_of(sdo.read(protocol.STATUSWORD))
+    return state_of(sdo.read(objects.STATUSWORD))
 
 
 def _fault(sdo: SdoAccess) -> str:
     """Return in words why the drive is in fault."""
     try:
-        code = sdo.read(protocol.ERROR_CODE)
+        code = sdo.read(objects.ERROR_CODE)
     except SdoRefusal:
         code = 0
     code = code or sdo.last_emergency()

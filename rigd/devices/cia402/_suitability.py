@@ -10,7 +10,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 from rigd.devices import Eds, EdsEntry
-from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _objects as objects
 from rigd.devices.cia402._requirements import (
     MAY_BE_WRITE_ONLY,
     REQUIREMENTS,
@@ -68,21 +68,21 @@ class Judgement:
 
 
 _PDO_ENTRIES: Final = {
-    protocol.RPDO_MAPPING: protocol.RPDO_ENTRIES,
-    protocol.TPDO_MAPPING: protocol.TPDO_ENTRIES,
+    objects.RPDO_MAPPING: objects.RPDO_ENTRIES,
+    objects.TPDO_MAPPING: objects.TPDO_ENTRIES,
 }
 _LENGTHS: Final = {
     entry >> 16: entry & 0xFF for entries in _PDO_ENTRIES.values() for entry in entries
 }
 """Bits that each mapped object has in its PDO."""
 _COB_IDS: Final = (
-    (protocol.SYNC_COB_ID, 0),
-    (protocol.EMERGENCY_COB_ID, 0),
-    (protocol.TPDO_COMMUNICATION, 1),
-    (protocol.RPDO_COMMUNICATION, 1),
+    (objects.SYNC_COB_ID, 0),
+    (objects.EMERGENCY_COB_ID, 0),
+    (objects.TPDO_COMMUNICATION, 1),
+    (objects.RPDO_COMMUNICATION, 1),
 )
 _NOT_SET_BY_RIGD: Final = (Watchdog.OWN, Watchdog.NONE)
-_TOLD_BEFORE: Final = (protocol.SUPPORTED_MODES, protocol.IDENTITY)
+_TOLD_BEFORE: Final = (objects.SUPPORTED_MODES, objects.IDENTITY)
 
 
 def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
@@ -154,17 +154,17 @@ class _Judge:
 
     def _torque_mode(self) -> Finding:
         what, wanted = (
-            f"{protocol.SUPPORTED_MODES:04X} Supported drive modes",
+            f"{objects.SUPPORTED_MODES:04X} Supported drive modes",
             "bit 9 (cyclic torque)",
         )
-        modes = self._eds.get(protocol.SUPPORTED_MODES)
-        place = f"object {protocol.SUPPORTED_MODES:04X}"
+        modes = self._eds.get(objects.SUPPORTED_MODES)
+        place = f"object {objects.SUPPORTED_MODES:04X}"
         if modes is None:
             sentence = f"No cyclic synchronous torque mode: {place} is missing."
             return Finding(what, "absent", wanted, Grade.REFUSED, sentence)
         if modes.default:
             shown = f"0x{modes.default:X}"
-            if modes.default & protocol.SUPPORTS_CYCLIC_TORQUE:
+            if modes.default & objects.SUPPORTS_CYCLIC_TORQUE:
                 return Finding(what, shown, wanted, Grade.FITS)
             sentence = (
                 f"No cyclic synchronous torque mode: {place} = {shown} lacks bit 9; this drive or "
@@ -181,11 +181,11 @@ class _Judge:
             return Finding(what, found.value, wanted, Grade.FITS)
         if found is not Watchdog.NONE:
             return Finding(what, f"1016:1 absent; {found.value}", wanted, Grade.STANDS_IN)
-        return self._to_accept(requirement(protocol.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
+        return self._to_accept(requirement(objects.HEARTBEAT_CONSUMER, 1), what, "absent", wanted)
 
     def _stands(self) -> Watchdog:
-        heartbeat = self._eds.get(protocol.HEARTBEAT_CONSUMER, 1)
-        deadline = self._eds.get(protocol.RPDO_COMMUNICATION, protocol.EVENT_TIMER)
+        heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
+        deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         return watchdog(
             heartbeat=heartbeat is not None and heartbeat.writable,
             rpdo_deadline=deadline is not None and deadline.writable,
@@ -196,7 +196,7 @@ class _Judge:
         what = f"{needed.place} {needed.name}"
         if needed.core:
             return Finding(what, "absent", "core", Grade.REFUSED, _sentence(needed.missing()))
-        if needed.index == protocol.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
+        if needed.index == objects.ABORT_OPTION and self._stands() in _NOT_SET_BY_RIGD:
             found = "absent; in its place: what the maker's own watchdog does"
             return Finding(what, found, "", Grade.STANDS_IN)
         if needed.accept:
@@ -225,9 +225,9 @@ class _Judge:
         if settings is None:
             return False
         return {
-            (protocol.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
-            (protocol.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
-            (protocol.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
+            (objects.MAX_SPEED_RPM, 0): settings.max_speed_rad_s > 0,
+            (objects.RATED_TORQUE, 0): settings.rated_torque_unit_nm > 0,
+            (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
         }.get((needed.index, needed.sub), False)
 
     def _present(self, needed: Requirement, entry: EdsEntry) -> Finding:
@@ -278,7 +278,7 @@ class _Judge:
             does = None
         elif (needed.index, needed.sub) in _COB_IDS:
             # Drives are free to set the bit that forbids remote requests.
-            does = (entry.default ^ wanted) & ~protocol.NO_REMOTE_REQUEST == 0
+            does = (entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
             mapping = needed.index + 0x200
             if does and mapping in _PDO_ENTRIES and self._mapped(mapping) != _PDO_ENTRIES[mapping]:
                 sentence = (
@@ -290,7 +290,7 @@ class _Judge:
             does = needed.fit.allows(entry.default, wanted)
         if does:
             return Finding(what, f"{found}: it does", asked, Grade.FITS)
-        if does is None and needed.index != protocol.CONTROLWORD:
+        if does is None and needed.index != objects.CONTROLWORD:
             return Finding(what, f"{found}: the drive will be asked", asked, Grade.ASK)
         sentence = (
             f"its object {needed.place} ({needed.name}) is read-only and does not hold what is "

@@ -8,9 +8,8 @@ from typing import Final
 
 from rigd.devices import DeviceError, wired_stop_dropped
 from rigd.devices.cia402._node import Node
+from rigd.devices.cia402._objects import CONTROLWORD, CYCLIC_TORQUE
 from rigd.devices.cia402._protocol import (
-    CONTROLWORD,
-    CYCLIC_TORQUE,
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     FOLLOWS_TARGET,

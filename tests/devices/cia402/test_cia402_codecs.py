@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import rigd.devices.cia402 as package
 from rigd.devices.canbus import unpack_frame
-from rigd.devices.cia402 import _protocol as protocol
+from rigd.devices.cia402 import _objects as objects
 from rigd.devices.cia402 import _protocol as states
 from rigd.devices.cia402._node import Inbox
 from rigd.devices.cia402._protocol import (
@@ -214,15 +214,15 @@ def test_the_shipped_dictionary_has_the_types_of_cia_301_and_402():
             assert dictionary.get_variable(index, sub).data_type == kind, f"{index:04X}:{sub}"
     named = {
         value
-        for key, value in vars(protocol).items()
+        for key, value in vars(objects).items()
         if key.isupper() and isinstance(value, int) and 0x1000 <= value <= 0x6FFF
     }
     assert named <= set(dictionary), "an object that set-up may need is not in the dictionary"
 
 
 def test_the_mapping_of_the_pdos():
-    assert protocol.TPDO_ENTRIES == (0x60410010, 0x60640020, 0x60770010)
-    assert protocol.RPDO_ENTRIES == (0x60400010, 0x60710010)
+    assert objects.TPDO_ENTRIES == (0x60410010, 0x60640020, 0x60770010)
+    assert objects.RPDO_ENTRIES == (0x60400010, 0x60710010)
 
 
 @settings(max_examples=300)

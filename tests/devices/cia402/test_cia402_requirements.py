@@ -66,10 +66,10 @@ def test_the_table_loads_no_library():
 
 
 def test_what_is_mapped_is_what_the_pdos_carry():
-    from rigd.devices.cia402 import _protocol as protocol
+    from rigd.devices.cia402 import _objects as objects
 
     sent = {each.index for each in REQUIREMENTS if Access.SENT in each.access}
     received = {each.index for each in REQUIREMENTS if Access.RECEIVED in each.access}
-    assert sent == {entry >> 16 for entry in protocol.TPDO_ENTRIES}
-    assert received == {entry >> 16 for entry in protocol.RPDO_ENTRIES}
+    assert sent == {entry >> 16 for entry in objects.TPDO_ENTRIES}
+    assert received == {entry >> 16 for entry in objects.RPDO_ENTRIES}
     assert requirement(0x6072).accept == "torque_limit"
