@@ -10,7 +10,7 @@ move the motor and once in the torque alone. For every estimator and parameter a
 
 both in standard deviations between sessions. The fits are those of the paper with 1/omega weights,
 beam and clamp being known. The motor (2e-3 kg m², a loop of 80 rad/s, one tick late) is that of
-tests/whole_record.
+tests/identify.
 """
 
 import argparse

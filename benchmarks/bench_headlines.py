@@ -42,7 +42,6 @@ from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import numpy as np
-from analysis.report.html import Subject
 from headline_scores import (
     Scored,
     Told,
@@ -75,6 +74,7 @@ from analysis.identify import BAND_HZ, Measurement, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.record import Record, load_record
 from analysis.report import document, loss_factors
+from analysis.results import Subject
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

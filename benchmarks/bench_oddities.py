@@ -36,7 +36,7 @@ TYPES = ("I", "II", "III", "IV", "V", "VI")
 EXTERNAL = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """External damping of the beams whose first peak is looked at, in parts of that of `DAMPING`."""
 
-PAPER_TABLE3 = Path(__file__).parents[1] / "analysis" / "campaigns" / "data" / "paper_table3.csv"
+PAPER_TABLE3 = Path(__file__).parents[1] / "analysis" / "report" / "data" / "paper_table3.csv"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-pytest_plugins = ["standstill"]
+pytest_plugins = ["paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions"]
 
 # Threads gain nothing on small matrices, and fight each other where tests run in parallel.
 os.environ.update(

@@ -5,9 +5,9 @@ import pytest
 import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
-from rigd.spectral.frf import CrossSpectra
 
 from rigd.spectral import SpectralError, segment_count, segment_lengths, welch_response
+from rigd.spectral._frf import CrossSpectra
 
 RATE_HZ = 200.0
 SETTINGS = {"segment_length": 600, "overlap": 90, "nfft": 1000}

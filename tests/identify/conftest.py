@@ -4,8 +4,10 @@ The torque is the exact beam's response to a chirp through a motor loop of 20 Hz
 and with zeros for three times as long again: another grid of s than the estimator's, and no band.
 """
 
+import importlib.util
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -172,3 +174,78 @@ def truth(name, beam=LINK, delay_s=0.0, tool_inertia_kg_m2=0.0):
 @pytest.fixture(scope="session")
 def true_parameters():
     return truth
+
+
+@pytest.fixture(scope="session")
+def link():
+    return LINK
+
+
+@cache
+def step(name, amplitude_rad, delay_s=0.0, rest_s=1.0, held_s=10.0):
+    """Step of the motor, held until the record ends."""
+    t = np.arange(round((rest_s + held_s) * RATE_HZ)) / RATE_HZ - rest_s
+    asked_rad = np.where(t >= 0, amplitude_rad, 0.0)
+    return response(asked_rad, PLANTS[name], LINK, delay_s, 0.0, ())
+
+
+@pytest.fixture(scope="session")
+def steps():
+    """Make a session with a step: see `step`."""
+    return step
+
+
+@cache
+def extra_torque(name, rise):
+    """What mode 1 of plant `name` (damping of order 1) adds when its stiffness rises by `rise`.
+
+    Runge and Kutta's method on the mode's equation of motion, in y = r + angle:
+    ``rho/EI y'' + gamma y' + k (r + zeta r' + rise r³ / R²) = 0``.
+    """
+    damping, beam, step = PLANTS[name], LINK, 1 / RATE_HZ
+    assert damping.alpha == damping.lambda_ == 1
+    angle_rad = session(name).angle_rad
+    n = angle_rad.size
+    spectrum = np.fft.rfft(angle_rad, 2 * n)
+    s = 2j * np.pi * np.fft.rfftfreq(2 * n, step)
+    angle, speed = (np.fft.irfft(2 * x, 4 * n)[: 2 * n].tolist() for x in (spectrum, s * spectrum))
+    k = float(clamped_free_eigenvalues(1)[0] / beam.length_m) ** 4
+    ratio, gamma, zeta = beam.density_over_stiffness, damping.gamma, damping.zeta
+
+    def run(cubic):
+        def force(y, v, i):
+            r = y - angle[i]
+            return k * (r + zeta * (v - speed[i]) + cubic * r * r * r)
+
+        forces, deflections, y, v = np.zeros(n), np.zeros(n), 0.0, 0.0
+        for i in range(n - 1):
+            forces[i], deflections[i] = force(y, v, 2 * i), y - angle[2 * i]
+            d1 = -(gamma * v + forces[i]) / ratio
+            v2 = v + step / 2 * d1
+            d2 = -(gamma * v2 + force(y + step / 2 * v, v2, 2 * i + 1)) / ratio
+            v3 = v + step / 2 * d2
+            d3 = -(gamma * v3 + force(y + step / 2 * v2, v3, 2 * i + 1)) / ratio
+            v4 = v + step * d3
+            d4 = -(gamma * v4 + force(y + step * v3, v4, 2 * i + 2)) / ratio
+            y += step / 6 * (v + 2 * v2 + 2 * v3 + v4)
+            v += step / 6 * (d1 + 2 * d2 + 2 * d3 + d4)
+        return forces, np.abs(deflections).max()
+
+    linear, largest = run(0.0)
+    share = float(participation(beam, 1)[0]) * beam.bending_stiffness_n_m2
+    return -share * (run(rise / largest**2)[0] - linear)
+
+
+@pytest.fixture(scope="session")
+def stiffening():
+    """Compute the torque that a stiffness rising with the deflection adds: see `extra_torque`."""
+    return extra_torque
+
+
+@pytest.fixture(scope="session")
+def brake():
+    """Drag by steps in time: see `brake.py`."""
+    spec = importlib.util.spec_from_file_location("brake", Path(__file__).with_name("brake.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

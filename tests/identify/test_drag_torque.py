@@ -1,8 +1,6 @@
 """Torque by drag of the air: against steps in time, its derivatives, and the published case."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,15 +17,6 @@ ROD_M = 2e-3
 AIR_M2_PER_S = 1.5e-5
 WHITE = DragLaw(ROD_M, 10 * ROD_M ** (1 / 3) * AIR_M2_PER_S ** (2 / 3))
 """``C_D = 1 + 10 Re^(-2/3)`` of a rod of 2 mm."""
-
-
-@pytest.fixture(scope="module")
-def brake():
-    path = Path(__file__).with_name("brake.py")
-    spec = importlib.util.spec_from_file_location("brake", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def swept(duration_s, stop_hz, amplitude_rad=0.025, rest_s=1.0, after_s=3.0):

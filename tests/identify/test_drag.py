@@ -1,8 +1,6 @@
 """Drag of the air: found where it is, with nothing false beside it; not looked for elsewhere."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -15,14 +13,10 @@ DRAG_M = 2.3e-3
 
 
 @pytest.fixture(scope="module")
-def braked(sessions, plants, link):
+def braked(sessions, plants, link, brake):
     """A session of type III in air, made by steps in time."""
-    path = Path(__file__).parents[1] / "whole_record" / "brake.py"
-    spec = importlib.util.spec_from_file_location("brake", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     still = sessions("III")
-    more = module.drag_torque(still.angle_rad, 1000.0, link, plants["III"], DRAG_M)
+    more = brake.drag_torque(still.angle_rad, 1000.0, link, plants["III"], DRAG_M)
     return replace(still, torque_nm=still.torque_nm + more)
 
 
