@@ -34,11 +34,11 @@ from analysis.identify import (
     RecordFit,
     Steps,
     Unknowns,
-    descend,
     fit_record,
     mode_poles,
 )
 from analysis.models import STRUCTURES
+from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, transfer
 
 RATE_HZ = 1000.0
