@@ -15,7 +15,7 @@ def printable(text: str, most: int | None = None) -> str:
     Parameters
     ----------
     text
-        Of a file, a device, or a path.
+        Text from a file, a device, or a path.
     most
         Characters of it that are shown; an ellipsis stands for the rest. All if it is not given.
     """

@@ -50,7 +50,7 @@ class DeflectionFilter:
     Parameters
     ----------
     beam, damping
-        Of the exact model.
+        Parameters of the exact model.
     rate_hz
         Samples of the angle a second.
     modes
@@ -87,7 +87,7 @@ class DeflectionFilter:
 
         ladder = _ladder(damping, rate_hz)
         step: Complex = np.exp(np.concatenate([pairs.ravel(), ladder]) / rate_hz)
-        # Of each mode (row), how much of each pole it has.
+        # Row per mode, column per pole: share of the pole in the mode.
         weights = np.zeros((z.size, step.size), dtype=np.complex128)
         for i, residues in enumerate(_residues(z, pairs, beam, damping)):
             weights[i, 2 * i : 2 * i + 2] = residues / rate_hz

@@ -1,4 +1,4 @@
-"""The peer: cyclictest of rt-tests, the least lateness a program can have on this computer."""
+"""Peer of the loop: cyclictest of rt-tests, the least latency of a program on this computer."""
 
 import os
 import re

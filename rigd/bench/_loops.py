@@ -46,7 +46,7 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
     profile
         Whose settings count.
     rate_hz
-        Of the loop.
+        Rate of the loop.
     spin_us
         Last part of each wait that is spent polling the clock.
     """

@@ -1,4 +1,4 @@
-"""What is measured, in which order, and how long it still takes."""
+"""Programme of the measurements: which, in which order, and the time left."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from rigd.engine import REFUSED
 from rigd.profile import Profile
 
 ROUNDS = 3
-"""Of loop and cyclictest in turn: the computer is not the same from one second to the next."""
+"""Rounds of loop and cyclictest in turn: the computer changes from one second to the next."""
 ALONE = "loop alone"
 RECORDED = "with recorder"
 SHOWN = "with recorder and live view"
@@ -36,7 +36,7 @@ class Results:
     spin_us: float
     granted: dict[str, str]
     load_average: tuple[float, float, float]
-    """Of this computer, before."""
+    """Load average of this computer before the measurements."""
     rounds: list[tuple[Measurement, Measurement | None]] = field(default_factory=list)
     """The loop alone, and cyclictest right after it."""
     sessions: list[Measurement] = field(default_factory=list)
@@ -92,9 +92,9 @@ class Bench:
     profile
         Its real-time settings count; nothing of its hardware is touched.
     rate_hz
-        Of the loop.
+        Rate of the loop.
     seconds
-        Of each measurement.
+        Duration of each measurement.
     spin_us
         Last part of each wait that is spent polling the clock.
     tell

@@ -1,4 +1,4 @@
-"""What a check finds: rows of one table, as text, and the verdict over all of them."""
+"""Rows of a check: what was found, the verdict over all of them, and their table as text."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ def _is_number(value: object) -> bool:
 
 
 class Verdict(Enum):
-    """Of one row."""
+    """Result of one row."""
 
     OK = "ok"
     WARNING = "warning"

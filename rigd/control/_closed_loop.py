@@ -50,7 +50,7 @@ near that mode. With the coupling torque fed forward a mode loses 0.0001 to 0.00
 """
 
 _LIGHT_DAMPING_RATIO = 1e-4
-"""Of the beam for that check: undamped, its realisation may itself be unstable by rounding."""
+"""Damping of the beam in that check: undamped, rounding may make its realisation unstable."""
 
 MAX_DELAY_PERIODS = 50
 """Longest delay that is modelled: every period of delay is one more state."""
@@ -97,7 +97,7 @@ class LoopResponse:
 class Cut:
     """A signal at which the loop can be opened: it is read from the state and acts on the next.
 
-    Of the closed loop's matrix, ``outer(action, reading)`` is the part that goes through it.
+    ``outer(action, reading)`` is the part of the closed loop's matrix that passes through the cut.
     """
 
     name: str

@@ -54,7 +54,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
     Parameters
     ----------
     path
-        Of the socket. The user's own folder is made if it can be, one for a group has to be there.
+        Path of the socket. The user's own folder is created; a group's folder has to exist.
     group
         Whose members may use it too.
 

@@ -1,4 +1,4 @@
-"""The daemon as its clients see it: one blocking connection, and a stop that does not give up."""
+"""Client of the daemon: one blocking connection, and a stop that does not give up."""
 
 import json
 import os
@@ -41,6 +41,9 @@ _UNKNOWN = (
 )
 
 
+# Connection
+
+
 class DaemonGoneError(Exception):
     """The daemon cannot be reached, or is gone; the message is for the operator.
 
@@ -75,7 +78,7 @@ class Client:
     Parameters
     ----------
     path
-        Of the socket.
+        Path of the socket.
     connect_s
         Time for a daemon that takes no connections, being suspended or beset by others.
     answer_s
@@ -84,7 +87,7 @@ class Client:
     Attributes
     ----------
     pid, uid
-        Of the process that listens there, as the kernel knows it.
+        Process and user that listen there, as the kernel reports them.
 
     Raises
     ------
@@ -254,13 +257,16 @@ def _refusal(message: Document) -> RefusedByDaemonError:
     return kind(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
 
 
+# Stop
+
+
 def stop_session(path: Path) -> Document:
     """Have a daemon stop what it runs; asks again and again, then sends its process a signal.
 
     Parameters
     ----------
     path
-        Of its socket.
+        Path of its socket.
 
     Returns
     -------
@@ -341,7 +347,7 @@ def what_is_left(pid: int, uid: int) -> str:
     Parameters
     ----------
     pid, uid
-        Of its process and user.
+        Process and user of the daemon.
     """
     deadline_s = time.monotonic() + _END_PATIENCE_S
     while True:
@@ -411,6 +417,9 @@ def _signal_stop(pid: int) -> bool:
             os.kill(pid, STOP_SIGNAL)
             return True
     return False
+
+
+# Running daemons
 
 
 def find_views(rig: str | None) -> list[LiveAddress]:

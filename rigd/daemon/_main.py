@@ -33,7 +33,7 @@ def run_daemon(
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     folder
         Where session files go.
     group

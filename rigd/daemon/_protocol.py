@@ -1,4 +1,4 @@
-"""Requests to the daemon: from a line of bytes to something that may be obeyed, or a refusal.
+"""Requests to the daemon: parsed from a line of bytes into a checked request, or refused.
 
 Whatever comes in is untrusted. A refusal names what is wrong; docs/control_socket.md has the rules.
 """

@@ -309,7 +309,7 @@ class _Client(asyncio.Protocol):
 
     @property
     def pid(self) -> int:
-        """Of its process."""
+        """Number of its process."""
         return self._peer.pid
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

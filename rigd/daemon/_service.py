@@ -81,7 +81,7 @@ _log = logging.getLogger(NAME)
 
 
 class RigControl(Protocol):
-    """What the daemon needs of :class:`rigd.runner._rig.Rig`."""
+    """What the daemon needs of :class:`rigd.runner.Rig`."""
 
     connected: bool
     zero_lost: bool
@@ -111,7 +111,7 @@ class RigControl(Protocol):
         """See whether all is well between sessions."""
 
     def status(self) -> RigStatus | None:
-        """Look at the board, from any thread."""
+        """Read the status from shared memory, from any thread."""
 
     def disconnect(self) -> None:
         """Close everything."""
@@ -168,7 +168,7 @@ class Service:
     rig
         To own; not connected yet.
     profile
-        Of the rig.
+        Profile of the rig.
     folder
         Where session files go.
     worker
@@ -331,7 +331,7 @@ class Service:
         return {"stopping": True}
 
     def look(self) -> None:
-        """Take a look at the board, and tell of the progress."""
+        """Read the rig's status, and publish the progress."""
         self._look = look = self._rig.status()
         if look is None:
             self._written.clear()

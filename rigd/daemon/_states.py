@@ -1,4 +1,4 @@
-"""The states of the daemon, what leads from one to another, and what is told of them as JSON."""
+"""States of the daemon, their transitions, and the daemon's status as JSON documents."""
 
 import os
 import pwd
@@ -140,6 +140,8 @@ class StateMachine:
         )
 
 
+# Documents
+
 Document = dict[str, Any]
 
 
@@ -159,7 +161,7 @@ class Peer:
     """A client, as the kernel knows it."""
 
     number: int
-    """Of its connection."""
+    """Number of its connection."""
     pid: int
     uid: int
 
@@ -203,7 +205,7 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
     Parameters
     ----------
     look
-        At the board.
+        Status of the rig.
     rates
         Measured records a second, by topic.
     """
@@ -262,7 +264,7 @@ def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Doc
     Parameters
     ----------
     look
-        At the board.
+        Status of the rig.
     total
         Ticks of the record.
     rate_hz

@@ -1,4 +1,4 @@
-"""Where a running ``rigd simulate`` is found: one small file for each simulated rig.
+"""Address of a running ``rigd simulate``: one small file for each simulated rig.
 
 The simulated rig stands in for the hardware of one profile. Whoever opens that profile's devices
 looks here first, so that a motor never moves where a simulation was meant.

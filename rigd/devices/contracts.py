@@ -46,9 +46,9 @@ class LineHealth:
     Attributes
     ----------
     bits
-        Of all frames sent and received, without those that are stuffed in between.
+        Bits of all frames sent and received, without stuff bits.
     bit_rate_bit_s
-        Of the line.
+        Bit rate of the line.
     errors
         Disturbed, damaged and missing messages.
     status
@@ -139,7 +139,7 @@ class WrenchSensor(Protocol):
     wrench_stale: bool
     """The last wrench read is not the answer to the last request."""
     wrench_time_ns: int
-    """When the last wrench read was asked for, or arrived if it is streamed; likewise."""
+    """When the last wrench read was asked for, or arrived if it is streamed; as for the angle."""
     wrench_saturated: bool
     """An axis of the last wrench is at the end of its range."""
 

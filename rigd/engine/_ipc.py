@@ -1,16 +1,13 @@
 """The processes of a rig: their table, how they are started, and the messages to and from them.
 
-How a supervisor talks to the processes it starts: a few JSON lines each way.
+One table, `PROCESSES`, says how each process is started, watched, and ended. Every process counts
+up its word on the `Board` several times a second. A dead process is noticed at once, a hung one by
+its heartbeat; the table says what happens then.
 
 A child is ``python -m MODULE``. Its standard input brings its job and then messages, a JSON line
 each; a line that announces a pickled object is followed by its bytes. The end of standard input
 means that the supervisor is gone. Its standard output brings JSON lines, few and short, so that
 they fit into a pipe's buffer and no child ever waits for its supervisor.
-
-The processes of a rig: one table, by which they are started, watched, and ended.
-
-Every process beats: it counts up a word of the board several times a second. A dead process is
-noticed at once, a hung one by its beats; what then happens stands here.
 """
 
 import contextlib
@@ -37,6 +34,9 @@ _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
 _KILLED_GRACE_S = 2.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+# Messages
 
 Message = dict[str, Any]
 
@@ -304,6 +304,9 @@ def _go_on_when_orphaned() -> None:
     """
     with contextlib.suppress(AttributeError):  # Linux has it, others do without
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+
+
+# Table of processes
 
 
 @dataclass(frozen=True, slots=True)

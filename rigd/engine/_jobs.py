@@ -1,4 +1,4 @@
-"""What the processes of a rig are told: at their start, and for each session."""
+"""Jobs of a rig's processes: what each is told at its start, and for each session."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The way of a tick's results to the recorder, the live view and the status."""
+"""Publishing of a tick's results: to the status (`Display`), and to recorder and live view."""
 
 import time
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from rigd.session import Status, pack_control_into, pack_sample_into, pack_timin
 
 
 class Display:
-    """Writes the board's words of the control process, some times a second.
+    """Writes the control process's words on the board several times a second.
 
     Parameters
     ----------
     board
         Where.
     devices
-        Of whose lines it tells.
+        Devices whose line health it reports.
 
     Attributes
     ----------
@@ -80,6 +80,8 @@ class Display:
         self._before = now_ns, bits
 
 
+# Samples of a record
+
 _AFTER_MISSED = int(Status.AFTER_MISSED)
 _AFTER_LOST = int(Status.AFTER_LOST)
 _LATE = int(Status.LATE)
@@ -96,7 +98,7 @@ _ROOM_POLL_S = 0.0002
 class Counts:
     """The bookkeeping of a record: scheduled = recorded + missed + lost.
 
-    Of what was recorded, `late` ticks woke late, and `stale_angles` and `stale_wrenches` hold a
+    Of the recorded ticks, `late` woke late, and `stale_angles` and `stale_wrenches` hold a
     reading that is not of their own tick.
     """
 

@@ -52,7 +52,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
         The one core to run on; -1 for the last isolated one, or where none is isolated the last one
         this process may use.
     root
-        Of the file system.
+        Root of the file system.
 
     Returns
     -------
@@ -86,7 +86,7 @@ class Precedence:
     loop_cpu
         ``realtime.cpu``, which says where the loop runs.
     root
-        Of the file system.
+        Root of the file system.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
     cpu
         As given to :func:`obtain`. One that is named is chosen whether it may be used or not.
     root
-        Of the file system.
+        Root of the file system.
     """
     if cpu >= 0:
         return cpu, False

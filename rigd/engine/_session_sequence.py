@@ -26,7 +26,7 @@ _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002
 _GO_PATIENCE_S = 10.0
 _SUPERVISOR_PATIENCE_S = 2.0
-"""Of time that this process has run itself: a computer that stands still is nobody's fault."""
+"""Counts the time that this process has run itself: a stalled computer is no supervisor's fault."""
 _OF_MOTION = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
 _AGAINST_TORQUE = (
     "The shaft gets faster against the torque: angle and torque do not count in the same sense. "

@@ -1,19 +1,16 @@
-"""What the processes of a rig share: words, topics, events, and the memory of them all.
+"""Shared state of a rig's processes: words, events and topics, and the memory that holds them.
 
-The board: a few shared words by which processes tell each other where they are.
-
-Every word has one writer. Reading or writing one takes a fraction of a microsecond and never
-blocks, which is why the control loop may do so.
-
-What the control process has to say, as fixed-size records in a ring of their own.
-
-The loop must not wait for anybody who listens, so it writes to shared memory instead of a pipe;
-the recorder puts every event into the file, the supervisor shows it to the operator.
-
-What the control process publishes: one table, from which everything that carries it works.
-
-The shared memory is laid out from it, the recorder logs by it, and ``rigd status`` compares what
-comes with what is expected.
+Words
+    `Board` holds a few words by which processes tell each other where they are. Each word has one
+    writer. Access takes a fraction of a microsecond and never blocks, so the control loop may use
+    them.
+Events
+    What the control process has to say, as fixed-size records in a ring of their own. The loop must
+    not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
+    event into the file, the supervisor shows it to the operator.
+Topics
+    What the control process publishes: one table, `TOPICS`, from which the shared memory is laid
+    out, by which the recorder logs, and with which ``rigd status`` compares the rates it sees.
 """
 
 import contextlib
@@ -29,9 +26,11 @@ from rigd.engine._ring import Ring, RingSpec, reserve
 from rigd.safety import BUFFERED_S
 from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
+# Words
+
 
 class Phase(IntEnum):
-    """Where the control process is."""
+    """What the control process is doing."""
 
     PREPARING = 0
     """Connecting the devices."""
@@ -69,7 +68,7 @@ class Stop(IntEnum):
 
 
 class Word(IntEnum):
-    """The words of the board."""
+    """Index of each word of the :class:`Board`."""
 
     # Written by the supervisor
     STOP = 0
@@ -89,15 +88,15 @@ class Word(IntEnum):
     TORQUE_COMMAND_NNM = 11
     CONTROL_BEAT = 12
     BUS_LOAD_PPM = 17
-    """Of the busiest line, as measured, or UNKNOWN. Likewise:"""
+    """Measured load of the busiest line, or UNKNOWN."""
     BUS_ERRORS = 18
-    """On all lines, since the devices were connected."""
+    """Errors on all lines since the devices were connected, or UNKNOWN."""
     SENSOR_STATUS = 19
-    """Status word; 0: all is well."""
+    """Status word, 0: no fault; or UNKNOWN."""
     # Written by the recorder
     RECORDER_BEAT = 13
     DISK_FREE_MB = 14
-    """Of the disk that the session goes to, in 10⁶ bytes, at least 1; 0: not known yet."""
+    """Free space on the disk of the session file, in 10⁶ bytes, at least 1; 0: not known yet."""
     # Written by the live publisher
     LIVE_DROPPED = 15
     LIVE_BEAT = 16
@@ -105,12 +104,13 @@ class Word(IntEnum):
     """Samples up to this one of the ring have been shown, or counted as dropped."""
     # Written by the control process
     STALE_ANGLES = 21
-    """Recorded ticks whose angle is an old one; likewise:"""
+    """Recorded ticks with a stale angle."""
     STALE_WRENCHES = 22
+    """Recorded ticks with a stale wrench."""
 
 
 UNKNOWN = -1
-"""Of a line that there is not, or that does not tell."""
+"""Value for a line that does not exist, or does not report."""
 
 
 class Board:
@@ -152,6 +152,8 @@ class Board:
             self._memory.close()
 
 
+# Events
+
 Level = Literal["debug", "info", "warning", "error", "fatal"]
 LEVELS: tuple[Level, ...] = ("debug", "info", "warning", "error", "fatal")
 
@@ -191,6 +193,8 @@ def read_events(block: bytes) -> list[Event]:
         events.append(Event(t_ns, LEVELS[level], text))
     return events
 
+
+# Topics
 
 HURRIED_BUFFERED_S = 160.0
 """What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
@@ -233,8 +237,10 @@ TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
 """The samples last: what explains a sample is in the file no later than the sample."""
 
 
+# Memory of a rig
+
 DESCRIPTORS = len(TOPICS) + 2
-"""Of shared memory, for :func:`create_channels`."""
+"""File descriptors of shared memory, for :func:`create_channels`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,13 +248,13 @@ class ChannelSpecs:
     """What a child process needs to attach."""
 
     rings: tuple[RingSpec, ...]
-    """In the order of :data:`rigd.engine._shared_state.TOPICS`."""
+    """In the order of :data:`TOPICS`."""
     board_fd: int
 
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The rings, in the order of :data:`rigd.engine._shared_state.TOPICS`, and the board."""
+    """The rings, in the order of :data:`TOPICS`, and the board."""
 
     events: Ring
     controls: Ring

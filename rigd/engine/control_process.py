@@ -1,7 +1,7 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on.
 
 It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
-the supervisor orders, one after the other. A device that fails ends it: connecting anew is the
+the supervisor requests, one after the other. A device that fails ends it: connecting anew is the
 operator's decision.
 """
 
@@ -78,7 +78,7 @@ def attend(
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     devices
         Not yet connected.
     clock, channels, parent, stop
@@ -164,7 +164,7 @@ class _Attendance:
                 self._read_at_rest()
 
     def serve(self) -> None:
-        """Do what the supervisor orders, until it is gone or a stop is asked for between sessions.
+        """Serve the supervisor until it is gone, or a stop is asked for between sessions.
 
         Raises
         ------

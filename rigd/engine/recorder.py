@@ -1,4 +1,4 @@
-"""The recorder process: ring → session file.
+"""The recorder process: from the rings to the session file.
 
 It opens the file before anything moves, takes what the loop publishes as fast as the disk lets
 it, and closes the file with the outcome. If the supervisor dies it waits until the loop has
@@ -123,7 +123,7 @@ class Recorder:
     channels
         Attached.
     writer
-        Of the file, not yet begun.
+        Writer of the file, not yet begun.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""From recorded sessions to the windows that are fitted."""
+"""Windows of motion from recorded sessions, as the estimate takes them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

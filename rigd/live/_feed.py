@@ -1,4 +1,4 @@
-"""The way from the publisher to the viewers, which never blocks and heals by itself.
+"""Connection from the publisher to the Rerun server, which never blocks and restores itself.
 
 With its server absent or frozen the SDK first buffers without telling, and then blocks for ever.
 Therefore whatever is sent is flushed with a time limit, and nothing more is handed to the SDK until

@@ -1,23 +1,19 @@
 """What viewers connect to: a Rerun server, the page for browsers, and the file that tells of both.
 
-Where the live view of a rig is found: one small file for each, as long as there is one.
-
-It stands in the user's runtime folder. What a killed process left is told by its process, which is
-not there any more.
-
-The web viewer's page, on loopback, as Rerun brings it, but kept from reaching beyond.
-
-As it is, the page loads fonts and sends usage statistics to the internet, from the operator's
-browser. Therefore it is passed on from here, with a policy that browsers enforce: it may load from
-this computer, and from nowhere else. A few lines are added by which it is loaded again when a
-server was replaced: viewers do not connect a second time by themselves.
-
-What viewers connect to: a Rerun server, the page for browsers, and the file that tells of both.
-
-The server takes what the publisher sends, and passes it on to any number of viewers. It is a
-process of its own because a viewer that is slow or frozen then holds nobody up, and because the
-SDK's own server listens on every interface. Viewers connect to it without any authentication, so it
-must never be reachable from another machine.
+Server
+    It takes what the publisher sends, and passes it on to any number of viewers. It is a process of
+    its own because a viewer that is slow or frozen then holds nobody up, and because the SDK's own
+    server listens on every interface. Viewers connect to it without any authentication, so it must
+    never be reachable from another machine.
+Page
+    The web viewer's page on loopback, as Rerun brings it, but confined to this computer. Unchanged,
+    it loads fonts and sends usage statistics to the internet, from the operator's browser.
+    Therefore it is passed on from here, with a policy that browsers enforce: it may load from this
+    computer, and from nowhere else. A few lines are added by which it is loaded again when a server
+    was replaced: viewers do not connect a second time by themselves.
+Address
+    One small file for each live view in the user's runtime folder, as long as there is one. A file
+    that a killed process left is recognised by that process being gone.
 """
 
 import collections
@@ -45,6 +41,8 @@ from typing import Any, Final, Self
 
 from rigd.runtime import runtime_folder
 from rigd.view import without_settings
+
+# Rerun's program
 
 LOOPBACK: Final = "127.0.0.1"
 
@@ -80,7 +78,7 @@ class RerunProgram:
     Parameters
     ----------
     options
-        Of its command line.
+        Options of its command line.
     environment
         What it is to find there beside this process's own.
 
@@ -175,6 +173,8 @@ def _die_with_parent() -> None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
+# Addresses
+
 _PREFIX: Final = "live-"
 _SUFFIX: Final = ".json"
 _MOST_BYTES: Final = 4096
@@ -189,7 +189,7 @@ class LiveAddress:
     rig
         The profile's name.
     pid
-        Of the publisher.
+        Process of the publisher.
     born
         When that process was started, in clock ticks since the computer was: no other process has
         both numbers.
@@ -322,6 +322,8 @@ def _born(pid: int) -> int | None:
     state, *rest = text.rpartition(")")[2].split()  # the name before may hold anything
     return None if state in "ZX" else int(rest[18])
 
+
+# Page for browsers
 
 PAGE_PORT: Final = 9090
 """Rerun's own, as long as nobody else has it."""
@@ -568,12 +570,14 @@ def kept_here(page: str) -> str:
     return _REMOTE_LINK.sub("", page).replace("</body>", f"{_AGAIN}</body>", 1)
 
 
+# Server of a rig
+
 GRPC_PORT: Final = 9876
 """Rerun's own: where viewers look unless told otherwise, and tunnels can be laid in advance."""
 _BACKLOG: Final = "16MiB"
 """What a viewer that joins late is sent first: some 80 s."""
 _MOST_SESSIONS: Final = 20
-"""Of some 300 kB each that stay, layout and charts; then another server takes its place."""
+"""Each leaves some 300 kB of layout and charts in the server; then another takes its place."""
 _START_S: Final = 15.0
 """In which a server has to take connections, on a computer that is busy."""
 _ANSWER_S: Final = 0.1
@@ -592,7 +596,7 @@ class Outlet:
     Attributes
     ----------
     address
-        Of the server that takes connections now; None: there is none at the moment.
+        Address of the server that accepts connections now; None while there is none.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Rerun's native viewer: a window on a live view, or on a file."""
+"""Rerun's native viewer: a window on a live view, or on a file; and the page for a file."""
 
 import contextlib
 import threading
@@ -22,6 +22,9 @@ _MOST_MEMORY: Final = "4GiB"
 _START_S: Final = 30.0
 """In which a server has to take connections."""
 _LOOK_S: Final = 0.05
+
+
+# File in a window or a browser
 
 
 class _Playback:
@@ -65,7 +68,7 @@ class Window(_Playback):
     Parameters
     ----------
     path
-        Of the recording.
+        Path of the recording.
     scratch
         Folder in which Rerun may leave files: it does when it is ended.
     options
@@ -96,7 +99,7 @@ class PageOfFile(_Playback):
     Parameters
     ----------
     path
-        Of the recording.
+        Path of the recording.
     scratch
         Folder in which Rerun may leave files.
 
@@ -156,6 +159,8 @@ class PageOfFile(_Playback):
             time.sleep(_LOOK_S)
 
 
+# Window on a live view
+
 _WINDOW_MEMORY: Final = "2GiB"
 """Then the oldest is forgotten; the same computer may be running the loop."""
 _ANSWER_S: Final = 5.0
@@ -170,7 +175,7 @@ class Viewer:
     Parameters
     ----------
     address
-        Of the live view that is shown first.
+        Address of the live view that is shown first.
     scratch
         Folder in which Rerun may leave files: it does when it is ended.
     options

@@ -73,7 +73,7 @@ class Draft:
     eds
         What the drive's file tells.
     path
-        Of the file that is to be written.
+        Path of the file to write.
 
     Raises
     ------

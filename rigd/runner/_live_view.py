@@ -173,7 +173,7 @@ class LiveView:
 
 
 def subject_of(order: Order) -> Subject:
-    """Return what the picture of a session is of."""
+    """Return what the live view needs to know of a session."""
     rig = order.profile.rig
     return Subject(
         name=order.path.stem,

@@ -34,7 +34,7 @@ class Prediction:
     peak_tracking_error_rad: float
     peak_coupling_torque_nm: float
     tip: TipMotion | None = None
-    """Of the beam's free end in a vacuum; None without a beam, or where it does not matter."""
+    """Motion of the beam's free end in a vacuum; None without a beam, or where it is irrelevant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Foresight:
     Parameters
     ----------
     profile
-        Of the rig. Its loop is closed when it is first asked for.
+        Profile of the rig. Its closed loop is computed when first needed.
     """
 
     def __init__(self, profile: Profile) -> None:

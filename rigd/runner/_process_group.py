@@ -1,4 +1,4 @@
-"""The processes of a rig, and the memory they share.
+"""Process group of a rig: control, recorder and live publisher, and the memory they share.
 
 This module is quick to import, so that the processes can be started before anything else: they
 import what they need while the supervisor reads the profile and plans.

@@ -1,8 +1,7 @@
-"""A session as asked for: rig, excitation, file and room for it, and the file's metadata.
+"""Session request: rig, excitation, file and room for it, and the file's metadata.
 
-From what the operator asks for to a session that can be run: rig, file, and room for it.
-
-Shared by sessions in the foreground and by the daemon.
+These are the steps from what the operator asks for to a session that can be run. Sessions in the
+foreground and those of the daemon share them.
 """
 
 import json
@@ -61,11 +60,11 @@ def load_rig(
     Parameters
     ----------
     name
-        Of the profile, or its file.
+        Name of the profile, or its file.
     fast
         Not in real time.
     seed
-        Of a simulated rig's noise; None leaves the profile's.
+        Seed of a simulated rig's noise; None keeps the profile's.
     hardware
         The operator says that the hardware is to move.
 

@@ -47,7 +47,7 @@ class Rig:
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     fast
         Under the virtual clock.
     live
@@ -254,7 +254,7 @@ class Rig:
             raise RigError(message.get("ended") or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
-        """Return a look at the board, from any thread; None while there is none."""
+        """Return the status from shared memory, from any thread; None while there is none."""
         with self._looking:
             crew, view = self._crew, self._view
             if crew is None or not crew.laid_out:
@@ -338,7 +338,7 @@ class Rig:
 
 
 def _wipe(board: Board) -> None:
-    """Take from the board what is said to or of one session."""
+    """Clear the words of the board that belong to one session."""
     board[Word.STOP] = Stop.NO
     board[Word.GO] = 0
     board[Word.LIVE_DROPPED] = 0

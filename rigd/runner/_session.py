@@ -64,7 +64,7 @@ class SessionFailedError(Exception):
     kept
         Where its record was saved, if that is not the ``.part`` of the file.
     counts
-        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``,
+        Counts of ticks, as far as known: ``scheduled``, ``missed``, ``late``,
         ``stale_angles``, ``stale_wrenches``.
     """
 
@@ -111,14 +111,14 @@ class SessionResult:
     reason: str
     scheduled: int
     recorded: int | None
-    """None: not known before the file is recovered; likewise `lost`."""
+    """None, as `lost`, where it is not known before the file is recovered."""
     missed: int
     late: int
     lost: int | None
     fault: bool
     """Something failed, in the record or after it, whatever was asked for meanwhile."""
     stale_angles: int = 0
-    """Recorded ticks whose angle is an old one; likewise `stale_wrenches`."""
+    """Recorded ticks with a stale angle; `stale_wrenches` counts stale wrenches."""
     stale_wrenches: int = 0
     live_dropped: int = 0
     """Samples that the live view did not get."""
@@ -361,7 +361,7 @@ class Session:
         return self._as_finished(reason)
 
     def _as_finished(self, reason: str) -> Message:
-        """Say what the control process would have said, as far as the board tells."""
+        """Make up the control process's result from its words on the board."""
         counts = self._counts()
         whole = counts["scheduled"] == self._order.excitation.reference_rad.size
         return {

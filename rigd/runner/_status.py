@@ -1,4 +1,4 @@
-"""What the shared memory tells of a rig and of a record that grows."""
+"""Status of a rig and of a growing record, read from shared memory."""
 
 import os
 import time
@@ -16,7 +16,7 @@ from rigd.runner._process_group import Crew
 from rigd.session import decode_samples
 
 _WINDOW_S: Final = 1.0
-"""Of samples by which lateness and rate are told."""
+"""Window of samples from which lateness and rate are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,15 +26,19 @@ class SignalStatus:
     rate_hz: float
     """Ticks a second over the last second, without those that were missed."""
     lateness_p50_us: float
-    """Over the last second; likewise:"""
+    """Wake-up latency over the last second: median."""
     lateness_p99_us: float
+    """Wake-up latency over the last second: 99th percentile."""
     work_p99_us: float
+    """Execution time of a tick over the last second: 99th percentile."""
     tracking_error_rad: float
     """Reference less angle, now."""
     peak_tracking_error_rad: float
-    """Largest magnitude since the record began; likewise:"""
+    """Largest magnitude since the record began."""
     peak_coupling_torque_nm: float
+    """Largest magnitude since the record began."""
     peak_torque_command_nm: float
+    """Largest magnitude since the record began."""
 
 
 class SignalWatch:
@@ -43,7 +47,7 @@ class SignalWatch:
     Parameters
     ----------
     rate_hz
-        Of the rig.
+        Rate of the rig.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -128,7 +132,7 @@ class TopicStatus:
 
 @dataclass(frozen=True, slots=True)
 class RigStatus:
-    """A look at the board."""
+    """Status of the rig, as read from shared memory."""
 
     phase: Phase
     angle_rad: float
@@ -140,14 +144,17 @@ class RigStatus:
     late: int
     lost: int
     bus_load_percent: float | None
-    """Of the busiest line; None where there is none. Likewise:"""
+    """Load of the busiest line; None where there is none."""
     bus_errors: int | None
+    """Errors on all lines; None where they are not known."""
     sensor_status: int | None
+    """Status word of the sensor; None where it is not known."""
     disk_free_mb: int | None
+    """Free space on the disk of the session file; None before it is known."""
     view_dropped: int
     """Samples that the live view did not get."""
     signals: SignalStatus | None
-    """Of the record; None before its first sample."""
+    """Figures of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
     topics: tuple[TopicStatus, ...]
     live_view: LiveAddress | None = None
@@ -160,7 +167,7 @@ class StatusWatch:
     Parameters
     ----------
     rate_hz
-        Of the rig.
+        Rate of the rig.
     """
 
     def __init__(self, rate_hz: float) -> None:

@@ -109,6 +109,9 @@ def _others(fd: int, said: str) -> str:
     return found
 
 
+# One program at a time on a rig
+
+
 class RigBusyError(Exception):
     """Another program runs the rig; the message says which."""
 

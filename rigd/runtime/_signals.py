@@ -1,11 +1,10 @@
 r"""Signals that ask for an end, and what each process makes of them.
 
-Signals that ask for an end: what each process makes of them.
-
 Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal reach every process in it; a service manager
-sends SIGTERM to all at once. To the supervisor and to the control process each of them means: stop
-safely. (A suspended control process would leave its last torque on.) The recorder and the live
-publisher let them pass: they end when the supervisor has no more use for them.
+sends SIGTERM to all at once. A command ends by an exception (`raise_on`). To the supervisor and to
+the control process each of the signals means: stop safely (`StopRequest`); a suspended control
+process would leave its last torque on. The recorder and the live publisher let them pass
+(`ignore`): they end when the supervisor has no more use for them.
 """
 
 import signal
@@ -66,6 +65,8 @@ def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
     signal.setitimer(signal.ITIMER_REAL, _REPEAT_S)
 
+
+# In the processes of a rig
 
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 

@@ -212,11 +212,11 @@ class _Shown:
         return shown
 
     def texts(self, values: Mapping[str, str]) -> dict[str, str]:
-        """Return the first entries, values cut likewise."""
+        """Return the first entries, with long values cut."""
         return self.mapping({key: _cut(value, _LONGEST_TEXT) for key, value in values.items()})
 
     def events(self, events: Sequence[Event], unread: int) -> list[Event]:
-        """Return the first events, likewise; `unread` more are in the file."""
+        """Return the first events, with long texts cut; `unread` more are in the file."""
         shown: list[Event] = []
         for event in events:
             short = replace(

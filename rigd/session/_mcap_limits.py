@@ -1,8 +1,8 @@
-"""What an MCAP file may take of memory and time, and the unpacking of its chunks within that.
+"""Limits on memory and time for reading an MCAP file, and the unpacking of its chunks.
 
-However few bytes unpack to however many records: what a chunk claims to hold is bounded by
-`MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked piece by
-piece; and all that takes a step of the program is counted against `MAX_STEPS`.
+A few bytes may unpack to any number of records. So the size that a chunk claims is bounded by
+`MAX_CHUNK_BYTES` and the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked piece by
+piece; and whatever takes a step of the program is counted against `MAX_STEPS`.
 """
 
 import struct
@@ -50,11 +50,11 @@ class McapError(Exception):
 
 
 class McapTooLargeError(McapError):
-    """The file takes more memory or time than it may; the message likewise."""
+    """The file takes more memory or time than allowed; the message is a predicate to its name."""
 
 
 class McapDamageError(Exception):
-    """Something in the file contradicts the format; the message likewise."""
+    """Something in the file contradicts the format; the message is a predicate to its name."""
 
 
 class Allowance:
@@ -103,7 +103,7 @@ class Allowance:
         Parameters
         ----------
         opcode, content
-            Of its record.
+            Opcode and content of the record.
         where
             It stands, for messages.
 

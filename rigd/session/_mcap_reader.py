@@ -79,7 +79,7 @@ class Stretch:
     records: Buffer
     """In which the runs lie; it is not kept by the reader."""
     runs: list[Run]
-    """Of the wanted topics, in the order of the file."""
+    """Runs of messages of the wanted topics, in the order of the file."""
     unit: int
     """Byte of the file at which their chunk begins, or that of some messages without chunk."""
 
@@ -486,7 +486,7 @@ class _Reader:
     ) -> tuple[int, int]:
         """Hand on the messages that follow one another from `start` on and end before `limit`.
 
-        Of those outside of chunks `most` at most. Returns where the first other record begins, and
+        At most `most` of those outside of chunks. Returns where the first other record begins, and
         how many they were.
         """
         unpack = _RUN_HEAD.unpack_from

@@ -55,12 +55,12 @@ MAX_MESSAGE_BYTES: Final = 1 << 14
 """Longest message that is decoded; the fixed layout takes 119."""
 
 _BLOCK_BYTES: Final = 1 << 18
-"""Of messages that are decoded together: they stay in a processor's cache."""
+"""Size of the messages that are decoded together: they stay in a processor's cache."""
 _BLOCK_RUNS: Final = 1 << 16
 _FEW: Final = 16
 """Messages that are sooner decoded one by one."""
 _MOST_LAYOUTS: Final = 16
-"""Of messages of one channel and length: a writer that leaves out zeros makes a few."""
+"""Layouts of messages of one channel and length: a writer that omits zeros makes a few."""
 _MOST_GROUPS: Final = 100_000
 """Times that messages of one layout are taken together, at some 100 µs each."""
 
@@ -68,7 +68,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 _MOST_FIELD_NUMBER: Final = (1 << 29) - 1
 _MOST_TAG_BYTES: Final = 5
 _MOST_VARINT_BYTES: Final = 9
-"""Of 63 bits: what is longer is negative, or padded."""
+"""Bytes of 63 bits: what is longer is negative, or padded."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,9 @@
-"""Writing a session file."""
+"""Writer of session files.
+
+Samples, controls and timings come as arrays of records and are written chunk by chunk, events as
+they happen. The file has the suffix ``.part`` and carries a lock until it is complete, and is then
+renamed to its own name, never over another file.
+"""
 
 import contextlib
 import errno
@@ -46,78 +51,6 @@ try:
     import fcntl
 except ImportError:  # sessions are recorded on Linux, but read anywhere
     fcntl = None  # type: ignore[assignment]
-
-
-_COPY_BYTES: Final = 1 << 20
-
-
-def fsync_directory(path: Path) -> None:
-    """Bring the names in a folder to the disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def copy_new(descriptor: int, target: Path) -> None:
-    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
-    with target.open("xb") as copy:
-        try:
-            position = 0
-            while data := os.pread(descriptor, _COPY_BYTES, position):
-                copy.write(data)
-                position += len(data)
-            copy.flush()
-            os.fsync(copy.fileno())
-        except OSError:
-            target.unlink()
-            raise
-
-
-def rename_new(source: Path, target: Path) -> None:
-    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
-    try:
-        os.link(source, target)
-    except OSError as error:
-        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
-            raise
-        # A file system without hard links (FAT, some network shares): reserve the name, which
-        # fails if anybody has it, and replace the empty file that then is our own.
-        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-        source.replace(target)
-    else:
-        source.unlink()
-
-
-def mark_as_written(descriptor: int) -> None:
-    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
-
-    An advisory lock; a file system without locks goes without it.
-    """
-    if fcntl is not None:
-        with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_being_written(path: Path) -> bool:
-    """Tell whether a living process holds the mark of `mark_as_written`."""
-    if fcntl is None:
-        return False
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    else:
-        return False
-    finally:
-        os.close(descriptor)
 
 
 PART_SUFFIX: Final = ".part"
@@ -541,3 +474,77 @@ class SessionWriter:
         os.fsync(self._stream.fileno())
         self._synced_at = time.monotonic()
         self._dirty = False
+
+
+# Files that come into being
+
+_COPY_BYTES: Final = 1 << 20
+
+
+def fsync_directory(path: Path) -> None:
+    """Bring the names in a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def copy_new(descriptor: int, target: Path) -> None:
+    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
+    with target.open("xb") as copy:
+        try:
+            position = 0
+            while data := os.pread(descriptor, _COPY_BYTES, position):
+                copy.write(data)
+                position += len(data)
+            copy.flush()
+            os.fsync(copy.fileno())
+        except OSError:
+            target.unlink()
+            raise
+
+
+def rename_new(source: Path, target: Path) -> None:
+    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
+            raise
+        # A file system without hard links (FAT, some network shares): reserve the name, which
+        # fails if anybody has it, and replace the empty file that then is our own.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        source.replace(target)
+    else:
+        source.unlink()
+
+
+def mark_as_written(descriptor: int) -> None:
+    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
+
+    An advisory lock; a file system without locks goes without it.
+    """
+    if fcntl is not None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_being_written(path: Path) -> bool:
+    """Tell whether a living process holds the mark of `mark_as_written`."""
+    if fcntl is None:
+        return False
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    else:
+        return False
+    finally:
+        os.close(descriptor)

@@ -158,7 +158,7 @@ class SimulatedSensor:
     plant, sensor, simulation
         What is measured, and how well.
     weights
-        Of the last readings in what is read, oldest first; one weight: each reading is taken when
+        Weights of the last readings in the value, oldest first; one weight: a reading is taken when
         it is asked for.
     """
 

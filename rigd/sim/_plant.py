@@ -43,12 +43,12 @@ class SimulatedPlant:
     Parameters
     ----------
     parameters
-        Of the rig. Delays may be any non-negative times, fractions of a period included.
+        Parameters of the rig. Delays may be any non-negative time, also a fraction of a period.
 
     Attributes
     ----------
     angle_rad, velocity_rad_s : float
-        Of the output shaft at this instant.
+        Angle and speed of the output shaft at this instant.
     coupling_torque_nm : float
         What an ideal sensor between motor and clamp measures at this instant, ``Γ + J_tool θ''``.
         It jumps with the motor's torque. At a jump the mean of both sides is given, which is where
@@ -329,7 +329,7 @@ def _step(
     switch_s
         When the motor's torque changes, from the step's start.
     angle_instant_s, torque_instant_s
-        Of which instants the sensed values are, from the step's start.
+        Instants of the sensed values, from the start of the step.
 
     Returns
     -------

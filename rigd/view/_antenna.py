@@ -53,9 +53,9 @@ _LOOKS_HZ: Final = 100.0
 _SELDOM_HZ: Final = 4.0
 """How often what is not looked at that closely is sent: the label, and the trail."""
 _LONGEST_GAP_S: Final = 10.0
-"""Of samples that are missing, no more than this is made up."""
+"""Longest gap of missing samples that is filled."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
-"""Of the first mode, where the profile tells no damping; the least of the paper's fits has half."""
+"""First mode's, where the profile has no damping; the least of the paper's fits has half."""
 
 _HOUSING: Color = (105, 110, 120)
 _METAL: Color = (140, 145, 155)
@@ -168,7 +168,7 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     Parameters
     ----------
     angle_rad
-        Of the motor.
+        Angle of the motor.
     deflection
         Shape (points,), evenly along the beam, relative to the line that its root points along; in
         beam lengths.

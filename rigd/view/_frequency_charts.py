@@ -1,4 +1,4 @@
-"""Frequency response and spectrogram as they grow, with the nominal model."""
+"""Charts over frequency: the growing frequency response with the nominal model, a spectrogram."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 
     from rigd.spectral import FrequencyResponse, RunningEstimate
     from rigd.view._session_info import Subject
+
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+# Estimate
 
 _HELD: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
 
@@ -66,8 +73,7 @@ class SweepResponse:
         return self._running.estimate()
 
 
-Real = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
+# Frequency response
 
 FIRST_HZ: Final = 0.5
 """Below, the torque that moves an antenna is lost in the sensor's noise."""
@@ -97,7 +103,7 @@ NO_COHERENCE: Final = "Of a single segment there is no coherence"
 
 _SHADES: Final = ("not_estimated_below", "not_estimated_above")
 _GROUPS: Final = 200
-"""Of points along the axis, two kept of each: enough for the pixels of a view."""
+"""Groups of points along the axis, two kept per group: enough for the pixels of a view."""
 _PHASE_FROM_DEG: Final = -90.0
 """Phases lie about 0 and 180 degrees; cut here, they do not jump from end to end."""
 _MODEL_STEP_HZ: Final = 0.01
@@ -263,6 +269,8 @@ def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
     return Chart(entity, width, height, frequency, y, (*keys, NOT_ESTIMATED_KEY))
 
 
+# Spectrogram
+
 SPECTROGRAM: Final = "/spectrogram"
 SIZE: Final = (1280.0, 677.0)
 """Width and height of the canvas, in points."""
@@ -270,7 +278,7 @@ SIZE: Final = (1280.0, 677.0)
 LOWEST_DB, HIGHEST_DB = -80.0, 0.0
 """Levels, in dB re 1 N·m, at the two ends of the colours."""
 MOST_COLUMNS: Final = 300
-"""Of the image: more than that many columns are merged, the highest level kept."""
+"""Columns of the image: more are merged, the highest level kept."""
 
 _BAR = 28.0
 """Width of the bar of colours, in points."""

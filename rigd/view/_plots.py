@@ -1,9 +1,8 @@
-"""What is plotted over time: which curves, in which units and colours.
+"""Plots over time: which curves, in which units and colours.
 
-Colours of what is shown, as red, green and blue from 0 to 255.
-
-Those of Okabe and Ito (2008) are told apart with any colour vision. Here are the ones of them that
-stand out from Rerun's dark background and from its light one.
+Colours are red, green and blue from 0 to 255. Those of Okabe and Ito (2008) are told apart with any
+colour vision; used here are the ones that stand out from Rerun's dark background and from its light
+one.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +16,9 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from rerun import ComponentColumn, RecordingStream
 
+
+# Colours
+
 Color = tuple[int, int, int]
 
 ORANGE: Color = (230, 159, 0)
@@ -25,8 +27,10 @@ GREEN: Color = (0, 158, 115)
 VERMILION: Color = (213, 94, 0)
 PURPLE: Color = (204, 121, 167)
 GREY: Color = (130, 130, 130)
-"""Of frames, grids and tick labels, and of a curve that is beside the point."""
+"""For frames, grids and tick labels, and for a curve of minor interest."""
 
+
+# Plots over time
 
 Records = npt.NDArray[Any]
 """Structured array (n,) with a field ``t_ns``."""
@@ -49,11 +53,11 @@ class Curve:
     label
         What the legend calls it, with its unit.
     color
-        Of the line.
+        Color of the line.
     values
         Its values (n,) from records (n,).
     width
-        Of the line, in points.
+        Width of the line, in points.
     """
 
     label: str

@@ -1,4 +1,4 @@
-"""A recorded session as a picture, and Rerun's files."""
+"""Recorded sessions as Rerun shows them, and Rerun's files."""
 
 import contextlib
 import os
@@ -23,6 +23,201 @@ from rigd.view._session_info import Health, Note, Subject, outcome_note
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
+
+
+Records = npt.NDArray[Any]
+
+_BLOCK_S: Final = 1.0
+"""Part of the session that is drawn at a time: as often as the charts are drawn anew."""
+_MOST_SPAN: Final = 10
+"""Ticks per sample: what lies between few samples would be made up, and fill the disk."""
+_LAST_UTC_NS: Final = 2**63 - 1
+_PROFILE: Final = "profile.toml"
+"""Attachment that tells the nominal damping."""
+
+
+def subject_of_session(session: Session) -> Subject:
+    """Return what the views need to know of a recorded session.
+
+    A stopped session is shown as it was planned, as it was live. Without segments all of
+    the record is the sweep.
+
+    Raises
+    ------
+    SessionError
+        If there are no samples, or far too few, or a number is missing, or cannot be a rig's.
+    """
+    ticks = session.samples["tick"]
+    if len(ticks) == 0:
+        raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
+    first, end = int(ticks[0]), int(ticks[-1]) + 1
+    if session.start_utc_ns > _LAST_UTC_NS:
+        raise SessionError(
+            f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
+            "which Rerun cannot show. Whoever writes the file must correct it."
+        )
+    if end - first > _MOST_SPAN * len(ticks):
+        raise SessionError(
+            f"{session.path}: only {len(ticks)} of the {end - first} ticks from {first} to "
+            f"{end - 1} have a sample, too few to be shown as a session."
+        )
+    return Subject(
+        name=session.metadata.get("id") or session.path.stem,
+        rate_hz=_within(session, "rate_hz", "Hz", 1.0, 1e5),
+        ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
+        sweep=session.segments.get("sweep", (first, end)),
+        beam=Beam(
+            _within(session, "beam_length_m", "m", 1e-3, 1e3),
+            _within(session, "beam_density_kg_per_m", "kg/m", 1e-6, 1e3),
+            _within(session, "beam_bending_stiffness_n_m2", "N·m²", 1e-9, 1e9),
+        ),
+        damping=nominal_damping(session.attachments.get(_PROFILE, b"")),
+        tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
+        angle_delay_s=session.number("angle_delay_s", 0.0),
+        torque_delay_s=session.number("torque_delay_s", 0.0),
+    )
+
+
+def nominal_damping(profile: bytes) -> Damping | None:
+    """Return the nominal damping that a profile states; None if it states none that can be used.
+
+    Only these numbers are looked for: the profile of an older or of a newer program serves as well.
+    """
+    try:
+        table = tomllib.loads(profile.decode("utf-8"))["beam"]["damping"]
+        zeta, alpha, gamma, lambda_ = (
+            float(table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
+        )
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+        return None
+    # Comparisons are false of what is not a number.
+    usable = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
+    return Damping(zeta, alpha, gamma, lambda_) if usable and 0.0 <= lambda_ < 2.0 else None
+
+
+def draw_session(
+    stream: "RecordingStream",
+    session: Session,
+    timings: Records,
+    *,
+    layout: "rrb.Blueprint | None" = None,
+    on_progress: Callable[[float], None] = lambda _share: None,
+) -> None:
+    """Draw a recorded session as it was drawn live, so that every chart grows with its time.
+
+    Parameters
+    ----------
+    stream
+        Takes the drawings.
+    session
+        To be drawn.
+    timings
+        The readings' ages (n,) of ``TIMING_DTYPE``; there may be none.
+    layout
+        Layout of the window; by default what `recorded_blueprint` returns.
+    on_progress
+        Told the share that is drawn, from time to time.
+
+    Raises
+    ------
+    SessionError
+        As `subject_of_session` does.
+    """
+    subject = subject_of_session(session)
+    picture = Picture(subject, lambda: layout or recorded_blueprint())
+    # The time at which it is drawn is not to be shown.
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    stream.send_recording_start_time_nanos(session.start_utc_ns)
+    for draw in picture.frame():
+        draw(stream)
+    for draw in picture.events([*_notes(session)]):
+        draw(stream)
+    samples = session.samples
+    counts = np.zeros(3, np.int64)
+    done, last_tick = 0, -1
+    block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
+    for block, ages in _blocks(samples, timings, block_ticks):
+        done += len(block)
+        counts += _counts(block, last_tick)
+        last_tick = int(block["tick"][-1])
+        missed, late, lost = counts.tolist()
+        health = Health(missed_ticks=missed, late_ticks=late, lost_ticks=lost)
+        for draw in (
+            *picture.timings(ages),
+            *picture.samples(block),
+            *picture.health(int(block["t_ns"][-1]), health),
+        ):
+            draw(stream)
+        on_progress(done / len(samples))
+    for draw in picture.finish():
+        draw(stream)
+
+
+def recorded_blueprint(front: "Sequence[rrb.Container]" = ()) -> "rrb.Blueprint":
+    """Return the layout of the live view, which here is played from the start.
+
+    Parameters
+    ----------
+    front
+        Tabs that stand before those of the live view.
+    """
+    import rerun.blueprint as rrb
+
+    live = blueprint()
+    return rrb.Blueprint(
+        rrb.Tabs(*front, *live.root_container.contents),
+        rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),
+        live.blueprint_panel,
+        live.selection_panel,
+    )
+
+
+def _within(session: Session, key: str, unit: str, least: float, most: float) -> float:
+    """Return a number of the file, if a rig can have it."""
+    value = session.number(key)
+    if not least <= value <= most:
+        raise SessionError(
+            f"{session.path}: {key} is {value:g} {unit}, but must be from {least:g} to {most:g} "
+            f"{unit}. Whoever writes the file must correct it."
+        )
+    return value
+
+
+def _notes(session: Session) -> Iterator[Note]:
+    """Yield the log of the session, and how it ended, which is told elsewhere in the file."""
+    for event in session.events:
+        yield Note(event.t_ns, event.level, event.message)
+    if session.outcome is not None:
+        outcome = session.outcome.get("outcome", "unknown")
+        reason = session.outcome.get("reason", "")
+        yield outcome_note(int(session.samples["t_ns"][-1]), outcome, reason)
+
+
+def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
+    """Return how many ticks were missed, late and lost, (3,), from the one after `last_tick` on."""
+    gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
+    status = samples["status"]
+    lost = np.where(status & Status.AFTER_LOST, gaps, 0)
+    late = (status & Status.LATE) != 0
+    return np.array([(gaps - lost).sum(), late.sum(), lost.sum()], np.int64)
+
+
+def _blocks(
+    samples: Records, timings: Records, block_ticks: int
+) -> Iterator[tuple[Records, Records]]:
+    """Yield samples of `block_ticks` consecutive ticks each, and the timings of the same ticks."""
+    starts = np.flatnonzero(np.diff(samples["tick"] // block_ticks)) + 1
+    ends = np.append(starts, len(samples))
+    last_ticks = samples["tick"][ends - 1]
+    timing_ends = np.searchsorted(timings["tick"], last_ticks, side="right")
+    first = first_timing = 0
+    for end, timing_end in zip(ends, timing_ends, strict=True):
+        yield samples[first:end], timings[first_timing:timing_end]
+        first, first_timing = end, timing_end
+
+
+# Files of Rerun's
 
 
 def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
@@ -146,195 +341,3 @@ def _why_not(part: Path) -> str:
     except OSError as error:
         return error.strerror or str(error)
     return "Rerun gave up"
-
-
-Records = npt.NDArray[Any]
-
-_BLOCK_S: Final = 1.0
-"""Of the session, drawn at a time: as often as the charts are drawn anew."""
-_MOST_SPAN: Final = 10
-"""Ticks per sample: what lies between few samples would be made up, and fill the disk."""
-_LAST_UTC_NS: Final = 2**63 - 1
-_PROFILE: Final = "profile.toml"
-"""Attachment that tells the nominal damping."""
-
-
-def subject_of_session(session: Session) -> Subject:
-    """Return what the picture of a recorded session is of.
-
-    Of a session that was stopped it is what was planned, as it was live. Without segments all of
-    the record is the sweep.
-
-    Raises
-    ------
-    SessionError
-        If there are no samples, or far too few, or a number is missing, or cannot be a rig's.
-    """
-    ticks = session.samples["tick"]
-    if len(ticks) == 0:
-        raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
-    first, end = int(ticks[0]), int(ticks[-1]) + 1
-    if session.start_utc_ns > _LAST_UTC_NS:
-        raise SessionError(
-            f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
-            "which Rerun cannot show. Whoever writes the file must correct it."
-        )
-    if end - first > _MOST_SPAN * len(ticks):
-        raise SessionError(
-            f"{session.path}: only {len(ticks)} of the {end - first} ticks from {first} to "
-            f"{end - 1} have a sample, too few to be shown as a session."
-        )
-    return Subject(
-        name=session.metadata.get("id") or session.path.stem,
-        rate_hz=_within(session, "rate_hz", "Hz", 1.0, 1e5),
-        ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
-        sweep=session.segments.get("sweep", (first, end)),
-        beam=Beam(
-            _within(session, "beam_length_m", "m", 1e-3, 1e3),
-            _within(session, "beam_density_kg_per_m", "kg/m", 1e-6, 1e3),
-            _within(session, "beam_bending_stiffness_n_m2", "N·m²", 1e-9, 1e9),
-        ),
-        damping=nominal_damping(session.attachments.get(_PROFILE, b"")),
-        tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
-        angle_delay_s=session.number("angle_delay_s", 0.0),
-        torque_delay_s=session.number("torque_delay_s", 0.0),
-    )
-
-
-def nominal_damping(profile: bytes) -> Damping | None:
-    """Return the nominal damping that a profile states; None if it states none that can be used.
-
-    Only these numbers are looked for: the profile of an older or of a newer program serves as well.
-    """
-    try:
-        table = tomllib.loads(profile.decode("utf-8"))["beam"]["damping"]
-        zeta, alpha, gamma, lambda_ = (
-            float(table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
-        )
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
-        return None
-    # Comparisons are false of what is not a number.
-    usable = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
-    return Damping(zeta, alpha, gamma, lambda_) if usable and 0.0 <= lambda_ < 2.0 else None
-
-
-def draw_session(
-    stream: "RecordingStream",
-    session: Session,
-    timings: Records,
-    *,
-    layout: "rrb.Blueprint | None" = None,
-    on_progress: Callable[[float], None] = lambda _share: None,
-) -> None:
-    """Draw a recorded session as it was drawn live, so that every chart grows with its time.
-
-    Parameters
-    ----------
-    stream
-        Takes the drawings.
-    session
-        To be drawn.
-    timings
-        The readings' ages (n,) of ``TIMING_DTYPE``; there may be none.
-    layout
-        Of the window; by default what `recorded_blueprint` returns.
-    on_progress
-        Told the share that is drawn, from time to time.
-
-    Raises
-    ------
-    SessionError
-        As `subject_of_session` does.
-    """
-    subject = subject_of_session(session)
-    picture = Picture(subject, lambda: layout or recorded_blueprint())
-    # Of the moment at which it is drawn nothing is to be seen.
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    stream.send_recording_start_time_nanos(session.start_utc_ns)
-    for draw in picture.frame():
-        draw(stream)
-    for draw in picture.events([*_notes(session)]):
-        draw(stream)
-    samples = session.samples
-    counts = np.zeros(3, np.int64)
-    done, last_tick = 0, -1
-    block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
-    for block, ages in _blocks(samples, timings, block_ticks):
-        done += len(block)
-        counts += _counts(block, last_tick)
-        last_tick = int(block["tick"][-1])
-        missed, late, lost = counts.tolist()
-        health = Health(missed_ticks=missed, late_ticks=late, lost_ticks=lost)
-        for draw in (
-            *picture.timings(ages),
-            *picture.samples(block),
-            *picture.health(int(block["t_ns"][-1]), health),
-        ):
-            draw(stream)
-        on_progress(done / len(samples))
-    for draw in picture.finish():
-        draw(stream)
-
-
-def recorded_blueprint(front: "Sequence[rrb.Container]" = ()) -> "rrb.Blueprint":
-    """Return the layout of the live view, which here is played from the start.
-
-    Parameters
-    ----------
-    front
-        Tabs that stand before those of the live view.
-    """
-    import rerun.blueprint as rrb
-
-    live = blueprint()
-    return rrb.Blueprint(
-        rrb.Tabs(*front, *live.root_container.contents),
-        rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),
-        live.blueprint_panel,
-        live.selection_panel,
-    )
-
-
-def _within(session: Session, key: str, unit: str, least: float, most: float) -> float:
-    """Return a number of the file, if a rig can have it."""
-    value = session.number(key)
-    if not least <= value <= most:
-        raise SessionError(
-            f"{session.path}: {key} is {value:g} {unit}, but must be from {least:g} to {most:g} "
-            f"{unit}. Whoever writes the file must correct it."
-        )
-    return value
-
-
-def _notes(session: Session) -> Iterator[Note]:
-    """Yield the log of the session, and how it ended, which is told elsewhere in the file."""
-    for event in session.events:
-        yield Note(event.t_ns, event.level, event.message)
-    if session.outcome is not None:
-        outcome = session.outcome.get("outcome", "unknown")
-        reason = session.outcome.get("reason", "")
-        yield outcome_note(int(session.samples["t_ns"][-1]), outcome, reason)
-
-
-def _counts(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
-    """Return how many ticks were missed, late and lost, (3,), from the one after `last_tick` on."""
-    gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
-    status = samples["status"]
-    lost = np.where(status & Status.AFTER_LOST, gaps, 0)
-    late = (status & Status.LATE) != 0
-    return np.array([(gaps - lost).sum(), late.sum(), lost.sum()], np.int64)
-
-
-def _blocks(
-    samples: Records, timings: Records, block_ticks: int
-) -> Iterator[tuple[Records, Records]]:
-    """Yield samples of `block_ticks` consecutive ticks each, and the timings of the same ticks."""
-    starts = np.flatnonzero(np.diff(samples["tick"] // block_ticks)) + 1
-    ends = np.append(starts, len(samples))
-    last_ticks = samples["tick"][ends - 1]
-    timing_ends = np.searchsorted(timings["tick"], last_ticks, side="right")
-    first = first_timing = 0
-    for end, timing_end in zip(ends, timing_ends, strict=True):
-        yield samples[first:end], timings[first_timing:timing_end]
-        first, first_timing = end, timing_end

@@ -1,4 +1,4 @@
-"""Everything that is shown of one session."""
+"""Scene of one session: records, events and health come in, drawings for Rerun go out."""
 
 import collections
 from collections.abc import Callable, Sequence

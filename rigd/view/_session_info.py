@@ -1,4 +1,4 @@
-"""What a picture tells of a session in words: what it is of, its log lines, its health."""
+"""Session information for the viewer: the session's data, its log lines, its health, a summary."""
 
 from dataclasses import astuple, dataclass, fields
 from typing import TYPE_CHECKING, Any, Final
@@ -20,11 +20,11 @@ class Subject:
     Attributes
     ----------
     name
-        Of the session; the viewer shows it as the recording's.
+        Name of the session; the viewer shows it as the recording's.
     rate_hz
         Scheduled ticks a second.
     ticks
-        Of the whole record, as scheduled.
+        Ticks of the whole record, as scheduled.
     sweep
         First tick of the excitation, and its end (exclusive).
     beam
@@ -97,7 +97,7 @@ class Health:
     view_dropped
         Samples that could not be shown in time, since the start.
     bus_load_percent
-        Of the CAN bus or the serial line.
+        Load of the CAN bus or the serial line.
     bus_errors
         Disturbed, damaged or missing messages, since the devices were connected.
     sensor_status

@@ -50,7 +50,7 @@ class AtiCanSensor:
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        Of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
+        State of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
     polls : GaugePolls
         With the last turn-round time and the count of lost replies.
     late_replies : int

@@ -36,12 +36,13 @@ class AtiSerialSensor:
     rig
         With sections ``ati_serial`` and ``acquisition``.
     simulator
-        Of the simulated rig that stands in for it, or None.
+        Address of the simulated rig that stands in for it, or None.
 
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        Of the last reading; the time (``time.monotonic_ns``) is when its newest record was read.
+        State of the last reading; the time (``time.monotonic_ns``) is when its newest record was
+        read.
     stream : RecordStream
         With the counts of records and checksum errors.
     status : list of str

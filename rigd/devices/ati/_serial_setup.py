@@ -1,8 +1,7 @@
 """The serial port of a Digital F/T sensor, and its set-up over Modbus while it does not stream.
 
-A serial port as the loop uses it: opened and configured by pyserial, then read without blocking.
-
-Configuration is pyserial's work; its own reading costs several system calls for what is one here.
+Pyserial opens and configures the port; the loop then reads it without blocking and without
+pyserial, whose own reading costs several system calls for what is one here.
 """
 
 import os
@@ -193,6 +192,8 @@ def _remedy(error: Exception) -> str:
     )
 
 
+# Set-up over Modbus
+
 SILENCE_S = 0.002
 """Modbus: a frame is over when the line has been silent for this long."""
 
@@ -218,9 +219,9 @@ class SerialSetup:
     line
         Open.
     settings
-        Of the sensor.
+        Settings of the sensor.
     name
-        Of the sensor, for messages.
+        Name of the sensor, for messages.
     """
 
     def __init__(self, line: SerialLine, settings: AtiSerial, name: str) -> None:

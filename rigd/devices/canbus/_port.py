@@ -1,5 +1,6 @@
-"""The kernel's ``struct can_frame``: identifier, length, up to eight bytes; 16 bytes in all.
+"""Ports of a CAN bus: a socket of the kernel, the Unix socket of a simulated bus, or python-can.
 
+All carry the kernel's ``struct can_frame``: identifier, length, up to eight bytes; 16 bytes in all.
 Classical CAN with identifiers of 11 bits is all that the rig speaks.
 """
 
@@ -42,6 +43,9 @@ read_head = Struct("=IB").unpack_from
 """Identifier with flags, and length, from raw frame."""
 
 
+# Frames
+
+
 def pack_frame(can_id: int, data: bytes = b"") -> bytes:
     """Return the 16 bytes of a frame.
 
@@ -63,6 +67,8 @@ def unpack_frame(raw: bytes) -> tuple[int, bytes]:
     return can_id, data[: min(length, 8)]
 
 
+# Ports
+
 # What the kernel keeps for a reader that is late: some 200 ms of a full bus.
 _RECEIVE_BUFFER = 212_992
 # As much as the system allows: a simulated rig that stands still is told by its silence.
@@ -80,7 +86,7 @@ class CanPort(Protocol):
     """
 
     name: str
-    """Of the bus, for messages."""
+    """Name of the bus, for messages."""
 
     def send(self, frame: bytes) -> None:
         """Send 16 bytes made by :func:`rigd.devices.canbus.pack_frame`.
@@ -137,7 +143,7 @@ class SocketPort:
     link
         Connected; made non-blocking.
     name
-        Of the bus, for messages.
+        Name of the bus, for messages.
     remedy
         What to look at when it has gone.
     """

@@ -40,7 +40,7 @@ class Assignment:
     index: int
     sub: int
     kind: str
-    """Of :data:`KINDS`."""
+    """Type of the value, one of :data:`KINDS`."""
     value: int
 
     @property

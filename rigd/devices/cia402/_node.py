@@ -26,20 +26,23 @@ from rigd.devices.cia402._protocol import (
 _TOGGLE_BIT = 0x80
 
 
+# What has come
+
+
 class Inbox:
     """The drive's last words. A frame of the wrong length changes nothing but counts.
 
     Parameters
     ----------
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     sto_error_code
-        Of the emergency message that says that its STO was dropped; 0 if it has none.
+        Error code of the emergency message for a dropped STO; 0 if the drive has none.
 
     Attributes
     ----------
     statusword, position, torque
-        Of the last TPDO; position in counts, torque in 1/1000 of the rated one.
+        Content of the last TPDO; position in counts, torque in 1/1000 of the rated one.
     strayed : int or None
         First statusword that was not as :meth:`guard` asks, in whichever TPDO it came: the drive
         may be back in the next one.
@@ -48,7 +51,7 @@ class Inbox:
     legible : bool
         The last TPDO had the right length.
     nmt_state : int or None
-        Of the last heartbeat.
+        NMT state in the last heartbeat.
     heard : bool
         A heartbeat has come since somebody set this to False.
     watching : bool
@@ -174,6 +177,8 @@ class Inbox:
         self.reply = data
 
 
+# The node
+
 _LONG_AGO_NS = -(1 << 62)
 _START_PATIENCE_NS = 1_000_000_000
 """For going operational, beside three periods of the drive's heartbeat."""
@@ -195,7 +200,7 @@ class Node:
     exchange
         Started; delivers the drive's frames to the inbox.
     frames, inbox
-        Of the drive.
+        Frames to the drive, and what has come from it.
 
     Attributes
     ----------

@@ -92,7 +92,7 @@ class Requirement:
     Attributes
     ----------
     index, sub
-        Of the object.
+        Index and sub-index of the object.
     name
         As CiA 301 and 402 call it.
     core
@@ -492,7 +492,7 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
     Parameters
     ----------
     node_id
-        Of the drive. CiA 301 sets its identifiers beforehand: it is added to all but that of SYNC.
+        Node number of the drive. It is added to all predefined identifiers (CiA 301) but SYNC's.
     """
     return {
         **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},

@@ -111,9 +111,9 @@ class SdoAccess:
     port
         Open; nobody else receives from it meanwhile.
     node_id
-        Of the drive.
+        Node number of the drive.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     """
 
     def __init__(self, port: CanPort, node_id: int, name: str) -> None:

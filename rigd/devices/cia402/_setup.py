@@ -25,6 +25,22 @@ from rigd.devices.cia402._requirements import (
 from rigd.devices.cia402._sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
 from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
 
+_READ_ONLY = 0x0601_0002
+_ABORTS = {
+    0x0601_0000: "unsupported access",
+    _READ_ONLY: "read-only",
+    0x0602_0000: "no such object",
+    0x0604_0041: "it cannot be mapped",
+    0x0604_0042: "the PDO gets too long",
+    0x0604_0043: "incompatible parameters",
+    0x0609_0030: "value out of range",
+    0x0609_0031: "value too great",
+    0x0609_0032: "value too small",
+    0x0800_0000: "general error",
+    0x0800_0022: "not in this state of the device",
+}
+"""SDO abort codes in short."""
+
 _MODE_PATIENCE_S = 0.3
 _RATED_TORQUE_TOLERANCE = 0.02
 _DUPLICATE_WATCHES = 127
@@ -77,7 +93,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     rig
         With a section ``cia402``.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
 
     Returns
     -------
@@ -172,9 +188,9 @@ class _SetUp:
     sdo
         The way to it.
     settings
-        Of the profile.
+        Settings of the profile.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     wanted
         What its objects are to hold, by index and sub-index.
     """
@@ -196,7 +212,7 @@ class _SetUp:
         Parameters
         ----------
         row
-            Of the object.
+            Row of the object in the table of requirements.
         wanted
             The value; the one of the table of values if it is not given.
 
@@ -510,20 +526,3 @@ def _disable_others(sdo: SdoAccess, communication: int) -> None:
 
 def _words(refusal: SdoRefusal) -> str:
     return _ABORTS.get(refusal.code, "see CiA 301")
-
-
-_READ_ONLY = 0x0601_0002
-_ABORTS = {
-    0x0601_0000: "unsupported access",
-    _READ_ONLY: "read-only",
-    0x0602_0000: "no such object",
-    0x0604_0041: "it cannot be mapped",
-    0x0604_0042: "the PDO gets too long",
-    0x0604_0043: "incompatible parameters",
-    0x0609_0030: "value out of range",
-    0x0609_0031: "value too great",
-    0x0609_0032: "value too small",
-    0x0800_0000: "general error",
-    0x0800_0022: "not in this state of the device",
-}
-"""SDO abort codes in short."""

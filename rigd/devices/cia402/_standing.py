@@ -1,4 +1,4 @@
-"""The drive without the loop: off before anything else, reset, and whether it would get ready.
+"""The drive without the loop: switched off first of all, reset, and asked whether it could start.
 
 Everything goes by SDO, which a drive answers in each NMT state but stopped. Whether the motor has
 torque is what the statusword says, never what was commanded.
@@ -44,7 +44,7 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     rig
         With a section ``cia402``.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
 
     Returns
     -------

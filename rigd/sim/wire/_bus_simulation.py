@@ -1,7 +1,7 @@
-"""The simulated rig between its lines: nodes, clock and faults, without any input or output.
+"""Bus simulation: the rig between its lines, with nodes, clock and faults, but no input or output.
 
 Whatever comes in is handed over with the time it came; what the nodes say goes out through two
-callables. So the same world runs behind sockets and in a test.
+callables. So the same `World` runs behind sockets and in a test.
 """
 
 import heapq
@@ -23,6 +23,9 @@ _FORGET_PERIODS = 100
 _PATIENCE_NS = 5_000_000_000
 
 
+# Clocks
+
+
 class WallClock:
     """Whole periods of wall time, on a grid that follows the SYNC.
 
@@ -40,7 +43,7 @@ class WallClock:
     Attributes
     ----------
     tick : int
-        Where the world is.
+        Tick of the simulated rig.
     """
 
     def __init__(self, period_ns: float, now_ns: int) -> None:
@@ -82,7 +85,7 @@ class WallClock:
 
 
 class LockStep:
-    """One period a SYNC; the world waits for the next one.
+    """One period per SYNC; simulated time waits for the next one.
 
     It does not wait for ever: five seconds after the last SYNC, and at once where nobody is left
     who could send one, time goes on by the wall clock, so that a drive notices a dead host. Before
@@ -122,6 +125,8 @@ class LockStep:
         """Wait no longer: nobody is connected any more."""
         self._stands_until_ns = min(self._stands_until_ns, now_ns)
 
+
+# Nodes and frames
 
 _SYNC = 0x80
 _SYNC_HEAD = pack_frame(_SYNC)[:4]
@@ -194,7 +199,7 @@ class World:
     Parameters
     ----------
     rig, simulated
-        Of the rig, and what moves.
+        Parameters of the rig, and the plant with its devices.
     lock_step
         One period a SYNC, instead of wall time.
     now_ns

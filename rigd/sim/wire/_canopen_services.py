@@ -1,9 +1,8 @@
 """Services of a simulated CANopen node: emergency messages, heartbeats, PDOs.
 
-PDOs of a simulated CANopen node, mapped as its dictionary says.
-
-A mapping is turned into one :class:`struct.Struct` and a list of readers whenever it changes, so
-that a PDO costs a few microseconds when it comes or goes.
+PDOs are mapped as the node's dictionary says. A mapping is turned into one :class:`struct.Struct`
+and a list of readers whenever it changes, so that a PDO costs a few microseconds when it comes or
+goes.
 """
 
 import math
@@ -13,6 +12,8 @@ from functools import partial
 from struct import Struct
 
 from rigd.sim.wire._object_dictionary import Abort, AbortCode, Entry, ObjectDictionary
+
+# Emergency messages
 
 _FRAME = Struct("<HB5s")
 _GENERIC = 0x01
@@ -27,7 +28,7 @@ class Emergencies:
     objects
         Gets the objects 1001, 1003 and 1014.
     node_id
-        Of the node.
+        Number of the node.
     send
         Takes identifier and data of an EMCY message, where one may be sent.
 
@@ -112,6 +113,8 @@ class Emergencies:
         if not (standing | value) & DISABLED and (standing ^ value) & 0x7FF:
             raise Abort(AbortCode.STATE)
 
+
+# Heartbeats
 
 WATCHES = 2
 _TOLERANCE_S = 1e-9
@@ -215,6 +218,8 @@ def add_watches(
         objects.add_record(0x1016, entries)
     return watches
 
+
+# PDOs
 
 DISABLED = 0x8000_0000
 MAX_ENTRIES = 8

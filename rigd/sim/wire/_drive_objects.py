@@ -1,9 +1,7 @@
-"""Object dictionary and state machine of the simulated drive.
+"""Object dictionary and state machine of the simulated drive (CiA 402).
 
-What stands in the object dictionary of the simulated drive, besides PDOs and errors.
-
-Torques are in 1/1000 of the rated torque, positions in encoder counts at the output shaft, both in
-the drive's own direction.
+The dictionary holds what the drive has besides PDOs and errors. Torques are in 1/1000 of the rated
+torque, positions in encoder counts at the output shaft, both in the drive's own direction.
 """
 
 import math
@@ -19,6 +17,9 @@ from rigd.sim.wire._object_dictionary import Abort, AbortCode, Entry, ObjectDict
 
 if TYPE_CHECKING:
     from rigd.sim.wire._object_dictionary import DeviceFile
+
+
+# State machine
 
 RAMP_S = 0.05
 """How long a ramp lasts. In a torque mode there is nothing to ramp: the shaft coasts meanwhile."""
@@ -175,6 +176,8 @@ class StateMachine:
             self._entered(left)
 
 
+# Object dictionary
+
 NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE = 0, 10
 
 _DEVICE_TYPE = 0x0002_0192  # a servo drive, by CiA 402
@@ -191,7 +194,7 @@ _NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
 """Limits; with one of zero no drive would turn."""
 
 _TORQUE_UNIT_NM = 1e-3
-"""Of object 6076 where the profile does not state one."""
+"""Unit of object 6076 where the profile does not state one."""
 _MAX_SPEED_RPM = 20_000
 
 # 605A without the options that stop by a current or voltage limit.

@@ -1,9 +1,8 @@
-"""Faults to inject: how they are written, what they do to what is sent, and the log of it.
+"""Faults to inject: how they are specified, what they do to frames, and the log of events.
 
-Faults to inject: how they are written, and what they do to what is sent.
-
-``KIND[,key=value…][@SECONDS]``: with ``@`` so long after the drive was first enabled, without at
-once. Times are of the simulated world. A frame meets at most one fault, the oldest that it fits.
+A fault is written as ``KIND[,key=value…][@SECONDS]``: with ``@`` it begins so long after the drive
+was first enabled, without at once. Times are simulated time. A frame meets at most one fault, the
+oldest that it fits.
 """
 
 import json
@@ -21,6 +20,8 @@ from rigd.devices.contracts import DeviceError
 class WrongUseError(ValueError):
     """What was asked for cannot be had; the message says why, for the operator."""
 
+
+# Specification of a fault
 
 Value = int | float | str
 Deliver = Callable[[int, bytes, object], None]
@@ -181,6 +182,9 @@ def _complaint(spec: str, what: str) -> str:
     return f"Fault '{spec}': {what}."
 
 
+# Faults on a line
+
+
 class _Active:
     """A fault of a line, and how much of it is still to come."""
 
@@ -280,6 +284,8 @@ class Line:
             self._deliver(can_id, data[hit:], origin)
 
 
+# Log of events
+
 _FLUSH_S = 0.2
 _SILENT = ("torque", "sdo write", *LINE_KINDS)
 """What happens too often to be told on the terminal."""
@@ -291,14 +297,14 @@ class EventLog:
     Parameters
     ----------
     path
-        Of the file of JSON lines, which is new; None for none.
+        Path of the new file of JSON lines; None for none.
     quiet
         Tell nothing on the terminal.
 
     Attributes
     ----------
     time_s : float
-        Simulated time; whoever moves the world sets it.
+        Simulated time; `World` sets it.
 
     Raises
     ------

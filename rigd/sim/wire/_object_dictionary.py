@@ -11,6 +11,8 @@ from typing import Final
 from rigd.devices import EdsEntry, EdsError, read_eds
 from rigd.devices.contracts import DeviceError
 
+# Objects
+
 
 class AbortCode(IntEnum):
     """Why an SDO access failed, as the node tells its client."""
@@ -121,7 +123,7 @@ class Entry:
     default: int = field(init=False)
     default_text: bytes = field(init=False)
     bits: int = field(init=False)
-    """Of a number; 0 for bytes, which no PDO carries."""
+    """Bits of a number; 0 for bytes, which no PDO carries."""
     _low: int = field(init=False)
     _high: int = field(init=False)
 
@@ -136,7 +138,7 @@ class Entry:
         Parameters
         ----------
         said
-            Of the file, a number as this one is.
+            Entry of the file, a number as this one is.
         default
             Value at power-on from now on; None leaves it as it is.
         """
@@ -333,6 +335,8 @@ class ObjectDictionary:
                 entry.reset()
 
 
+# SDO server
+
 _HEAD = Struct("<BHB")
 _ABORT = Struct("<BHBI")
 
@@ -456,6 +460,8 @@ class SdoServer:
     def _write(self, data: bytes) -> None:
         self._wrote(self._index, self._sub, self._objects.write(self._index, self._sub, data))
 
+
+# EDS files
 
 _FIRST_INDEX = 0x1000
 """Below it stand types and dummies, which nobody can read."""

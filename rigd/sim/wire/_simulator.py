@@ -54,6 +54,9 @@ _LONGEST_SOCKET_NAME = 107
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+# One simulation per rig
+
+
 @contextmanager
 def only_one(rig_name: str) -> Iterator[None]:
     """Refuse to start beside another simulated rig of the same name."""
@@ -107,6 +110,8 @@ def stop_requested() -> Iterator[Callable[[], bool]]:
             signal.signal(number, before[number])
 
 
+# Control socket
+
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 """Answers a request."""
 
@@ -120,9 +125,9 @@ class ControlSocket:
     Parameters
     ----------
     path
-        Of the Unix socket.
+        Path of the Unix socket.
     handlers
-        Of the event loop; kept up to date.
+        Handlers of the event loop, by file descriptor; kept up to date.
     answer
         Takes a request, returns the reply.
     """
@@ -204,6 +209,8 @@ def ask(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
         raise DeviceError(str(reply["error"] if isinstance(reply, dict) else reply))
     return reply
 
+
+# The process
 
 _IDLE_S = 0.01
 """How often the loop looks up while nothing hurries."""
