@@ -72,6 +72,8 @@ class Damping:
     lambda_: Annotated[float, Ge(0), Lt(2)] = 1.0
 
 
+# Transfer function
+
 PARAMETERS = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
 """What G may be differentiated with respect to; each derivative holds the other five constant."""
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from rigd.beam._model import Beam, Damping, TransferGrid
 from rigd.beam._modes import clamped_free_eigenvalues
 from rigd.beam._tip_mass import LoadedBeam
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 ERROR_BAND_HZ = (0.05, 100.0)
 """Band in which a realisation states its error: the paper's chirp and an octave above."""

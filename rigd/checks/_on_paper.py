@@ -29,7 +29,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import degrees, inf, isinf, radians
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rigd.beam import RealisationError
 from rigd.checks._rows import Row, Verdict, grade
@@ -40,10 +39,6 @@ from rigd.devices.canbus import MAX_LOAD, BusLoad, bus_load, check_identifiers
 from rigd.devices.cia402 import Grade, judge
 from rigd.profile import Profile
 from rigd.safety import Limits
-
-if TYPE_CHECKING:
-    from rigd.devices import RigParameters
-
 
 # Closed loop
 
@@ -313,7 +308,7 @@ _VERDICTS = {
 }
 
 
-def eds_rows(path: Path, rig: "RigParameters | None") -> Iterator[Row]:
+def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
     """Hold an EDS file against what rigd asks of a drive.
 
     Parameters

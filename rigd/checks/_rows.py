@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+# Values and their units
+
 _UNITS = {
     "_hz": (1.0, "Hz"),
     "_s": (1e3, "ms"),
@@ -54,6 +56,9 @@ def _end(key: str) -> str:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+# Rows
 
 
 class Verdict(Enum):
@@ -107,6 +112,8 @@ def grade(*, fail: bool, warn: bool = False) -> Verdict:
         return Verdict.FAIL
     return Verdict.WARNING if warn else Verdict.OK
 
+
+# Table
 
 _STYLES = {
     Verdict.OK: "green",

@@ -22,6 +22,8 @@ def fail(message: str, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
+# Progress
+
 _QUIET_S = 2.0
 """What takes no longer than this shows no progress."""
 
@@ -63,6 +65,8 @@ def _bar(name: str) -> Iterator[Callable[[float], None]]:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 
+
+# Options
 
 ProfileName = Annotated[
     str, typer.Option("--profile", help="Name of a hardware profile, or its file.")

@@ -24,6 +24,11 @@ from rigd.profile._load import ProfileError, profile_of
 from rigd.profile._schema import Profile, keys
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
 
+_ACCEPT = "cia402.accept_without"
+_LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
+_MAKERS_OWN = range(0x2000, 0x6000)
+_MOST_NAMED = 4
+
 
 class UnusableDriveError(ValueError):
     """A drive that no profile can make fit; the message names what it lacks."""
@@ -57,10 +62,6 @@ _OWN_WATCHDOG = Question(
     "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
     "(0: none)",
 )
-_ACCEPT = "cia402.accept_without"
-_LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
-_MAKERS_OWN = range(0x2000, 0x6000)
-_MOST_NAMED = 4
 
 
 class Draft:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from rerun.blueprint.encodings import VisualizerComponentMapping
     from rerun.datatypes import EntityPath
 
-    from rigd.view._plots import Source
     from rigd.view._scene import Drawing
 
 

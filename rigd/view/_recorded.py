@@ -219,6 +219,14 @@ def _blocks(
 
 # Files of Rerun's
 
+SUFFIX: Final = ".rrd"
+"""By which Rerun's viewer tells what a file is."""
+
+_MAGIC: Final = b"RRF"
+_TRIAL_BYTES: Final = 1 << 20
+_OS_ERROR: Final = re.compile(r"os error (\d+)")
+"""How the SDK tells the system's reason, within sentences that are not for the operator."""
+
 
 def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without what is meant for Rerun: ``RERUN=off`` and so on."""
@@ -237,15 +245,6 @@ def settle_sdk() -> None:
     for name in os.environ.keys() - without_settings(os.environ).keys():
         del os.environ[name]
     os.environ["RUST_LOG"] = "off"
-
-
-SUFFIX: Final = ".rrd"
-"""By which Rerun's viewer tells what a file is."""
-
-_MAGIC: Final = b"RRF"
-_TRIAL_BYTES: Final = 1 << 20
-_OS_ERROR: Final = re.compile(r"os error (\d+)")
-"""How the SDK tells the system's reason, within sentences that are not for the operator."""
 
 
 class RrdFileError(Exception):

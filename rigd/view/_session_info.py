@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
+EVENTS: Final = "/events"
+
+
+SUMMARY: Final = "/summary"
+
+
 @dataclass(frozen=True, slots=True)
 class Subject:
     """A session, as far as its views depend on it.
@@ -130,8 +136,6 @@ def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
     return np.array([(t_ns, *values)], HEALTH_DTYPE)
 
 
-EVENTS: Final = "/events"
-
 _RERUN_LEVELS: Final = {
     "debug": "DEBUG",
     "info": "INFO",
@@ -149,9 +153,6 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
     # To the millisecond: more is hard to read.
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
     stream.log(EVENTS, rr.TextLog(note.message, level=_RERUN_LEVELS.get(note.level, "INFO")))
-
-
-SUMMARY: Final = "/summary"
 
 
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:

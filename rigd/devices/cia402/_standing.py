@@ -31,6 +31,12 @@ _SILENT_S = 1.0
 """How long a drive that answers nothing at all is waited for."""
 
 
+_PRESS_STO = (
+    "the motor may still turn: press the wired stop (STO) and keep clear of the beam, then switch "
+    "the drive off and on"
+)
+
+
 def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     """Switch the drive off, see that it is, reset its fault, and see that it would get ready.
 
@@ -126,12 +132,6 @@ def wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
             return reached()
         time.sleep(_POLL_S)
     return True
-
-
-_PRESS_STO = (
-    "the motor may still turn: press the wired stop (STO) and keep clear of the beam, then switch "
-    "the drive off and on"
-)
 
 
 def _see_off(sdo: SdoAccess, name: str) -> None:

@@ -13,6 +13,10 @@ from rigd.devices.contracts import DeviceError
 
 # Objects
 
+NUMBERS = "bBhHiIqQ"
+_FORMATS = {kind: Struct("<" + kind) for kind in NUMBERS}
+_LONGEST_TEXT = 1024
+
 
 class AbortCode(IntEnum):
     """Why an SDO access failed, as the node tells its client."""
@@ -44,11 +48,6 @@ class Abort(Exception):
     def __init__(self, code: AbortCode) -> None:
         super().__init__(f"{code.name} {code:#010x}")
         self.code = code
-
-
-NUMBERS = "bBhHiIqQ"
-_FORMATS = {kind: Struct("<" + kind) for kind in NUMBERS}
-_LONGEST_TEXT = 1024
 
 
 @dataclass(frozen=True, slots=True)
