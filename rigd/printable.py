@@ -3,7 +3,7 @@
 from typing import Final
 
 UNPRINTABLE: Final = "?"
-"""What stands for a character that cannot be printed."""
+"""Replacement of a character that cannot be printed."""
 
 
 def printable(text: str, most: int | None = None) -> str:

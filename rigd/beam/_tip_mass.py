@@ -52,11 +52,11 @@ class LoadedResponse:
 
     response: Complex
     by_elastic: Complex
-    """By c."""
+    """Derivative with respect to c."""
     by_inertial: Complex
-    """By p."""
+    """Derivative with respect to p."""
     by_mass: Complex
-    """By the tip's mass, in N·m/(rad kg)."""
+    """Derivative with respect to the tip's mass, in N·m/(rad kg)."""
 
 
 def loaded_response(

@@ -23,7 +23,7 @@ from rigd.session import decode_samples, read_session
 
 LOOK_S = 0.1
 AROUND_S = 3.5
-"""What a measurement takes beyond its record."""
+"""Time that a measurement takes beyond its record."""
 _BLOCK = 10_000
 _TARE_S = 0.2
 _NO_LIMIT = 1_000_000_000

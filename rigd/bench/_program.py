@@ -40,7 +40,7 @@ class Results:
     rounds: list[tuple[Measurement, Measurement | None]] = field(default_factory=list)
     """The loop alone, and cyclictest right after it."""
     sessions: list[Measurement] = field(default_factory=list)
-    """With recorder, and with what else there is."""
+    """Sessions with the recorder, and with each further load."""
     search: list[Measurement] = field(default_factory=list)
     """Sessions at other rates, and the best at this."""
     no_peer: str = ""

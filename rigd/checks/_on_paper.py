@@ -198,7 +198,7 @@ class _Blindness:
     what: str
     duration_s: float
     ended_by: str
-    """What ends it, with its key."""
+    """Limit or watchdog that ends it, with its key."""
     key: str
 
 
@@ -339,7 +339,7 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
 # Profile and wiring
 
 HIGH_LOAD = 0.7
-"""Above, one more device does not fit, nor do repeated frames after a disturbance."""
+"""Load above which one more device, or repeated frames after a disturbance, do not fit."""
 
 
 def profile_rows(profile: Profile) -> Iterator[Row]:

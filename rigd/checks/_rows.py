@@ -81,10 +81,10 @@ class Row:
     what: str
     found: str
     wanted: str
-    """What it is compared with; empty if with nothing."""
+    """Value it is compared with; empty if there is none."""
     verdict: Verdict
     detail: str = ""
-    """What is too long for a table."""
+    """Text that is too long for a table."""
 
     def as_dict(self) -> dict[str, str]:
         """Return the row for a JSON document."""

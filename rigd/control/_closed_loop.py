@@ -124,7 +124,7 @@ class ClosedLoop:
     d: Real
     """(5,)."""
     model: LoopModel
-    """What it was made of."""
+    """Model it was computed from."""
     cuts: tuple[Cut, ...]
     """The torque command, the angle and the coupling torque as the controller reads them."""
     poles_rad_s: Complex

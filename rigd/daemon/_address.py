@@ -13,7 +13,7 @@ from pathlib import Path
 from rigd.runtime import runtime_folder
 
 COMMON = Path("/run/rigd")
-"""For a daemon that a group may use: a user's own runtime folder is closed to others."""
+"""Folder of daemons that a group may use: a user's own runtime folder is closed to others."""
 _SUFFIX = ".daemon"
 _PROBE_S = 1.0
 _CREDENTIALS = struct.Struct("3i")

@@ -27,12 +27,12 @@ _ANSWER_PATIENCE_S = 60.0
 """Connecting the devices anew takes up to half of it."""
 _CONNECT_PATIENCE_S = 5.0
 _CROWD_PATIENCE_S = 10.0
-"""For a daemon that turns clients away, or takes nobody."""
+"""Time to go on trying a daemon that turns clients away, or accepts nobody."""
 _STOP_PATIENCE_S = 10.0
 _STOP_ANSWER_S = 0.5
 _SIGNAL_AFTER_S = 0.3
 _END_PATIENCE_S = 3.0
-"""In which what a dead daemon has left ends by itself."""
+"""Time in which what a dead daemon has left ends by itself."""
 _PAUSE_S = 0.02
 _TIME = struct.Struct("@ll")
 _UNKNOWN = (

@@ -59,11 +59,11 @@ from rigd.runner import (
 from rigd.runtime import StopRequest
 
 LOOK_S = 0.2
-"""From one look at the rig to the next."""
+"""Time from one look at the rig to the next."""
 _DEAF_S = 1.5
-"""Without a look for so long the event loop is stuck, and hears no stop."""
+"""Time without a look after which the event loop counts as stuck, and hears no stop."""
 _RATE_LOOKS = 10
-"""Over as many of them a rate is measured."""
+"""Number of looks over which a rate is measured."""
 _LOGGED = {
     "info": logging.INFO,
     "warning": logging.WARNING,

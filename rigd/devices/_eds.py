@@ -60,7 +60,7 @@ class EdsEntry:
     sub: int
     name: str
     data_type: int
-    """By CiA 301: 0x0006 is UNSIGNED16; 0: not told."""
+    """Data type by CiA 301: 0x0006 is UNSIGNED16; 0: not stated."""
     access: str
     """``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
     mappable: bool
@@ -90,15 +90,15 @@ class Eds:
 
     path: Path
     node_id: int
-    """For which it was read."""
+    """Node number for which the file was read."""
     vendor_name: str
     vendor_id: int
-    """What object 1018:1 shows; 0: not told."""
+    """Value of object 1018:1; 0: not stated."""
     product_name: str
     product_code: int
-    """What object 1018:2 shows; 0: not told."""
+    """Value of object 1018:2; 0: not stated."""
     revision: int
-    """What object 1018:3 shows; 0: not told."""
+    """Value of object 1018:3; 0: not stated."""
     bit_rates_bit_s: tuple[int, ...]
     """Empty: not told."""
     commissioned_node_id: int

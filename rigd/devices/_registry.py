@@ -28,7 +28,7 @@ class Reality(Enum):
 
     HARDWARE = "the hardware"
     SIMULATED = "the simulated rig"
-    """In the process that opens it, under whatever clock."""
+    """Simulated in the process that opens it, under either clock."""
     SIMULATOR = "rigd simulate, by the clock"
     LOCK_STEP = "rigd simulate, in lock-step"
 

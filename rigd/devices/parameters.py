@@ -26,12 +26,12 @@ class Motor:
     viscous_nm_s_per_rad: NonNegative
     coulomb_nm: NonNegative
     rated_torque_nm: Positive
-    """What 1000 thousandths of torque are to the drive (its object 6076)."""
+    """Torque of 1000 thousandths in the drive (its object 6076)."""
     peak_torque_nm: Positive
     continuous_torque_nm: Positive = math.inf
-    """Root of the mean square that the motor bears for ever, without getting too hot."""
+    """Continuous (rms) torque rating; infinite: none is known."""
     thermal_time_constant_s: Positive = 10.0
-    """Over which that mean is taken."""
+    """Time constant of the motor's heating, over which the rms torque is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Actuation:
     """The way of a torque command to the motor's shaft."""
 
     delay_s: NonNegative
-    """From the tick that computes a command to the moment the motor exerts it."""
+    """Time from the tick that computes a command to the moment the motor exerts it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class ServoDrive:
     gear_ratio: Positive
     """Motor turns per turn of the output shaft; only to compare 6076 with the rated torque."""
     rated_torque_unit_nm: NonNegative
-    """What one count of 6076 is, at the motor's shaft; 0 does not compare it."""
+    """Torque of one count of 6076 at the motor's shaft; 0 disables the comparison."""
     torque_delivery: Literal["at_sync", "on_arrival"]
     """When a torque takes effect: RPDO of type 1, or of type 255."""
     heartbeat_period_s: Annotated[float, Gt(0), Le(1)]
@@ -208,7 +208,7 @@ class AtiCan:
     calibration: Annotated[int, Ge(0), Le(15)]
     """Index of the active calibration."""
     serial_number: str
-    """As the sensor has to answer; empty accepts any."""
+    """Serial number that the sensor has to answer; empty accepts any."""
     saturation_counts: Annotated[int, Gt(0), Le(32767)]
     """Magnitude of a raw gauge from which on the sensor is saturated."""
 
@@ -226,7 +226,7 @@ class AtiSerial:
     calibration: Annotated[int, Ge(1), Le(16)]
     """Number of the calibration block that is loaded."""
     serial_number: str
-    """As the sensor has to answer; empty accepts any."""
+    """Serial number that the sensor has to answer; empty accepts any."""
     saturation_counts: Annotated[int, Gt(0), Le(32767)]
     """Magnitude of a raw gauge from which on the sensor is saturated."""
 

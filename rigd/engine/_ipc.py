@@ -314,15 +314,15 @@ class Process:
     """One kind of process."""
 
     name: str
-    """What messages to the operator call it."""
+    """Name in messages to the operator."""
     module: str
     """Run as ``python -m module``; empty: it is the one that starts the others."""
     beat: Word
     """Its word on the board."""
     hung_after_s: float | None
-    """Without a beat; None: judged by what it leaves undone instead."""
+    """Time without a heartbeat; None: judged by what it leaves undone instead."""
     grace_s: float
-    """In which it has to end when it is asked to; then it is terminated, then killed."""
+    """Time in which it has to end when asked to; then it is terminated, then killed."""
     for_one_session: bool
     """A new one is started for each session."""
     loss: str
@@ -368,7 +368,7 @@ SUPERVISOR = Process(
 )
 
 PROCESSES = (CONTROL, RECORDER, LIVE, SUPERVISOR)
-"""In the order in which they are ended: the one with the torque first."""
+"""All processes, in the order in which they are ended: the one with the torque first."""
 
 
 class Pulse:

@@ -19,7 +19,7 @@ class ControlJob:
     """What the operator was told would move, and nothing else may; None: nothing was told."""
     channels: ChannelSpecs
     fast: bool
-    """Under the virtual clock."""
+    """Run under the virtual clock."""
 
 
 @dataclass(frozen=True, slots=True)

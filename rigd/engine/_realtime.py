@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 REFUSED = "refused: "
-"""How the report on a setting begins that was not granted."""
+"""Beginning of the report on a setting that was not granted."""
 LOCKED = "locked"
 """The report on memory of which no part is ever waited for."""
 WAKE_UP_US = 2
@@ -23,7 +23,7 @@ WAKE_UP_US = 2
 core would poll, and a rig that waits for its operator would heat the room."""
 
 NICE = -10
-"""For supervisor and recorder where the system grants no real-time priority."""
+"""Niceness of supervisor and recorder where the system grants no real-time priority."""
 
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2

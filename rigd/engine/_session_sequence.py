@@ -115,7 +115,7 @@ class Procedure:
         self._recording = False
         self.counts = self._log.counts
         self.results: dict[str, str] = {}
-        """What the record's outcome has to tell beside the counts."""
+        """Results for the record's outcome, in addition to the counts."""
 
     def tare(self) -> dict[str, str]:
         """Average the sensor at rest, before the drive is enabled.

@@ -44,7 +44,7 @@ class Phase(IntEnum):
     OFF = 6
     """Torque is zero and the drive is disabled: between sessions, and at the end."""
     WAITING = 7
-    """Until the beam is at rest, before the tare."""
+    """Waiting until the beam is at rest, before the tare."""
 
     @property
     def words(self) -> str:
@@ -248,7 +248,7 @@ class ChannelSpecs:
     """What a child process needs to attach."""
 
     rings: tuple[RingSpec, ...]
-    """In the order of :data:`TOPICS`."""
+    """All rings, in the order of :data:`TOPICS`."""
     board_fd: int
 
 

@@ -35,12 +35,12 @@ from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
 
 _SILENCE_S = 1.0
-"""For which a device may be silent between sessions."""
+"""Time for which a device may be silent between sessions."""
 _STANDSTILL_POLL_S = 0.05
 _ZERO_S = 0.2
 _SIGN_OF_LIFE_S = 1.0
 _TAKE_UP_TICKS = 2
-"""After which it is known where the motor stands and that it does."""
+"""Ticks after which it is known where the motor stands, and that it does."""
 
 
 def main() -> None:

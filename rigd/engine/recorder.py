@@ -147,7 +147,7 @@ class Recorder:
         ]
         self._recorded = 0
         self.header: Message | None = None
-        """What the file is to say of the session, as soon as the supervisor has told."""
+        """Metadata, segments and attachments of the session, once the supervisor has sent them."""
         self.begun = False
 
     def _begin(self, header: Message) -> None:

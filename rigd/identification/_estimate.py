@@ -29,7 +29,7 @@ Complex = NDArray[np.complex128]
 # The motor's equation as linear rows
 
 SCALE, INERTIA, VISCOUS, COULOMB, DELAY, ZERO = range(6)
-"""Where the unknowns stand; from the last on, one zero of the torque for each session."""
+"""Indices of the unknowns; from the last on, one zero of the torque for each session."""
 
 _FLANK = 0.15
 """Part of a window in which the test functions rise, and fall."""
@@ -280,7 +280,7 @@ _LEAST_SPEED_PART = 0.1
 _SPEED_S = 0.01
 """Half the time over which that speed is taken."""
 _MAX_SCALE_STD = 0.05
-"""What a torque constant from a datasheet is good for."""
+"""Accuracy of a torque constant from a datasheet."""
 _SCALES = (0.5, 2.0)
 """Without a beam the equation is solved by no torque and no motor too: a scale beyond these is no
 torque constant."""

@@ -22,7 +22,7 @@ _PATIENCE_S: Final = 0.2
 _STALLED_PATIENCE_S: Final = 0.02
 """Once it stalls, the session must not be kept waiting again and again."""
 _MOST_STALLED_LOOKS: Final = 200
-"""Then the server is killed; at 20 a second, as the publisher looks, after 10 s."""
+"""Looks after which the server is killed: at 20 a second, as the publisher looks, 10 s."""
 
 
 class Feed:

@@ -339,7 +339,7 @@ _BLOCK: Final = 65_536
 _PATIENCE_S: Final = 10.0
 _LOOK_S: Final = 0.1
 _LONGEST_S: Final = 60.0
-"""For one connection: the viewer has 40 MB, and the tunnel may be slow."""
+"""Longest time of a connection: the viewer has 40 MB, and the tunnel may be slow."""
 _MOST_AT_ONCE: Final = 16
 _OWN_NAMES: Final = frozenset({LOOPBACK, "localhost"})
 """Any page on the internet can have its own name lead here; it is not to read what this shows."""
@@ -575,14 +575,14 @@ def kept_here(page: str) -> str:
 GRPC_PORT: Final = 9876
 """Rerun's own: where viewers look unless told otherwise, and tunnels can be laid in advance."""
 _BACKLOG: Final = "16MiB"
-"""What a viewer that joins late is sent first: some 80 s."""
+"""Data that a viewer which joins late is sent first: some 80 s."""
 _MOST_SESSIONS: Final = 20
 """Each leaves some 300 kB of layout and charts in the server; then another takes its place."""
 _START_S: Final = 15.0
-"""In which a server has to take connections, on a computer that is busy."""
+"""Time in which a server has to accept connections, on a busy computer."""
 _ANSWER_S: Final = 0.1
 _PAUSE_S: Final = 1.0
-"""From one start of a server to the next."""
+"""Least time between two starts of a server."""
 
 
 class Outlet:

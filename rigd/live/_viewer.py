@@ -18,9 +18,9 @@ from rigd.live._server import (
 from rigd.runtime import runtime_folder
 
 _MOST_MEMORY: Final = "4GiB"
-"""Then the oldest is forgotten: a session of some hours has room."""
+"""Limit beyond which the oldest data are dropped: a session of some hours has room."""
 _START_S: Final = 30.0
-"""In which a server has to take connections."""
+"""Time in which a server has to accept connections."""
 _LOOK_S: Final = 0.05
 
 
@@ -162,7 +162,7 @@ class PageOfFile(_Playback):
 # Window on a live view
 
 _WINDOW_MEMORY: Final = "2GiB"
-"""Then the oldest is forgotten; the same computer may be running the loop."""
+"""Limit beyond which the oldest data are dropped; the same computer may be running the loop."""
 _ANSWER_S: Final = 5.0
 _HOSTS: Final = ("127.0.0.1", "localhost")
 

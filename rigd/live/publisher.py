@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 
 _PERIOD_S: Final = 1 / 15
-"""What is sent costs more by the piece than by its size; the eye takes this for smooth."""
+"""Period of sending: the cost grows with the number of messages; the eye takes this for smooth."""
 _IDLE_PERIOD_S: Final = 1.0
 _HURRY_S: Final = 0.2
 _WAITING_S: Final = 10.0
 """Duration of samples that may wait for a stalled server."""
 _STUCK_S: Final = 20
 _PARTING_S: Final = 0.3
-"""What was sent last is on its way to the viewers for so long."""
+"""Time that the last messages take to the viewers."""
 
 
 def main() -> None:
@@ -273,9 +273,9 @@ class Backlog:
 # Health of a session
 
 LOOK_S: Final = 0.25
-"""From one look to the next."""
+"""Time from one look to the next."""
 _RATE_LOOKS: Final = 4
-"""Over as many of them the rate is measured."""
+"""Number of looks over which the rate is measured."""
 
 
 class Vitals:

@@ -17,7 +17,7 @@ _START_PATIENCE_S = 60.0
 """On a computer that is busy, before one that only starts counts as hung."""
 _BEGIN_PATIENCE_S = 1.0
 _MOST_RESTARTS = 3
-"""In one session: what dies again and again is not worth the processor time."""
+"""Most restarts in one session: a process that dies again and again is given up."""
 
 
 class LiveView:

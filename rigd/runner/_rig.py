@@ -32,7 +32,7 @@ from rigd.runtime import StopRequest
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0
 _ANSWER_PATIENCE_S = 10.0
-"""Beyond the time that is measured."""
+"""Time to wait for an answer, beyond the time that is measured."""
 
 
 class RigError(Exception):

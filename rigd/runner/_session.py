@@ -37,9 +37,9 @@ from rigd.runtime import StopRequest
 _POLL_S = 0.05
 _PATIENCE_S = 5.0
 _SLOW_PATIENCE_S = 30.0
-"""For enabling a drive and for switching it off, which may take its time."""
+"""Time for enabling a drive and for switching it off, which may be slow."""
 _START_PATIENCE_S = 30.0
-"""For a recorder that is only starting, on a computer that is busy; nothing moves yet."""
+"""Time for a recorder to start on a busy computer; nothing moves yet."""
 _MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
@@ -50,7 +50,7 @@ _COUNTED = {
     "stale_angles": Word.STALE_ANGLES,
     "stale_wrenches": Word.STALE_WRENCHES,
 }
-"""What the control process counts on the board, by the names of the outcome."""
+"""Words that the control process counts in, by the names in the outcome."""
 _NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
 
 
@@ -106,7 +106,7 @@ class SessionResult:
     """How a session ended."""
 
     path: Path | None
-    """None: there is no file, for it ended before tick 0, or none that is whole."""
+    """Path of the file; None: it ended before tick 0, or no complete file could be made."""
     outcome: str
     reason: str
     scheduled: int
@@ -123,7 +123,7 @@ class SessionResult:
     live_dropped: int = 0
     """Samples that the live view did not get."""
     part: Path | None = None
-    """What there is of a file that could not be made whole."""
+    """Path of an incomplete file that could not be completed."""
     hardware: bool | None = None
     """Whether it was the hardware that moved, and nothing simulated; None: not known."""
 

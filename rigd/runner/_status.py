@@ -113,7 +113,7 @@ class ProcessStatus:
     state: str
     """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
     still_s: float
-    """For how long it has shown no sign of work, as far as somebody looked."""
+    """Time without a heartbeat, as far as somebody looked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class RigStatus:
 
     phase: Phase
     angle_rad: float
-    """From the rig's zero."""
+    """Angle from the rig's zero."""
     coupling_torque_nm: float
     torque_command_nm: float
     tick: int
@@ -158,7 +158,7 @@ class RigStatus:
     processes: tuple[ProcessStatus, ...]
     topics: tuple[TopicStatus, ...]
     live_view: LiveAddress | None = None
-    """Where the sessions are shown, if they are."""
+    """Address at which the sessions are shown, if they are."""
 
 
 class StatusWatch:

@@ -16,7 +16,7 @@ BelowAll = Annotated[float, Gt(0), Lt(100)]
 """Per cent; a share is never more than all."""
 
 BUFFERED_S = 16.0
-"""What shared memory holds for the recorder, so that no stall of a disk loses a sample."""
+"""Time that shared memory buffers for the recorder, so that no stall of a disk loses a sample."""
 
 
 @dataclass(frozen=True, slots=True)

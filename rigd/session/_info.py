@@ -38,7 +38,7 @@ class SessionInfo:
     rate_hz: float
     samples: int
     ticks: int
-    """From the first recorded tick to the last, both counted."""
+    """Ticks from the first recorded one to the last, both counted."""
     duration_s: float
     """`ticks` at the nominal rate."""
     missing_ticks: int

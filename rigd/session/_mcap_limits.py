@@ -34,7 +34,7 @@ MAX_SKIPPED: Final = 20
 
 CHUNK_STEPS: Final = 20
 DECLARATION_STEPS: Final = 15
-"""What a chunk and a declaration cost of them."""
+"""Steps that a chunk and a declaration count as."""
 
 _DECLARED_COST: Final = 1000
 """Bytes that an object for one of them takes, about, however small its record."""

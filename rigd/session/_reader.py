@@ -302,7 +302,7 @@ class _Log:
 
     def __init__(self) -> None:
         self.first_log_time: int | None = None
-        """That of the first sample."""
+        """Log time of the first sample."""
         self.left_out = 0
         """Messages of the log that were not kept."""
         self._kept: list[tuple[int, int, bytes | int]] = []  # channel, log time, data or its length

@@ -46,12 +46,12 @@ TITLE: Final = f"Antenna, its motion drawn × {FACTOR:g}"
 
 DRAWN_HZ: Final = 20.0
 TRAIL_S: Final = 0.5
-"""For this long each drawn shape stays in the picture: they show where it swings and where not."""
+"""Time that each drawn shape stays visible: the shapes show where the beam swings."""
 
 _LOOKS_HZ: Final = 100.0
 """How often the tip is looked at for its largest deflection."""
 _SELDOM_HZ: Final = 4.0
-"""How often what is not looked at that closely is sent: the label, and the trail."""
+"""Rate at which slow items are sent: the label, and the trail."""
 _LONGEST_GAP_S: Final = 10.0
 """Longest gap of missing samples that is filled."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3

@@ -76,9 +76,9 @@ class SweepResponse:
 # Frequency response
 
 FIRST_HZ: Final = 0.5
-"""Below, the torque that moves an antenna is lost in the sensor's noise."""
+"""Lowest frequency shown: below it the antenna's torque is lost in the sensor's noise."""
 LAST_HZ: Final = 60.0
-"""Beyond what the paper's chirp excites, and its third mode."""
+"""Highest frequency shown: beyond what the paper's chirp excites, and the third mode."""
 
 OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
 MAGNITUDE: Final = "/frequency_response/magnitude"
@@ -96,7 +96,7 @@ MEASURED_KEY: Final = Key("measured", SKY_BLUE)
 MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
 COHERENCE_KEY: Final = Key("coherence", GREEN)
 NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
-"""Where the reference has not been, as far as the estimate has used it."""
+"""Key of the bands that the reference has not excited, as far as the estimate has used it."""
 
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
@@ -108,9 +108,9 @@ _PHASE_FROM_DEG: Final = -90.0
 """Phases lie about 0 and 180 degrees; cut here, they do not jump from end to end."""
 _MODEL_STEP_HZ: Final = 0.01
 _FAINT: Final = Damping(zeta=3e-4)
-"""To know how high a magnitude may rise where the damping is not known."""
+"""Damping that gives the highest magnitude of the axis where the beam's is not known."""
 _DEEPEST_DB: Final = 140.0
-"""Below the highest magnitude, what an axis shows at the most."""
+"""Largest range of an axis below the highest magnitude."""
 
 
 @dataclass(frozen=True, slots=True)

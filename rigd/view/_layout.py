@@ -264,9 +264,9 @@ def _log() -> "rrb.TextLogView":
 # Axis labels
 
 LEAST_SPACING: Final = 24.0
-"""Between labels, in points: Rerun shows none that are nearer than 20, and hardly those of 21."""
+"""Space between labels, in points: Rerun shows none nearer than 20, and hardly those at 21."""
 MARGINS: Final = 1.1
-"""How many times longer than its values need an axis is."""
+"""Factor by which an axis is longer than its values need."""
 
 _STEP_NS: Final = 100_000_000
 """Interval of time of which the extremes are looked at."""

@@ -197,7 +197,7 @@ SIGNALS = Source(
     "/signals",
     (ANGLE, TRACKING_ERROR, COUPLING_TORQUE, TORQUE_COMMAND, FORCES, TORQUES, LOOP),
 )
-"""From samples."""
+"""Plots drawn from samples."""
 
 AGES = Plot(
     "ages_ms",
@@ -208,7 +208,7 @@ AGES = Plot(
     ),
 )
 READINGS = Source("/readings", (AGES,))
-"""From timings."""
+"""Plots drawn from timings."""
 
 FAULTY_TICKS = Plot(
     "faulty_ticks",
@@ -249,4 +249,4 @@ DISK = Plot(
     (Curve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
 )
 HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
-"""From readings of the health."""
+"""Plots drawn from health records."""

@@ -220,12 +220,12 @@ def _blocks(
 # Files of Rerun's
 
 SUFFIX: Final = ".rrd"
-"""By which Rerun's viewer tells what a file is."""
+"""Suffix by which Rerun's viewer recognises its files."""
 
 _MAGIC: Final = b"RRF"
 _TRIAL_BYTES: Final = 1 << 20
 _OS_ERROR: Final = re.compile(r"os error (\d+)")
-"""How the SDK tells the system's reason, within sentences that are not for the operator."""
+"""The system's error number in the SDK's messages, whose sentences are not for the operator."""
 
 
 def without_settings(environment: Mapping[str, str]) -> dict[str, str]:

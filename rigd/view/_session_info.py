@@ -143,7 +143,7 @@ _RERUN_LEVELS: Final = {
     "error": "ERROR",
     "fatal": "CRITICAL",
 }
-"""What Rerun calls the levels: it has colours for these."""
+"""Rerun's names of the levels: it has colours for these."""
 
 
 def send_note(stream: "RecordingStream", note: "Note") -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from rigd.devices import Wrench
 
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
-"""Which gauge stands where in a reading, on CAN as on the serial line."""
+"""Gauge at each place of a reading, on CAN and on the serial line."""
 
 Rows = tuple[tuple[float, ...], ...]
 

@@ -34,7 +34,7 @@ _ASSUMED = (
     f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} tells neither counts per unit nor "
     "units"
 )
-"""What is taken for granted of old firmware, for the session file and the operator."""
+"""Scale assumed for old firmware, for the session file and the operator."""
 
 
 class AtiCanSensor:

@@ -158,7 +158,7 @@ SYNC_RECORDS = 6
 """Records in a row that must fit. Less than come in a tick of 1 ms, so that one damaged record
 makes no tick go without any."""
 ERROR_BIT = 0x80
-"""In the last byte of a record: the sensor's status word has something to say."""
+"""Bit in the last byte of a record: the sensor's status word reports something."""
 
 _SUM_AT = RECORD_SIZE - 1
 _SUM_MASK = 0x7F

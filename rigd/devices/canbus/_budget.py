@@ -132,7 +132,7 @@ class BusLoad:
     plain: float
     """Part of the time, 0 to 1 and beyond, if no bit had to be stuffed."""
     worst: float
-    """With as many stuffed bits as there can be."""
+    """Load with as many stuffed bits as there can be."""
     frames_per_s: float
 
 

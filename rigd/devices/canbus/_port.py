@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 FRAME_SIZE = 16
 ERROR_FLAG = 0x2000_0000
-"""In the identifier of a frame by which a controller reports on itself (linux/can/error.h)."""
+"""Flag in the identifier: the controller reports on itself (linux/can/error.h)."""
 LONG_FLAG = 0x8000_0000
-"""In the identifier of a frame that has 29 bits of it; no device of the rig sends such."""
+"""Flag in the identifier: it has 29 bits; no device of the rig sends such frames."""
 REMOTE_FLAG = 0x4000_0000
-"""In the identifier of a request for data; no device of the rig sends such either."""
+"""Flag in the identifier: a request for data; no device of the rig sends such frames."""
 ERROR_MASK = 0x1FFF_FFFF
 SFF_MASK = 0x7FF
 
@@ -34,11 +34,11 @@ _PROTOCOL_VIOLATION = 0x08
 
 _FRAME = Struct("=IB3x8s")
 BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
-"""What the kernel reports then."""
+"""Error frame with which the kernel reports bus-off."""
 DAMAGED_FRAME = _FRAME.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
-"""What stands in for a frame that came damaged; it is counted, and nothing else follows."""
+"""Frame that stands in for a damaged one; it is counted, and nothing else follows."""
 LENGTH_AT = 4
-"""Where the number of data bytes stands in a raw frame."""
+"""Place of the number of data bytes in a raw frame."""
 read_head = Struct("=IB").unpack_from
 """Identifier with flags, and length, from raw frame."""
 

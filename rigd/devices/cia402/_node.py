@@ -181,7 +181,7 @@ class Inbox:
 
 _LONG_AGO_NS = -(1 << 62)
 _START_PATIENCE_NS = 1_000_000_000
-"""For going operational, beside three periods of the drive's heartbeat."""
+"""Time to become operational, in addition to three periods of the drive's heartbeat."""
 _FIRST_REPLY_NS = 100_000_000
 _FIRST_REPLIES = 20
 """SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""

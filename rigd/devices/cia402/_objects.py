@@ -58,9 +58,9 @@ CYCLIC_TORQUE: Final = 10
 SUPPORTS_CYCLIC_TORQUE: Final = 0x200
 """Its bit in 6502."""
 PDO_DISABLED: Final = 0x8000_0000
-"""In the COB-ID of a PDO."""
+"""Bit in the COB-ID of a PDO: it is disabled."""
 NO_REMOTE_REQUEST: Final = 0x4000_0000
-"""In the COB-ID of a TPDO: nobody may ask for it. Drives are free to set it."""
+"""Bit in the COB-ID of a TPDO: no remote request allowed. Drives are free to set it."""
 SYNC_ID: Final = 0x080
 PDO_COUNT: Final = 4
 """Pairs of PDOs with identifiers that CiA 301 sets beforehand."""

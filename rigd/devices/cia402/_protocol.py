@@ -49,7 +49,7 @@ FAULT_BIT: Final = 0x0008
 VOLTAGE_ENABLED: Final = 0x0010
 """The power stage is supplied; STO takes it from most drives."""
 FOLLOWS_TARGET: Final = 0x1000
-"""In cyclic synchronous torque mode: without it the drive ignores the target torque."""
+"""Bit 12 in cyclic synchronous torque mode: without it the drive ignores the target torque."""
 STATE_BITS: Final = 0x006F
 ENABLED: Final = 0x0027
 """Statusword in operation enabled, of its state bits."""

@@ -24,16 +24,16 @@ TORQUE_LIMIT: Final = "torque_limit"
 ABORT_OPTION: Final = "abort_option"
 TORQUE_FEEDBACK: Final = "torque_feedback"
 ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
-"""What a profile may accept by name that its drive has not."""
+"""Names of what a profile may accept that its drive lacks."""
 
 
 class Access(Flag):
     """What rigd does with an object."""
 
     READ = auto()
-    """By SDO."""
+    """Read by SDO."""
     WRITE = auto()
-    """By SDO, in pre-operational, unless the object already holds what is needed."""
+    """Written by SDO, in pre-operational, unless the object already holds what is needed."""
     SENT = auto()
     """Mapped into the drive's TPDO (an EDS has PDOMapping = 1, access ro, rw or rwr)."""
     RECEIVED = auto()

@@ -26,7 +26,7 @@ from rigd.devices.cia402._sdo import SdoAccess, SdoRefusal
 
 _POLL_S = 0.01
 _OFF_S = 0.2
-"""From the first command on: a drive that answers and shows torque after it is told to turn."""
+"""Time from the first command after which a drive that answers but has torque is an error."""
 _SILENT_S = 1.0
 """How long a drive that answers nothing at all is waited for."""
 

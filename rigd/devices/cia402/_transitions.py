@@ -67,7 +67,7 @@ def left_operation(name: str, statusword: int) -> DeviceError:
 
 
 _TICKS = 10
-"""In a row; a single lost command is repeated by the next."""
+"""Ticks in a row; a single lost command is repeated by the next."""
 
 
 class TorqueFollowing:

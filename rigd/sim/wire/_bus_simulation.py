@@ -17,9 +17,9 @@ from rigd.sim import SimulatedRig
 from rigd.sim.wire._faults import LINE_KINDS, SERIAL, EventLog, Fault, FaultError, Line
 
 _MEMORY_SYNCS = 256
-"""Over how many SYNCs the grid's phase is averaged: a single late one hardly moves it."""
+"""SYNCs over which the grid's phase is averaged: a single late one hardly moves it."""
 _FORGET_PERIODS = 100
-"""After so long a silence the next SYNC may come from another host: its phase counts anew."""
+"""Periods of silence after which the next SYNC may come from another host with its own phase."""
 _PATIENCE_NS = 5_000_000_000
 
 
@@ -140,7 +140,7 @@ _TRAITS = {
     "no_bit_12": "never_follows",
     "no_watch": "watchless",
 }
-"""What the drive may be like, and by which of its attributes."""
+"""Traits that a fault may give the drive, and the attribute of each."""
 
 
 class Node(Protocol):

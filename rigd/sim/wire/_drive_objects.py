@@ -28,7 +28,7 @@ _SWITCH_ON, _ENABLE_VOLTAGE, _NO_QUICK_STOP, _ENABLE_OPERATION = 0x01, 0x02, 0x0
 _FAULT_RESET = 0x80
 
 _STAY_IN_QUICK_STOP = 5
-"""From this value of 605A on."""
+"""Values of 605A from this one on keep the drive in quick stop."""
 
 
 class State(Enum):

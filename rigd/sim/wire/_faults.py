@@ -107,7 +107,7 @@ KINDS: dict[str, dict[str, _Key]] = {
 }
 _MOMENTARY = ("emcy", "jump", "restart", "power_cycle")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
-"""What goes on until it ends by itself or is ended."""
+"""Kinds that last until they end by themselves or are ended."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 
@@ -117,7 +117,7 @@ class Fault:
 
     kind: str
     values: Mapping[str, Value]
-    """By key; a key that was left out and has no default is missing."""
+    """Values by key; a key that was left out and has no default is missing."""
     after_s: float | None = None
     """Time after the drive was first enabled; None: at once."""
 
@@ -288,7 +288,7 @@ class Line:
 
 _FLUSH_S = 0.2
 _SILENT = ("torque", "sdo write", *LINE_KINDS)
-"""What happens too often to be told on the terminal."""
+"""Events that happen too often to be told on the terminal."""
 
 
 class EventLog:

@@ -52,7 +52,7 @@ def without_transport(rig: RigParameters) -> RigParameters:
 # CAN bus
 
 Handlers = dict[int, Callable[[], None]]
-"""What to call when a file descriptor has something to read."""
+"""Functions to call when a file descriptor has something to read."""
 OnFrames = Callable[[list[bytes], object], None]
 """Takes the frames of a sender, in order, and who it is."""
 

@@ -55,11 +55,11 @@ class Description:
     """What a device's file says of one sub-index."""
 
     kind: str
-    """As of an `Entry`."""
+    """Type, as in `Entry`."""
     access: str
     mapping: str
     default: int | None = None
-    """None where the file does not tell."""
+    """Value at power-on; None where the file does not state it."""
     low: int | None = None
     high: int | None = None
     text: bytes = b""
@@ -463,7 +463,7 @@ class SdoServer:
 # EDS files
 
 _FIRST_INDEX = 0x1000
-"""Below it stand types and dummies, which nobody can read."""
+"""Lowest index of objects; below it are types and dummies, which cannot be read."""
 _IDENTITY = 0x1018
 _WATCHED, _ONE_NODE = 0x1016, 0x1_0000
 
@@ -493,7 +493,7 @@ class DeviceFile:
 
     name: str
     entries: Mapping[tuple[int, int], Description]
-    """By index and sub-index."""
+    """Entries by index and sub-index."""
 
     def numbers(self, first: int, last: int) -> Iterator[int]:
         """Yield how far behind the first one the indices of this range are that there are."""

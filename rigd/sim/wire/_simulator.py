@@ -213,7 +213,7 @@ def ask(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
 # The process
 
 _IDLE_S = 0.01
-"""How often the loop looks up while nothing hurries."""
+"""Longest time that the loop waits while nothing is due."""
 
 
 @dataclass(frozen=True, slots=True)
