@@ -49,7 +49,7 @@ class DragGrid:
         ----------
         beam
         modes
-            How many are followed.
+            Number of modes that are followed.
         points
             Number of points of the Gauss-Legendre rule. The force is smooth but for kinks where the
             speed changes its sign along the beam.

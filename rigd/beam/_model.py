@@ -131,7 +131,7 @@ class TransferGrid:
         Parameters
         ----------
         beam, damping
-            Where to evaluate.
+            Parameters at which G is evaluated.
         wrt
             Names from `PARAMETERS`. ``ln_density_over_stiffness`` is ln(rho/EI) at constant EI,
             ``ln_stiffness`` is ln(EI) at constant rho/EI and gamma.

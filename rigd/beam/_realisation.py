@@ -118,7 +118,7 @@ def realise(
     Parameters
     ----------
     beam, damping
-        What to realise.
+        Parameters of the exact model.
     tip_mass_kg, root_compliance_rad_per_nm
         Point mass at its tip, and by how much its clamp turns for a torque.
     max_relative_error
@@ -379,7 +379,7 @@ def couple(
     viscous_nm_s_per_rad
         Viscous friction at the output shaft.
     tool_inertia_kg_m2
-        Between sensor and beam.
+        Inertia between sensor and beam.
     """
     beam_states = 0 if realisation is None else realisation.b.size
     n = 2 + beam_states

@@ -97,7 +97,7 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     beam, damping
         Parameters of the exact model.
     s
-        In rad/s, not 0.
+        Laplace variable in rad/s, not 0.
 
     Returns
     -------

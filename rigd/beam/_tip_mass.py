@@ -71,7 +71,7 @@ def loaded_response(
     elastic, inertial : ndarray of complex
         c and p there.
     beam : Beam
-        Its stiffness and length; its density is in p.
+        Stiffness and length of the beam; its density is in p.
     tip_mass_kg : float
     """
     stiffness, length = beam.bending_stiffness_n_m2, beam.length_m

@@ -36,7 +36,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
     rate_hz
         Wake-ups a second.
     seconds
-        For how long.
+        Duration of the measurement.
     cpu
         The core.
     priority

@@ -44,7 +44,7 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
     Parameters
     ----------
     profile
-        Whose settings count.
+        Profile whose settings count.
     rate_hz
         Rate of the loop.
     spin_us
@@ -109,7 +109,7 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
     Parameters
     ----------
     name
-        What the measurement is called.
+        Name of the measurement.
     profile
         From :func:`rig_for`.
     seconds
@@ -162,7 +162,7 @@ def run_session(
     name, profile, seconds, look
         As for :func:`run_alone`.
     live
-        With a live view.
+        Run it with a live view.
 
     Raises
     ------

@@ -162,7 +162,7 @@ def measurement(
     Parameters
     ----------
     name
-        What was measured.
+        Name of the measurement.
     rate_hz
         Ticks a second.
     samples

@@ -240,11 +240,11 @@ def exchange_rows(profile: Profile, devices: Devices, moves: Reality) -> Iterato
     Parameters
     ----------
     profile
-        Whose limits count.
+        Profile whose limits count.
     devices
         Connected, not enabled.
     moves
-        In lock-step the simulated rig waits for this computer, and times mean nothing.
+        What moves. In lock-step the simulated rig waits for this computer: times mean nothing.
 
     Raises
     ------

@@ -143,11 +143,11 @@ def machine_rows(
     Parameters
     ----------
     settings
-        What the profile asks for.
+        Real-time settings of the profile.
     root
         Root of the file system.
     kernel
-        Its version as ``uname -v`` has it; empty: that of this computer.
+        Version of the kernel as in ``uname -v``; empty: that of this computer.
     """
     kernel = kernel or platform.version()
     yield _kernel_row(root, kernel)

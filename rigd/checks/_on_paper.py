@@ -152,9 +152,9 @@ def worst_travel(
     rig, limits
         Parameters and limits of the profile.
     blind_s
-        For how long the torque stays on; infinite if nothing ends it.
+        Time for which the torque stays on; infinite if nothing ends it.
     max_speed_rad_s
-        Above which the drive by itself exerts no torque.
+        Speed above which the drive by itself exerts no torque.
 
     Notes
     -----

@@ -56,7 +56,7 @@ def bind(path: Path, group: str | None) -> socket.socket:
     path
         Path of the socket. The user's own folder is created; a group's folder has to exist.
     group
-        Whose members may use it too.
+        Group whose members may use it too.
 
     Raises
     ------

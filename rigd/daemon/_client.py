@@ -50,7 +50,7 @@ class DaemonGoneError(Exception):
     Parameters
     ----------
     message
-        What is known without looking.
+        Message as far as it is known without looking.
     lost
         Process and user of a daemon whose connection was lost.
     """

@@ -35,9 +35,9 @@ def run_daemon(
     profile
         Profile of the rig.
     folder
-        Where session files go.
+        Folder for session files.
     group
-        Whose members may command it, beside this user.
+        Group whose members may command it, as well as this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
 

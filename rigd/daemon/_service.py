@@ -166,11 +166,11 @@ class Service:
     Parameters
     ----------
     rig
-        To own; not connected yet.
+        Rig to own; not connected yet.
     profile
         Profile of the rig.
     folder
-        Where session files go.
+        Folder for session files.
     worker
         Runs the calls of the rig, one at a time.
     publish
@@ -178,7 +178,7 @@ class Service:
     moving
         Says what would move if the rig were connected now.
     fast, live
-        As the rig was made.
+        Options with which the rig was made.
 
     Attributes
     ----------

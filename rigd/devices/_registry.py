@@ -44,7 +44,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
     Parameters
     ----------
     selection
-        As a profile has it.
+        Drive and sensor that a profile names.
     source
         The profile's file, for the message.
 
@@ -119,7 +119,7 @@ def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:
     Parameters
     ----------
     rig
-        As a profile has it.
+        Parameters of a profile.
     moving
         What the operator was told would move, if that was told before.
 

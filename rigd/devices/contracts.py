@@ -31,7 +31,7 @@ def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
     device
         Name of the drive.
     shown
-        How it shows it, as the rest of a sentence.
+        How the drive shows it, as the rest of a sentence.
     """
     return DeviceError(
         f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, see "

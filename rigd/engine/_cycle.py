@@ -97,9 +97,9 @@ class Standstill:
         Parameters
         ----------
         angle_rad
-            From any zero that stays where it is.
+            Angle from any zero that does not change.
         due_ns
-            When its tick was due.
+            Time at which its tick was due.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class Cycle:
     Attributes
     ----------
     devices
-        As given.
+        Devices, as given.
     zero_rad
         The drive's own angle at the rig's zero.
     angle_rad, raw_wrench, wrench, coupling_torque_nm
@@ -320,9 +320,9 @@ class Cycle:
         Parameters
         ----------
         due_ns
-            When the present tick was due.
+            Time at which the present tick was due.
         recorder_lag_s
-            By how much the recorder is behind the loop.
+            Time by which the recorder is behind the loop.
         disk_free_mb
             Free space on the disk that holds the session file.
 
@@ -361,11 +361,11 @@ class Rest:
     Attributes
     ----------
     duration_s
-        For how long.
+        Duration of the readings.
     wrenches
         Raw: not tared; N and N·m, shape (n, 6).
     angles_rad
-        From the rig's zero; shape (n,).
+        Angles from the rig's zero; shape (n,).
     torques_nm
         Coupling torque of the raw wrenches; shape (n,).
     """
@@ -420,9 +420,9 @@ def observe_rest(
     Parameters
     ----------
     cycle, metronome
-        Which devices, and when.
+        Cycle that reads the devices, and the schedule of its ticks.
     rate_hz, duration_s
-        How often and for how long.
+        Rate and duration of the readings.
     projection
         Coupling torque = projection · wrench.
     check
@@ -451,7 +451,7 @@ def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
     profile
         Profile of the rig.
     heat_nm2
-        How warm the motor is: mean square of its torque over its thermal time constant, (N·m)².
+        Heat of the motor: mean square of its torque over its thermal time constant, (N·m)².
     """
     rig = profile.rig
     watch = LimitWatch(

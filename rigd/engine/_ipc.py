@@ -58,13 +58,13 @@ class Child:
     Parameters
     ----------
     name
-        What messages to the operator call it.
+        Name in messages to the operator.
     module
         Run as ``python -m module``; it starts importing at once and waits for its job.
     fds
         Descriptors it inherits.
     cores
-        Those that it may use, where they are others than this process's own.
+        Cores that it may use, where they differ from this process's own.
 
     Raises
     ------

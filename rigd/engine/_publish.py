@@ -19,7 +19,7 @@ class Display:
     Parameters
     ----------
     board
-        Where.
+        Board to write to.
     devices
         Devices whose line health it reports.
 
@@ -41,9 +41,9 @@ class Display:
         Parameters
         ----------
         cycle
-            With the last readings.
+            Cycle with the last readings.
         now_ns
-            On the engine's clock: a line's load is taken from one call to the next.
+            Time on the engine's clock: a line's load is taken from one call to the next.
         """
         board = self._board
         board.beat(Word.CONTROL_BEAT)
@@ -116,9 +116,9 @@ class SampleLog:
     Parameters
     ----------
     cycle, metronome, clock
-        Where the contents of a sample come from.
+        Sources of a sample's content.
     channels
-        Where they go.
+        Channels that it writes to.
     late_ns
         Lateness above which a tick is flagged as late.
 
@@ -154,9 +154,9 @@ class SampleLog:
         Parameters
         ----------
         tick
-            Its number in the record.
+            Number of the tick in the record.
         reference_rad
-            What the angle was to be.
+            Reference angle.
         missed
             Ticks that were missed right before it.
         wait

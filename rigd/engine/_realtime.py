@@ -91,7 +91,7 @@ class Precedence:
     Attributes
     ----------
     cores_before
-        Those that this process might use before it kept off the loop's.
+        Cores that this process could use before it left the loop's core.
     """
 
     def __init__(self, priority: int, loop_cpu: int, *, root: Path = Path("/")) -> None:

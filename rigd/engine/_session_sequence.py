@@ -43,7 +43,7 @@ class SessionEnd(Exception):
     Attributes
     ----------
     outcome, reason
-        For the file and for the operator.
+        Outcome and reason, for the file and the operator.
     device_failed
         A device did not do what it was asked: it must be connected anew.
     """
@@ -61,17 +61,17 @@ class Procedure:
     Parameters
     ----------
     profile
-        What the operator chose.
+        Profile that the operator chose.
     reference_rad
         Angle a tick, relative to the one at the start.
     cycle, clock, metronome
-        What a tick does, and when.
+        Work of a tick, and its schedule.
     standstill
-        Told of every angle that is read without torque.
+        Monitor of every angle that is read without torque.
     channels
-        Where samples, the controller's terms and events go.
+        Rings for samples, the controller's terms and events.
     display
-        Where the readings are shown.
+        Publishes the readings.
     parent
         The supervisor.
     stop

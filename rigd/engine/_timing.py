@@ -130,7 +130,7 @@ class Metronome:
     due_ns
         The same on the clock: it goes on evenly through a restart.
     lateness_ns
-        By how much its deadline was missed: less than a period.
+        Wake-up latency: time since its deadline, less than a period.
     """
 
     def __init__(self, clock: Clock, rate_hz: float) -> None:

@@ -132,11 +132,11 @@ def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) 
     Parameters
     ----------
     path
-        Its name.
+        Name of the file.
     most_bytes
         The limit.
     newline
-        As `open` has it.
+        Argument of `open`.
 
     Raises
     ------

@@ -174,7 +174,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     estimate
         Estimate of the profile's motor.
     profile
-        In which the numbers are to go.
+        Profile in which the numbers are to go.
     unusable
         Passes that were left out before the estimate.
     """

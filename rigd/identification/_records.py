@@ -35,7 +35,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     paths
         Session files of one rig, in any order.
     actuation_delay_s
-        Where the search for the command's delay begins.
+        Start value of the search for the command's delay.
 
     Raises
     ------

@@ -31,12 +31,12 @@ class Feed:
     Parameters
     ----------
     outlet
-        Whose server passes it on.
+        Outlet whose server passes it on.
 
     Attributes
     ----------
     connections
-        How often a connection began, with the frame of what is shown.
+        Number of connections that began, each with the frame of what is shown.
     stalled
         The server does not take what was sent.
     """

@@ -97,7 +97,7 @@ class Harvest:
     drawings
         Draw everything else.
     samples
-        How many samples those show that nobody has shown before.
+        Number of samples that the drawings show for the first time.
     """
 
     notes: "list[Drawing]"
@@ -113,7 +113,7 @@ class Intake:
     Parameters
     ----------
     session
-        To show.
+        Session to show.
     channels
         The memory of the rig's processes.
     seen
@@ -127,7 +127,7 @@ class Intake:
     t_ns
         Time of the newest sample, since the start of the session.
     took_s
-        For how much of the session were the samples that were read last.
+        Duration of the samples that were read last.
     """
 
     def __init__(self, session: LiveSession, channels: Channels, seen: int = 0) -> None:

@@ -80,7 +80,7 @@ class RerunProgram:
     options
         Options of its command line.
     environment
-        What it is to find there beside this process's own.
+        Environment variables in addition to this process's own.
 
     Raises
     ------
@@ -194,9 +194,9 @@ class LiveAddress:
         When that process was started, in clock ticks since the computer was: no other process has
         both numbers.
     grpc_port
-        On loopback, for native viewers.
+        Port on loopback, for native viewers.
     page_port
-        On loopback, for browsers.
+        Port on loopback, for browsers.
     server
         Number of the server, another for each: viewers do not connect a second time by themselves.
     """
@@ -382,7 +382,7 @@ class PageServer:
     Parameters
     ----------
     port
-        To take on loopback; 0 leaves the choice to the system.
+        Port to take on loopback; 0 leaves the choice to the system.
     address
         Asked for the view that there is now; None: none at the moment.
     upstream
@@ -391,7 +391,7 @@ class PageServer:
     Attributes
     ----------
     port
-        Where it listens.
+        Port on which it listens.
 
     Raises
     ------

@@ -106,7 +106,7 @@ class PageOfFile(_Playback):
     Attributes
     ----------
     address
-        Where it is.
+        Address of the page.
 
     Raises
     ------

@@ -26,14 +26,14 @@ class LiveView:
     Parameters
     ----------
     crew
-        With a publisher, its memory laid out.
+        Processes with a publisher, their memory laid out.
     rig
         The profile's name.
 
     Attributes
     ----------
     address
-        Where the view is, as far as is known.
+        Address of the view, as far as it is known.
     """
 
     def __init__(self, crew: Crew, rig: str) -> None:
@@ -53,7 +53,7 @@ class LiveView:
         Parameters
         ----------
         order
-            What is run.
+            Session that is run.
         stop
             The operator's: then the view is waited for no longer.
 

@@ -96,7 +96,7 @@ def plan_session(profile: Profile, excitation: Excitation, *, force: bool = Fals
     Parameters
     ----------
     profile, excitation
-        What is to be run.
+        Rig and excitation of the session.
     force
         Let torques be clipped, of the motor or of the sensor. No other limit can be forced: leaving
         it would end the session.

@@ -46,7 +46,7 @@ class Crew:
     Attributes
     ----------
     live
-        As given.
+        Whether the live publisher is started too.
     cores
         For the processes that are still to be started, where this one keeps off some; empty: its
         own.

@@ -238,7 +238,7 @@ def file_header(order: Order, connected: Message, tare: Message) -> Message:
     Parameters
     ----------
     order
-        What is run.
+        Session that is run.
     connected
         What the control process told of the devices and of its real-time settings.
     tare

@@ -49,7 +49,7 @@ class Rig:
     profile
         Profile of the rig.
     fast
-        Under the virtual clock.
+        Run under the virtual clock.
     live
         Show each session in a live view.
     crew
@@ -133,7 +133,7 @@ class Rig:
         Parameters
         ----------
         order
-            What to run.
+            Session to run.
         stop
             The operator's, which ends it.
         watcher, listens

@@ -60,9 +60,9 @@ class SessionFailedError(Exception):
     Attributes
     ----------
     path
-        Its file, if one was begun.
+        File of the session, if one was begun.
     kept
-        Where its record was saved, if that is not the ``.part`` of the file.
+        Path where the record was saved, if that is not the ``.part`` of the file.
     counts
         Counts of ticks, as far as known: ``scheduled``, ``missed``, ``late``,
         ``stale_angles``, ``stale_wrenches``.
@@ -169,11 +169,11 @@ class Session:
     Parameters
     ----------
     order
-        What to run.
+        Session to run.
     crew
-        Whose control process is connected and idle.
+        Processes of the rig; its control process is connected and idle.
     connected
-        What that process told when it was.
+        Message of that process when it had connected.
     live
         The view to keep up, or None.
     watcher

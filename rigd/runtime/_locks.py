@@ -26,7 +26,7 @@ class HeldFile:
     Parameters
     ----------
     name
-        What is locked; other characters than letters and digits count alike.
+        Name of what is locked; other characters than letters and digits count alike.
     everybody
         It is hardware, which all users of this computer share: the lock is in ``/run/lock`` where
         there is one. Otherwise it is in the user's own runtime folder.
@@ -124,7 +124,7 @@ class RigLock:
     rig
         The profile's name.
     holder
-        Which program this is, for whoever comes second.
+        Name of this program, for whoever comes second.
     hardware
         The rig is none of a user's own: all users of this computer have to be asked.
     alone

@@ -66,9 +66,9 @@ class Violation:
     Attributes
     ----------
     channel, value, limit, unit
-        What is wrong by how much.
+        Quantity, its value, and the limit that it exceeds.
     remedy
-        What the operator can do, a sentence; may be empty.
+        Advice for the operator, a sentence; may be empty.
     key
         Key of the profile where the limit stands; may be empty.
     below
@@ -130,17 +130,17 @@ class Interlock:
     name
         Name of the interlock.
     channel
-        What is watched, as messages name it.
+        Quantity that is watched, as messages name it.
     unit
         Unit of value and limit; empty where nothing is measured.
     limit
         Key of the profile with the level that ends a session; empty where nothing is measured.
     warning
-        Where a warning begins: a part of the limit, or a key of the profile; None: nowhere.
+        Level of the warning: a part of the limit, or a key of the profile; None: no warning.
     checked, action
-        By whom, and what follows.
+        Who checks it, and what follows.
     remedy
-        What the operator is told to do.
+        Advice for the operator.
     below
         The limit is the least that the value may be.
     follows_missed_ticks

@@ -383,11 +383,11 @@ class LimitWatch:
         Parameters
         ----------
         due_ns
-            When the present tick was due.
+            Time at which the present tick was due.
         torque_squares_nm2
             Sum over the ticks since the last call, of the torques exerted.
         recorder_lag_s
-            By how much the recorder is behind the loop.
+            Time by which the recorder is behind the loop.
         disk_free_mb
             Free space on the disk that holds the session file.
         """

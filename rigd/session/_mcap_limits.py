@@ -145,9 +145,9 @@ def unpacked(
     zstd
         Of :func:`zstd_decompressor`.
     compression
-        As the chunk names it.
+        Compression that the chunk names.
     packed
-        Its content.
+        Packed content of the chunk.
     size
         Bytes that it claims to hold.
     where

@@ -43,7 +43,7 @@ class SimulatedRig:
     Attributes
     ----------
     plant, sensor
-        What moves, and what measures it.
+        Plant, and the sensor that measures it.
     records_per_period : int
         Readings of the sensor in one period.
     """
@@ -156,7 +156,7 @@ class SimulatedSensor:
     Parameters
     ----------
     plant, sensor, simulation
-        What is measured, and how well.
+        Plant, sensor and its noise.
     weights
         Weights of the last readings in the value, oldest first; one weight: a reading is taken when
         it is asked for.

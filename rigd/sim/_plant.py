@@ -327,7 +327,7 @@ def _step(
     period_s
         Length of the step.
     switch_s
-        When the motor's torque changes, from the step's start.
+        Time at which the motor's torque changes, from the step's start.
     angle_instant_s, torque_instant_s
         Instants of the sensed values, from the start of the step.
 
@@ -383,7 +383,7 @@ def _held(
     model
         Motor and beam.
     of_force
-        What the force adds to the state's derivative, (n, points).
+        Effect of the force on the state's derivative, (n, points).
     holding_torque, period_s, angle_instant_s, torque_instant_s
         As for `_step`.
 
@@ -415,7 +415,7 @@ class OtherClock:
     periods
         Age of the first reading, in ticks.
     growth
-        By which the age grows each tick, in ticks; not negative.
+        Growth of the age per tick, in ticks; not negative.
     """
 
     __slots__ = ("_age", "_growth", "_readings")

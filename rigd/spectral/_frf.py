@@ -262,7 +262,7 @@ class CrossSpectra:
     sxy : ndarray of complex, shape (n,)
         Sum of the conjugate of the input times the output.
     segments : int
-        How many were added.
+        Number of segments that were added.
     """
 
     sxx: NDArray[np.float64]
@@ -444,7 +444,7 @@ def instrumental_response(
     Parameters
     ----------
     reference : array_like, shape (n,)
-        What the loop was asked for, in any unit and with any delay: both cancel.
+        Reference of the loop, in any unit and with any delay: both cancel.
     input_, output : array_like, shape (n,)
     rate_hz, segment_length, overlap, nfft
         See `rigd.spectral.welch_response`.

@@ -41,7 +41,7 @@ class RunningEstimate:
     Attributes
     ----------
     response : FrequencyResponse
-        Its coherence is None until there are two whole segments.
+        Response; its coherence is None until there are two whole segments.
     excited : ndarray of bool, shape (n,)
         Bins of the response where the reference has been; what it shows elsewhere is noise and
         what leaks.
@@ -380,7 +380,7 @@ class LowBins:
     nfft : int
         Length of the padded transform, at least `length`.
     bins : int
-        How many are wanted, from frequency 0 on; at most ``nfft // 2 + 1``.
+        Number of bins, from frequency 0 on; at most ``nfft // 2 + 1``.
     """
 
     def __init__(self, length: int, nfft: int, bins: int) -> None:

@@ -45,7 +45,7 @@ class Axis:
     Attributes
     ----------
     title
-        With its unit.
+        Title with its unit.
     first, last
         Values at its ends.
     ticks
@@ -78,7 +78,7 @@ class Key:
     Attributes
     ----------
     label
-        What it stands for.
+        Name of what it stands for.
     color, width
         Color and width of the line, the width in points.
     is_area
@@ -98,13 +98,13 @@ class Chart:
     Attributes
     ----------
     entity
-        Where Rerun keeps it.
+        Entity path in Rerun.
     width, height
         Size of the canvas, in points.
     x, y
-        Its axes.
+        Horizontal and vertical axis.
     legend
-        In the order it is read.
+        Entries of the legend, in reading order.
     left, right
         Room beside the frame, in points.
     """

@@ -301,7 +301,7 @@ class SpectrogramChart:
     Attributes
     ----------
     chart
-        Where it is drawn.
+        Chart on which it is drawn.
     """
 
     def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
@@ -375,7 +375,7 @@ def _place_image(
     Parameters
     ----------
     stream, entity
-        Where to say it.
+        Stream and entity to log to.
     corners
         Bottom left and top right on the canvas, (2, 2).
     shape

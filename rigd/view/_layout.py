@@ -57,7 +57,7 @@ class TimeView:
     Attributes
     ----------
     source, plot
-        What it shows.
+        Source and plot that it shows.
     window_s
         Time shown up to the cursor.
     height
@@ -283,7 +283,7 @@ class Scale:
     source
         Source of the values.
     views
-        Those of other sources are passed over, and those whose axis has fixed ends.
+        Views; those of other sources and those whose axis has fixed ends are ignored.
     """
 
     def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:

@@ -51,11 +51,11 @@ class Curve:
     Attributes
     ----------
     label
-        What the legend calls it, with its unit.
+        Name in the legend, with its unit.
     color
         Color of the line.
     values
-        Its values (n,) from records (n,).
+        Function from records (n,) to values (n,).
     width
         Width of the line, in points.
     """
@@ -73,11 +73,11 @@ class Plot:
     Attributes
     ----------
     component
-        What Rerun calls their values: a name that ends in the unit.
+        Rerun's name of their values; it ends in the unit.
     title
-        What the axis shows, with its unit.
+        Title of the axis, with its unit.
     curves
-        From the lowest to the topmost.
+        Curves from the lowest to the topmost.
     span
         The ends of the axis, where they are the same for every session.
     """
@@ -98,7 +98,7 @@ class Source:
         Where Rerun keeps them. One place for all of them: what sending costs is the number of
         places, hardly that of the values.
     plots
-        What is made of each record.
+        Plots that are made of each record.
     """
 
     entity: str

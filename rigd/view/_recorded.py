@@ -110,7 +110,7 @@ def draw_session(
     stream
         Takes the drawings.
     session
-        To be drawn.
+        Session to draw.
     timings
         The readings' ages (n,) of ``TIMING_DTYPE``; there may be none.
     layout

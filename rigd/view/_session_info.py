@@ -39,7 +39,7 @@ class Subject:
         Nominal damping of the profile; None where it is not known: then no model is drawn over the
         frequency response.
     tool_inertia_kg_m2
-        Between the torque sensor and the beam, about the motor's axis.
+        Inertia between the torque sensor and the beam, about the motor's axis.
     angle_delay_s, torque_delay_s
         Age of either value at its time stamp; positive: the value is older.
     """
@@ -62,11 +62,11 @@ class Note:
     Attributes
     ----------
     t_ns
-        When, since the start of the session.
+        Time since the start of the session.
     level
         "debug", "info", "warning", "error" or "fatal", as in the session file.
     message
-        In the operator's words.
+        Text for the operator.
     """
 
     t_ns: int
@@ -93,13 +93,13 @@ class Health:
     missed_ticks
         Skipped by the loop since the start of the session.
     late_ticks
-        That woke late but were not missed, since the start.
+        Ticks that woke late but were not missed, since the start.
     lost_ticks
-        Whose samples found no room in the ring, since the start.
+        Ticks whose samples found no room in the ring, since the start.
     recorder_lag_ticks
         Samples that wait in the ring for the recorder.
     disk_free_mb
-        On the disk that the session goes to, in 10⁶ bytes.
+        Free space on the disk of the session file, in 10⁶ bytes.
     view_dropped
         Samples that could not be shown in time, since the start.
     bus_load_percent

@@ -43,7 +43,7 @@ class AtiCanSensor:
     Parameters
     ----------
     rig
-        With sections ``ati_can`` and ``acquisition``.
+        Parameters with sections ``ati_can`` and ``acquisition``.
     link
         The bus, shared with the drive.
 
@@ -52,7 +52,7 @@ class AtiCanSensor:
     wrench_stale, wrench_saturated, wrench_time_ns
         State of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
     polls : GaugePolls
-        With the last turn-round time and the count of lost replies.
+        Polls, with the last turn-round time and the count of lost replies.
     late_replies : int
         Replies that came after the deadline, but before the next tick.
     bus_errors : int

@@ -118,9 +118,9 @@ class GaugePolls:
     Attributes
     ----------
     answer : tuple of bytes, or None
-        To the last poll, as of the last `settle`.
+        Answer to the last poll, as of the last `settle`.
     sent_ns, turnaround_ns : int
-        When the last poll was sent (``time.monotonic_ns``); from a poll to its answer.
+        Time of the last poll (``time.monotonic_ns``), and time from a poll to its answer.
     """
 
     __slots__ = (

@@ -175,9 +175,9 @@ class RecordStream:
     records : int
         Delivered so far.
     checksum_errors : int
-        How often a record did not fit where one had to begin.
+        Number of times that a record did not fit where one had to begin.
     dropped_bytes : int
-        That belonged to no record.
+        Number of bytes that belonged to no record.
     pending : int
         Bytes that are held until it is clear which record they belong to.
     """

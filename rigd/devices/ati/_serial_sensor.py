@@ -34,7 +34,7 @@ class AtiSerialSensor:
     Parameters
     ----------
     rig
-        With sections ``ati_serial`` and ``acquisition``.
+        Parameters with sections ``ati_serial`` and ``acquisition``.
     simulator
         Address of the simulated rig that stands in for it, or None.
 
@@ -44,7 +44,7 @@ class AtiSerialSensor:
         State of the last reading; the time (``time.monotonic_ns``) is when its newest record was
         read.
     stream : RecordStream
-        With the counts of records and checksum errors.
+        Stream, with the counts of records and checksum errors.
     status : list of str
         What the sensor's status word said last, in words; it can only be asked while the sensor
         does not stream, that is in `connect` and `close`.

@@ -32,11 +32,11 @@ class SerialLine:
     Parameters
     ----------
     port
-        Its file name.
+        File name of the port.
     baud
         Bits a second; any that the adapter can make.
     device
-        At its other end, for messages.
+        Device at the other end, for messages.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ class SerialSetup:
     Parameters
     ----------
     line
-        Open.
+        Open line.
     settings
         Settings of the sensor.
     name

@@ -47,7 +47,7 @@ class ReplyPairing:
     Parameters
     ----------
     inbox
-        Queue in which the replies arrive.
+        Counter of the replies that have come.
     pauses
         A tick may be left without a request. Not so with a device whose time passes with the
         requests: there what is missing is taken for lost in the end, unproven.
@@ -59,7 +59,7 @@ class ReplyPairing:
     lost : int
         Replies that were taken for lost.
     unproven : int
-        Those of them that may also be late for good.
+        Lost replies that may also be late by whole periods for good.
     """
 
     __slots__ = (
@@ -169,12 +169,12 @@ class CanExchange:
     Parameters
     ----------
     port
-        Open.
+        Open port.
 
     Attributes
     ----------
     error_frames : int
-        How often the controller reported a disturbance.
+        Number of disturbances that the controller reported.
     bits : int
         Bits of all frames sent and received, without stuff bits.
     """
@@ -316,7 +316,7 @@ class BusLock:
     Parameters
     ----------
     bus
-        Where the bus is: a channel, or the socket of a simulated one.
+        Channel of the bus, or socket of a simulated one.
     simulated
         It is a simulated one: other users have others.
     """
@@ -357,7 +357,7 @@ class CanLink:
     Parameters
     ----------
     settings
-        Which bus.
+        Settings of the bus.
     simulator
         Address of the simulated rig that stands in for it, or None.
     """

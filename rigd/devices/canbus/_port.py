@@ -141,11 +141,11 @@ class SocketPort:
     Parameters
     ----------
     link
-        Connected; made non-blocking.
+        Connected socket; it is made non-blocking.
     name
         Name of the bus, for messages.
     remedy
-        What to look at when it has gone.
+        Advice for the operator where the bus is gone.
     """
 
     def __init__(

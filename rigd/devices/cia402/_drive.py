@@ -48,7 +48,7 @@ class Cia402Drive:
     Parameters
     ----------
     rig
-        With the sections ``cia402`` and ``acquisition``.
+        Parameters with the sections ``cia402`` and ``acquisition``.
     link
         The bus, which may be shared.
 

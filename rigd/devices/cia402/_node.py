@@ -196,9 +196,9 @@ class Node:
     Parameters
     ----------
     rig
-        With the sections ``cia402`` and ``acquisition``.
+        Parameters with the sections ``cia402`` and ``acquisition``.
     exchange
-        Started; delivers the drive's frames to the inbox.
+        Started exchange; it delivers the drive's frames to the inbox.
     frames, inbox
         Frames to the drive, and what has come from it.
 

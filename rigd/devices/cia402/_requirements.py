@@ -94,17 +94,17 @@ class Requirement:
     index, sub
         Index and sub-index of the object.
     name
-        As CiA 301 and 402 call it.
+        Name in CiA 301 or 402.
     core
         No session without it.
     access
-        What is done with it.
+        Kind of access to it.
     stand_in
-        What does its work where it is absent; empty where nothing does.
+        Replacement where it is absent; empty where there is none.
     sentence
-        For the operator, where it is absent or cannot be used: what follows, and the remedy.
+        Consequence and remedy where it is absent or cannot be used, for the operator.
     fit
-        Which values it may hold where it cannot be written.
+        Values that it may hold where it cannot be written.
     accept
         Name under which ``cia402.accept_without`` has to accept its absence; empty where it does
         not have to. (For 1016:1 only where no other :class:`Watchdog` stands.)
@@ -513,7 +513,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     Parameters
     ----------
     rig
-        With a section ``cia402``.
+        Parameters with a section ``cia402``.
 
     Raises
     ------

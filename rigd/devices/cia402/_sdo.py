@@ -109,7 +109,7 @@ class SdoAccess:
     Parameters
     ----------
     port
-        Open; nobody else receives from it meanwhile.
+        Open port; nobody else receives from it meanwhile.
     node_id
         Node number of the drive.
     name

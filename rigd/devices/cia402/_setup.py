@@ -54,7 +54,7 @@ class Outfit:
     Attributes
     ----------
     identity
-        What it says of itself.
+        Identity that the drive reports.
     watchdog, watchdog_s
         What takes the torque off when this computer falls silent, and after how long; infinite
         where nothing does.
@@ -89,9 +89,9 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     Parameters
     ----------
     port
-        Open; nobody else receives from it meanwhile.
+        Open port; nobody else receives from it meanwhile.
     rig
-        With a section ``cia402``.
+        Parameters with a section ``cia402``.
     name
         Name of the drive, for messages.
 
@@ -192,7 +192,7 @@ class _SetUp:
     name
         Name of the drive, for messages.
     wanted
-        What its objects are to hold, by index and sub-index.
+        Values that its objects are to hold, by index and sub-index.
     """
 
     def __init__(
@@ -458,7 +458,7 @@ class _SetUp:
         flags
             Further bits of its COB-ID.
         entries
-            What it carries, as mapping entries.
+            Objects that it carries, as mapping entries.
         parameters
             Further sub-indices of the communication parameters, and what they are to hold where
             the drive has them and they are not 0, or are wanted.

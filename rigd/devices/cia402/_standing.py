@@ -46,9 +46,9 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     Parameters
     ----------
     port
-        Open; nobody else receives from it meanwhile.
+        Open port; nobody else receives from it meanwhile.
     rig
-        With a section ``cia402``.
+        Parameters with a section ``cia402``.
     name
         Name of the drive, for messages.
 

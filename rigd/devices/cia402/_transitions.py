@@ -41,7 +41,7 @@ def left_operation(name: str, statusword: int) -> DeviceError:
     name
         Name of the drive, for messages.
     statusword
-        Which names no fault, and which no emergency message explains.
+        Last statusword; it shows no fault, and no emergency message explains it.
     """
     state = state_of(statusword)
     left = (
@@ -86,7 +86,7 @@ class TorqueFollowing:
     response_s
         Time constant of that lag; 0 for a drive that tells what it was told.
     period_s
-        Between two commands.
+        Time between two commands.
 
     Attributes
     ----------

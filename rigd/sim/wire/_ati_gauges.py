@@ -43,7 +43,7 @@ class AtiGauges:
     Parameters
     ----------
     sensor
-        Its range fixes the gauges' sensitivity.
+        Sensor whose range fixes the gauges' sensitivity.
     counts_per_unit
         Per N and per N·m: the scale of the matrix.
 
@@ -53,7 +53,7 @@ class AtiGauges:
         From gauges to fx, fy, fz, tx, ty, tz, times the counts per unit. Not symmetric, no entry
         zero; each axis divided by its range, its condition number is 3.3.
     counts_per_unit : tuple of int
-        As given.
+        Counts per unit of force and torque, as given.
     quantisation : (6,) float64
         What the rounding of the gauges does at most to each axis, in N and N·m. With the range and
         resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and one

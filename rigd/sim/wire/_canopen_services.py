@@ -64,7 +64,7 @@ class Emergencies:
         code
             Error code.
         register
-            Its bits in the error register; the generic bit is added.
+            Bits of the error in the error register; the generic bit is added.
         vendor
             Up to five bytes of the message.
 
@@ -193,7 +193,7 @@ def add_watches(
     objects
         Gets the object.
     count
-        How many nodes can be watched; with 0 there is no such object.
+        Number of nodes that can be watched; with 0 there is no such object.
     restarted
         Called after a watch was set anew, and so is not lost.
     """
@@ -252,22 +252,22 @@ class Pdo:
     direction
         "r" or "t": what entries must allow in `Entry.mapping`.
     cob_id
-        At power-on, with `DISABLED` or not.
+        COB-ID at power-on, with `DISABLED` or not.
     mapped
         At power-on: index << 16 | sub-index << 8 | bits.
     slots
-        How many entries it can carry at most.
+        Largest number of entries.
     changed
         Called after identifier, type or mapping have changed.
 
     Attributes
     ----------
     can_id : int
-        As it is used; -1 while the PDO is off or empty.
+        Identifier in use; -1 while the PDO is off or empty.
     size : int
         Bytes of the PDO.
     entries : list of Entry
-        What it carries.
+        Objects that it carries.
     """
 
     direction = ""
@@ -376,7 +376,7 @@ class ReceivePdo(Pdo):
     pending : bytes or None
         Received, and waiting for the next SYNC.
     received_s : float or None
-        When the last one came; None before the first.
+        Time of the last one; None before the first.
     applied : bool
         Whether one has taken effect.
     """

@@ -85,9 +85,9 @@ class DriveNode:
     Parameters
     ----------
     rig
-        With a section [cia402].
+        Parameters with a section [cia402].
     simulated
-        What the drive pushes and measures.
+        Plant that the drive pushes and measures.
     advance
         Moves the simulated rig on to this SYNC. It is called at each valid SYNC, in every state,
         frozen or not: simulated time goes on.

@@ -210,7 +210,7 @@ class Line:
     Parameters
     ----------
     sender
-        Whose, for the log.
+        Sender of the frames, for the log.
     deliver
         Takes what gets through.
     postpone

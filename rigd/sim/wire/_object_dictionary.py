@@ -42,7 +42,7 @@ class Abort(Exception):
     Attributes
     ----------
     code : AbortCode
-        What the client is told.
+        SDO abort code for the client.
     """
 
     def __init__(self, code: AbortCode) -> None:
@@ -89,13 +89,13 @@ class Entry:
         Letter of :mod:`struct` for the number ("b", "B", "h", "H", "i", "I", "q", "Q"), or "s" for
         bytes: a text, or a value that nobody here computes with.
     value
-        At power-on.
+        Value at power-on.
     access
         "rw", "ro" or "wo", as seen by SDO.
     mapping
         Into which PDOs it may go: "r", "t", "rt" or none.
     low, high
-        What may be written; by default all that the type holds.
+        Range of values that may be written; by default that of the type.
     text
         The bytes at power-on.
     fixed
@@ -260,7 +260,7 @@ class ObjectDictionary:
         Parameters
         ----------
         file
-            What it says, by index and sub-index.
+            Descriptions in the file, by index and sub-index.
         own
             Indices whose values at power-on are not the file's.
         """
@@ -356,7 +356,7 @@ class SdoServer:
     Parameters
     ----------
     objects
-        What is read and written.
+        Objects that are read and written.
     reply
         Takes the eight bytes of an answer.
     wrote
