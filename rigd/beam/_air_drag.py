@@ -43,7 +43,7 @@ class DragGrid:
 
     @classmethod
     def of(cls, beam: Beam, modes: int, points: int) -> "DragGrid":
-        """Grid of a beam.
+        """Return the grid of a beam.
 
         Parameters
         ----------

@@ -128,7 +128,7 @@ class DeflectionFilter:
 
 
 def _followed(pairs: Complex, rate_hz: float) -> int:
-    """How many modes, from the first on, have poles and are slow enough for the sampling rate."""
+    """Return the number of modes, from the first on, with poles slow enough for the rate."""
     slow = np.abs(pairs[:, 0].imag) < 2 * np.pi * _HIGHEST * rate_hz
     told = slow & ~np.isnan(pairs[:, 0])
     return told.size if told.all() else int(np.argmin(told))

@@ -18,7 +18,7 @@ machine took the processor away, or firmware did."""
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Since a process began."""
+    """Processor time and page faults since a process began."""
 
     cpu_s: float
     page_faults: int
@@ -120,7 +120,7 @@ class Measurement:
 
     @property
     def stalls(self) -> int:
-        """How often it stood still."""
+        """Number of stalls."""
         return int(np.count_nonzero(self.lateness_us >= STALL_US))
 
 
@@ -157,7 +157,7 @@ def measurement(
     cpu_percent: float | None,
     page_faults: int | None,
 ) -> Measurement:
-    """Return what the samples of a record tell.
+    """Return the measurement from the samples of a record.
 
     Parameters
     ----------

@@ -83,7 +83,7 @@ def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
 
 
 def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
-    """Tell which watchdog stands, what stands in for what is missing, and what was accepted."""
+    """Show the watchdog, the replacements of missing objects, and what was accepted."""
     stands, after_s = outfit.watchdog, outfit.watchdog_s
     unproven = stands in (Watchdog.OWN, Watchdog.NONE)
     yield Row(

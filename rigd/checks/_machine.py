@@ -68,7 +68,7 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
-    """Say what a session would be granted of what the profile asks for."""
+    """Show which of the profile's real-time settings a session would be granted."""
     try:
         obtained = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
@@ -138,7 +138,7 @@ _LEAST_RUNTIME = 0.95
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[Row]:
-    """Say what about this computer makes ticks late, and what is done about it.
+    """Show what on this computer makes ticks late, and the remedies.
 
     Parameters
     ----------

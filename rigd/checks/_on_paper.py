@@ -145,7 +145,7 @@ class Travel:
 def worst_travel(
     rig: RigParameters, limits: Limits, blind_s: float, max_speed_rad_s: float = inf
 ) -> Travel:
-    """Return the worst travel while nobody looks.
+    """Return the worst travel while nothing controls the shaft.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def worst_travel(
 
 @dataclass(frozen=True, slots=True)
 class _Blindness:
-    """One way in which nobody looks at the shaft while the torque stays on."""
+    """One way in which the torque stays on while nothing controls the shaft."""
 
     what: str
     duration_s: float

@@ -63,7 +63,7 @@ _ROWS = 5  # angle, velocity, torque without friction, reference speed, sensor t
 
 @dataclass(frozen=True, slots=True)
 class LoopModel:
-    """What the closed loop is made of."""
+    """Parameters of the closed loop."""
 
     rate_hz: float
     beam: Beam | None
@@ -83,7 +83,7 @@ class LoopModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopResponse:
-    """What the loop does, tick by tick; each of shape (n,)."""
+    """Response of the loop, tick by tick; each of shape (n,)."""
 
     angle_rad: Real
     velocity_rad_s: Real

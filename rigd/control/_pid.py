@@ -22,7 +22,7 @@ class ControlDesignError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ControlSettings:
-    """What a profile chooses about the controller."""
+    """Controller settings of a profile."""
 
     pole_rad_s: Annotated[float, Gt(0)]
     """All four poles of the nominal closed loop lie at minus this."""

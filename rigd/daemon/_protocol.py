@@ -32,7 +32,7 @@ class RequestError(Exception):
 
 
 class Request(BaseModel):
-    """What every request may have."""
+    """Fields that every request may have."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -44,7 +44,7 @@ class Request(BaseModel):
 
 
 class Status(Request):
-    """Tell how everything is."""
+    """Report the status of daemon, rig and session."""
 
     command: Literal["status"]
 

@@ -81,7 +81,7 @@ _log = logging.getLogger(NAME)
 
 
 class RigControl(Protocol):
-    """What the daemon needs of :class:`rigd.runner.Rig`."""
+    """Part of :class:`rigd.runner.Rig` that the daemon uses."""
 
     connected: bool
     zero_lost: bool
@@ -223,7 +223,7 @@ class Service:
 
     @property
     def state(self) -> State:
-        """Where the daemon is."""
+        """State of the daemon."""
         return self._states.state
 
     async def open(self) -> None:
@@ -293,7 +293,7 @@ class Service:
         return await self._reset()
 
     def status(self) -> Document:
-        """Tell everything there is to tell."""
+        """Return the status of daemon, rig and session."""
         series = self._series
         look = self._look if self._rig.connected else None
         return {

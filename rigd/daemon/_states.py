@@ -19,7 +19,7 @@ _REMEMBERED = 50
 
 
 class State(StrEnum):
-    """Where the daemon is."""
+    """States of the daemon."""
 
     IDLE = "idle"
     """The devices are closed."""
@@ -61,7 +61,7 @@ _COMES_FROM: Mapping[str, State] = {
 
 
 class IllegalTransitionError(Exception):
-    """A transition that there is not: a mistake in the program."""
+    """A transition that does not exist: an error in the program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +105,12 @@ class StateMachine:
 
     @property
     def since_utc_ns(self) -> int:
-        """When the present state began."""
+        """Time at which the present state began."""
         return self.history[-1].utc_ns if self.history else self._began_utc_ns
 
     @property
     def reason(self) -> str:
-        """Why it is the present one."""
+        """Reason of the present state."""
         return self.history[-1].reason if self.history else "the daemon was started"
 
     def move(self, after: State, reason: str) -> None:

@@ -86,7 +86,7 @@ class EdsEntry:
 
 @dataclass(frozen=True, slots=True)
 class Eds:
-    """What a file tells of a drive."""
+    """Content of a drive's EDS or DCF file."""
 
     path: Path
     node_id: int
@@ -205,7 +205,7 @@ def _text(path: Path) -> str:
 
 
 def _sections(text: str, path: Path) -> Sections:
-    """Take a file apart; what is neither section nor key is passed over.
+    """Parse a file into sections; lines that are neither section nor key are ignored.
 
     Where a section or key stands twice, the first one counts.
     """

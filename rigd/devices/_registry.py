@@ -63,7 +63,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
 
 
 def reality(rig: RigParameters) -> Reality:
-    """Tell what would move if the devices of a rig were opened now."""
+    """Return what would move if the devices of a rig were opened now."""
     if rig.devices.drive == "sim":
         return Reality.SIMULATED
     simulator = find_simulator(rig.name)
@@ -86,7 +86,7 @@ def what_moves(rig: RigParameters, moving: Reality) -> str:
 
 
 def simulated_differently(rig: RigParameters) -> list[str]:
-    """Say in what the running simulated rig, if any stands in, differs from the profile's."""
+    """List the differences of a running simulated rig, if any, from the profile's."""
     simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
     return [] if simulator is None else differences(rig, simulator)
 

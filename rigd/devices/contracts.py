@@ -41,7 +41,7 @@ def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
 
 @dataclass(frozen=True, slots=True)
 class LineHealth:
-    """What happened on a device's line since it was connected; None is what is not known.
+    """Health of a device's line since it was connected; None: not known.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Drive(Protocol):
         """
 
     def health(self) -> LineHealth:
-        """Tell how its line is doing; quick enough for the loop, now and then."""
+        """Return the health of its line; quick enough for an occasional call in the loop."""
 
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises."""
@@ -162,7 +162,7 @@ class WrenchSensor(Protocol):
         """Return the wrench that was asked for."""
 
     def health(self) -> LineHealth:
-        """Tell how its line and the sensor are doing; quick enough for the loop, now and then."""
+        """Return the health of line and sensor; quick enough for an occasional call in the loop."""
 
     def close(self) -> None:
         """Release the line."""

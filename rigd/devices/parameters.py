@@ -73,7 +73,7 @@ class Actuation:
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """What only a simulated rig has: noise, and how it is drawn."""
+    """Parameters of a simulated rig only: noise, and how it is drawn."""
 
     torque_noise_nm: NonNegative
     """Standard deviation of white noise on each torque axis, each sample."""
@@ -118,7 +118,7 @@ class CanBus:
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
-    """Which replies a tick works with."""
+    """Acquisition: which replies a tick works with."""
 
     mode: Literal["same_tick", "previous_tick"]
     """A tick waits for the replies to its own requests, or takes those of the tick before."""

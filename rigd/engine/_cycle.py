@@ -444,7 +444,7 @@ def observe_rest(
 
 
 def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
-    """Return the watch for the rig of a profile; it stays for as long as the rig is connected.
+    """Return the limit monitor of a profile's rig; it is kept while the rig is connected.
 
     Parameters
     ----------
@@ -469,7 +469,7 @@ def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
 
 
 def remember_heat(profile: Profile, heat_nm2: float) -> None:
-    """Write down how warm the motor is now, for the next connection of this user.
+    """Store the heat of the motor for the next connection of this user.
 
     Without a place for it, the next one takes the motor for cold.
     """
@@ -483,7 +483,7 @@ def remember_heat(profile: Profile, heat_nm2: float) -> None:
 
 
 def recalled_heat_nm2(profile: Profile) -> float:
-    """Return how warm the motor is still after the last connection, in (N·m)²; 0.0: not known.
+    """Return the motor's heat left from the last connection, in (N·m)²; 0.0: not known.
 
     It has cooled down since by its thermal time constant.
     """

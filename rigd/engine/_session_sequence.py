@@ -38,7 +38,7 @@ _SWINGING = 2.0
 
 
 class SessionEnd(Exception):
-    """A session ends before its time; carries the outcome and the reason.
+    """A session ends early; carries the outcome and the reason.
 
     Attributes
     ----------

@@ -48,7 +48,7 @@ class Phase(IntEnum):
 
     @property
     def words(self) -> str:
-        """What the operator reads."""
+        """Name of the phase for the operator."""
         return _WORDS.get(self, self.name.lower())
 
 
@@ -224,7 +224,7 @@ class Topic:
         return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:
-        """Return the records a second of a recorded session; None where there is no saying."""
+        """Return the records a second of a recorded session; None where the rate is not fixed."""
         return rate_hz / self.every if self.every else None
 
 
@@ -271,7 +271,7 @@ class Channels:
 
     @property
     def specs(self) -> ChannelSpecs:
-        """What to hand to a child process."""
+        """Descriptors and layout to hand to a child process."""
         return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
 
     def ask_to_stop(self) -> None:

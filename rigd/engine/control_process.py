@@ -114,7 +114,7 @@ def attend(
 
 
 class _Attendance:
-    """Connected devices, and what is ordered of them."""
+    """Connected devices, and the requests of the supervisor."""
 
     def __init__(
         self,

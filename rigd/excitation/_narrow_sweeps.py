@@ -162,7 +162,7 @@ def _complaint(detail: ErrorDetails) -> str:
 
 
 def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
-    """Put together what is one mode, seen by several fits."""
+    """Group the entries of several fits that are one mode."""
     group: list[_Entry] = []
     for entry in sorted(entries, key=_frequency_hz):
         if group and _frequency_hz(entry) > SAME_MODE * _frequency_hz(group[0]):
@@ -200,7 +200,7 @@ _RIDGE: Final = 1e-12
 
 
 class Foresight(Protocol):
-    """What is known of the rig before it moves."""
+    """Loop preview: what is known of the rig before it moves."""
 
     @property
     def beam(self) -> Beam:

@@ -223,7 +223,7 @@ def _judge(
     solution: Real,
     delay_s: float,
 ) -> Fit:
-    """Take the bias by noise off the solution, and say how far to trust it."""
+    """Remove the bias by noise from the solution, and estimate its uncertainty."""
     chosen = np.flatnonzero(free)
     normal = np.zeros((chosen.size, chosen.size))
     bias = np.zeros(chosen.size)
@@ -287,7 +287,7 @@ torque constant."""
 
 
 class EstimateError(ValueError):
-    """The windows do not tell the motor's data; the message says why."""
+    """The windows do not determine the motor's data; the message says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,7 +317,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class MotorEstimate:
-    """What the windows tell of the motor, at its output shaft."""
+    """Estimate of the motor, at its output shaft."""
 
     inertia_kg_m2: Quantity
     viscous_nm_s_per_rad: Quantity

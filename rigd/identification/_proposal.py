@@ -167,7 +167,7 @@ class Proposal:
 
 
 def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> Proposal:
-    """Set an estimate beside a profile.
+    """Compare an estimate with a profile.
 
     Parameters
     ----------

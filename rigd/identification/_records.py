@@ -18,7 +18,7 @@ _USELESS = int(
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What some sessions of one rig hold for the estimate."""
+    """Data of some sessions of one rig for the estimate."""
 
     windows: list[Window]
     timing: Timing

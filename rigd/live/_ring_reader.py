@@ -88,7 +88,7 @@ Records = TypeVar("Records")
 
 @dataclass(frozen=True, slots=True)
 class Harvest:
-    """What came since the last time.
+    """Records that came since the last time, as drawings.
 
     Attributes
     ----------

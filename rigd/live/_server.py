@@ -128,12 +128,12 @@ class RerunProgram:
 
     @property
     def grpc_port(self) -> int:
-        """Where it takes connections; 0: not yet."""
+        """Port for connections; 0: none yet."""
         return self._ports.get(_LISTENING, 0)
 
     @property
     def page_port(self) -> int:
-        """Where it serves the web viewer's page, if it is to; 0: not yet."""
+        """Port of the web viewer's page, if it is to serve one; 0: none yet."""
         return self._ports.get(_SERVING_PAGE, 0)
 
     @property
@@ -216,12 +216,12 @@ class LiveAddress:
 
     @property
     def proxy_url(self) -> str:
-        """Where native viewers connect."""
+        """Address for native viewers."""
         return proxy_url(LOOPBACK, self.grpc_port)
 
     @property
     def page_url(self) -> str:
-        """What to open in a browser."""
+        """Address to open in a browser."""
         return f"http://{LOOPBACK}:{self.page_port}"
 
     @property

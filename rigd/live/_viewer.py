@@ -213,12 +213,12 @@ class Viewer:
 
     @property
     def last_words(self) -> str:
-        """What it said last."""
+        """Last lines of its log."""
         return self._program.last_words
 
     @property
     def control_url(self) -> str:
-        """Where the viewer itself takes orders; empty: not yet."""
+        """Address at which the viewer accepts commands; empty: none yet."""
         port = self._program.grpc_port
         return proxy_url(_HOSTS[0], port) if port else ""
 

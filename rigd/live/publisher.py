@@ -174,7 +174,7 @@ class _Shown:
         self._tell()
 
     def _tell(self) -> None:
-        """Put on the board what another publisher, if it takes over, has to know."""
+        """Write to the board what another publisher needs to know if it takes over."""
         board = self._board
         board[Word.LIVE_DROPPED] = self.dropped
         shown = self.intake.next - self.backlog.samples
@@ -192,7 +192,7 @@ class _Shown:
         self.over = True
 
     def send(self, feed: Feed, *, connected: bool) -> None:
-        """Send what waits; `connected` anew, with the frame of the picture."""
+        """Send what waits; if newly `connected`, with the frame of the scene."""
         if connected:
             self.backlog.forgive()
         if self.backlog:
@@ -279,7 +279,7 @@ _RATE_LOOKS: Final = 4
 
 
 class Vitals:
-    """Looks at the board a few times a second while a session is run.
+    """Reads the board a few times a second while a session is run.
 
     Parameters
     ----------

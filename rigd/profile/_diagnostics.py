@@ -312,7 +312,7 @@ def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _sections(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sections that the chosen devices lack, and those that nobody reads."""
+    """Yield sections that the chosen devices lack, and those that none of them uses."""
     drive, sensor = values["devices.drive"], values["devices.sensor"]
     needed = {*WIRING.get(drive, ()), *WIRING.get(sensor, ())}
     present = {

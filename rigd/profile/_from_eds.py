@@ -36,7 +36,7 @@ class UnusableDriveError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What no EDS tells and a profile has to."""
+    """Setting that no EDS states and a profile needs."""
 
     key: str
     text: str
@@ -153,7 +153,7 @@ class Draft:
 
     @property
     def doubts(self) -> list[str]:
-        """What the operator has to know of this drive, in sentences."""
+        """Remarks on this drive for the operator, in sentences."""
         findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
         told = [f.sentence for f in findings if f.sentence]
         return told + [

@@ -92,7 +92,7 @@ class LiveView:
         return told
 
     def finish(self, outcome: str, reason: str) -> None:
-        """Take note of the end of the session that is shown; how it ended may be unknown."""
+        """Note the end of the session that is shown; its outcome may be unknown."""
         if self._session is not None:
             self._session = None
             ends = tuple(ring.written for ring in self._crew.channels.rings)
@@ -105,7 +105,7 @@ class LiveView:
             self._listen(0.1)
 
     def _start(self) -> None:
-        """Set a new process to work."""
+        """Start a new process."""
         self._heard = False
         self._lost = ""
         self._pulse = Pulse()

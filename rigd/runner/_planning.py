@@ -39,7 +39,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A session that may be run."""
+    """A session that stays within the limits."""
 
     prediction: Prediction
     warnings: tuple[str, ...]
@@ -48,7 +48,7 @@ class Plan:
 
 
 class Foresight:
-    """What an excitation that is made for one rig may know of it.
+    """Loop preview: what an excitation made for one rig may know of it.
 
     Parameters
     ----------

@@ -203,7 +203,7 @@ def another_path(path: Path) -> Path:
 
 
 def what_is_kept(path: Path | None) -> str:
-    """Say what there is of a session that failed, once its processes have ended.
+    """Say what is kept of a session that failed, once its processes have ended.
 
     Parameters
     ----------

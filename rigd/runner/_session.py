@@ -103,7 +103,7 @@ class _NameTakenError(SessionFailedError):
 
 @dataclass(frozen=True, slots=True)
 class SessionResult:
-    """How a session ended."""
+    """Result of a session."""
 
     path: Path | None
     """Path of the file; None: it ended before tick 0, or no complete file could be made."""
@@ -152,7 +152,7 @@ class SessionResult:
 
 @dataclass(frozen=True, slots=True)
 class SessionProgress:
-    """Where a running session is."""
+    """Progress of a running session."""
 
     phase: Phase
     tick: int
@@ -216,7 +216,7 @@ class Session:
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
-        """Run it to its end.
+        """Run the session to its end.
 
         Raises
         ------

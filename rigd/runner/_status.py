@@ -42,7 +42,7 @@ class SignalStatus:
 
 
 class SignalWatch:
-    """Looks at the samples in the ring, as one who may miss some and holds nobody up.
+    """Observes the samples in the ring; it may miss some and delays nobody.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class SignalWatch:
 
 @dataclass(frozen=True, slots=True)
 class ProcessStatus:
-    """How one process of the table is."""
+    """Status of one process of the table."""
 
     name: str
     pid: int
@@ -118,7 +118,7 @@ class ProcessStatus:
 
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
-    """What came of one topic of the table."""
+    """Status of one topic of the table."""
 
     name: str
     written: int
@@ -177,7 +177,7 @@ class StatusWatch:
         self._signals = SignalWatch(rate_hz)
 
     def look(self, crew: Crew) -> RigStatus:
-        """Return how it stands now."""
+        """Return the status now."""
         board = crew.channels.board
         load_ppm = board.known(Word.BUS_LOAD_PPM)
         return RigStatus(

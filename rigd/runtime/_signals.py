@@ -85,7 +85,7 @@ def held_back() -> Iterator[None]:
 
 
 def ignore() -> None:
-    """Let these signals pass."""
+    """Ignore the signals that ask for an end."""
     for number in _STOPPING:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)

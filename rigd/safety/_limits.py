@@ -21,7 +21,7 @@ BUFFERED_S = 16.0
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What ends a session; from which part of it on there is a warning, the table says.
+    """Levels that end a session; the table says from which part on there is a warning.
 
     The angle is relative to the rig's zero; all but the free space of the disk are magnitudes that
     must not be exceeded.
@@ -106,7 +106,7 @@ class Violation:
 
 
 class Checked(Enum):
-    """By whom an interlock is checked, and when."""
+    """Place and time of an interlock's check."""
 
     TICK = "loop, every tick"
     LOOK = "loop, every 64 ticks"
@@ -115,7 +115,7 @@ class Checked(Enum):
 
 
 class Action(Enum):
-    """What follows when a limit is left."""
+    """Consequence of a violated limit."""
 
     FAULT = "torque off, session ends as fault"
     STOP = "torque off, session ends as stopped"

@@ -29,7 +29,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, slots=True)
 class SessionInfo:
-    """What there is to know of a session file without analysing it."""
+    """Summary of a session file without analysing it."""
 
     path: Path
     size_bytes: int

@@ -58,7 +58,7 @@ class McapDamageError(Exception):
 
 
 class Allowance:
-    """What one file has taken so far."""
+    """Memory and time that one file has taken so far."""
 
     def __init__(self) -> None:
         self._steps = 0

@@ -86,7 +86,7 @@ class Stretch:
 
 @dataclass(slots=True)
 class McapContents:
-    """What was read of a file, as far as it could be, but for the messages."""
+    """Content of a file as far as it could be read, without the messages."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)

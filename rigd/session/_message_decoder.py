@@ -130,7 +130,7 @@ _SAME: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where the fields stand in messages of one length whose bytes are `pattern` under `mask`."""
+    """Places of the fields in messages of one length whose bytes are `pattern` under `mask`."""
 
     mask: npt.NDArray[np.uint8]
     pattern: npt.NDArray[np.uint8]
@@ -141,7 +141,7 @@ class _Places:
 
 
 class Keeper(Protocol):
-    """Where decoded messages go."""
+    """Destination of decoded messages."""
 
     def room(self, count: int) -> npt.NDArray[np.void]:
         """Return an array (count,) of the decoder's dtype to be filled with the next messages."""

@@ -71,7 +71,7 @@ _BEGINNING_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What was made of a file."""
+    """Result of a recovery."""
 
     source: Path
     path: Path | None

@@ -119,7 +119,7 @@ class SimulatedDrive:
         return torque_nm
 
     def health(self) -> LineHealth:
-        """Tell that there is no line."""
+        """Report that there is no line."""
         return LineHealth()
 
     def disable(self) -> None:
@@ -193,7 +193,7 @@ class SimulatedSensor:
         """Nothing to connect to."""
 
     def calibration(self) -> dict[str, object]:
-        """Return what a real sensor would say of itself."""
+        """Return the calibration as a real sensor would report it."""
         return {
             "device": "simulated force-torque sensor",
             "axes": ["fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"],
@@ -218,7 +218,7 @@ class SimulatedSensor:
         return fx, fy, fz, tx, ty, tz
 
     def health(self) -> LineHealth:
-        """Tell that there is no line, and that all is well."""
+        """Report that there is no line, and no fault."""
         return LineHealth(status=0)
 
     def sample(self) -> None:

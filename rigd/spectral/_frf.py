@@ -182,7 +182,7 @@ def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
 
 
 def segment_count(samples: int, segment_length: int, overlap: int) -> int:
-    """Whole segments that fit a record; what is left over at its end goes unused."""
+    """Count the whole segments in a record; a rest at its end is unused."""
     return max(0, (samples - overlap) // (segment_length - overlap))
 
 
@@ -272,7 +272,7 @@ class CrossSpectra:
 
     @classmethod
     def of_nothing(cls, bins: int) -> "CrossSpectra":
-        """Return sums to begin with."""
+        """Return sums of no segment."""
         return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
 
     def copy(self) -> "CrossSpectra":

@@ -36,7 +36,7 @@ LEAST_SHARE: Final = 0.25
 
 @dataclass(frozen=True, slots=True)
 class RunningEstimate:
-    """What is known of a response so far.
+    """Estimate of a response so far.
 
     Attributes
     ----------

@@ -88,7 +88,7 @@ class Antenna:
         self._trail: list[_Moment] = []  # not yet sent
 
     def frame(self) -> list["Drawing"]:
-        """Return what stays as it is."""
+        """Return the static drawings."""
         return static_drawings()
 
     def samples(self, samples: Records) -> list["Drawing"]:
@@ -187,7 +187,7 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
 
 
 def label(tip_m: float) -> str:
-    """Return what is said of the tip's deflection, to two figures or 0.1 mm."""
+    """Return the text of the tip's deflection, to two figures or 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return f"tip bends ± {text} mm, drawn × {FACTOR:g}"
@@ -289,7 +289,7 @@ def _draw_lines(stream: "RecordingStream", entity: str, moments: Sequence[_Momen
 
 
 def _draw_label(stream: "RecordingStream", t_ns: int, tip_m: float) -> None:
-    """Say how far the tip really bends."""
+    """Label the true deflection of the tip."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

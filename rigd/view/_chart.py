@@ -40,7 +40,7 @@ _SHADE_OPACITY = 0.18
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """What runs along one side of a chart.
+    """Axis of a chart.
 
     Attributes
     ----------

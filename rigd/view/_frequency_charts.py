@@ -69,7 +69,7 @@ class SweepResponse:
         )
 
     def estimate(self) -> RunningEstimate | None:
-        """Return what is known so far, None as long as that is too little."""
+        """Return the estimate so far, None as long as there are too few samples."""
         return self._running.estimate()
 
 
@@ -370,7 +370,7 @@ class SpectrogramChart:
 def _place_image(
     stream: "RecordingStream", entity: str, corners: Real, shape: tuple[int, ...]
 ) -> None:
-    """Say where an image of levels (0–255) lies, and in which colours.
+    """Log the place of an image of levels (0–255), and its colours.
 
     Parameters
     ----------

@@ -106,7 +106,7 @@ class Source:
 
     @property
     def ticks(self) -> str:
-        """Where Rerun keeps values that the axes must hold besides."""
+        """Entity in Rerun of the invisible values that stretch the axes."""
         return f"{self.entity}/ticks"
 
     def columns(self, records: Records) -> dict[str, Values]:

@@ -317,7 +317,7 @@ def check_rrd_file(path: Path) -> None:
 
 @contextlib.contextmanager
 def _told(path: Path, part: Path) -> Iterator[None]:
-    """Tell what kept a file from being written."""
+    """Say what kept a file from being written."""
     try:
         yield
     except FileExistsError:

@@ -86,7 +86,7 @@ _LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Readings of one moment; None is one that is not known (there is no bus, say).
+    """Health readings at one time; None where a value is not known (without a bus, say).
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
 
 
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
-    """Return a Markdown table of how the session is doing; what is not known is left out."""
+    """Return a Markdown table of the session's health; unknown values are left out."""
     elapsed_s = 1e-9 * t_ns
     total_s = subject.ticks / subject.rate_hz
     rows = [

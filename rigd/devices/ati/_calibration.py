@@ -52,7 +52,7 @@ _LEAST_RANK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What one calibration says.
+    """One calibration of a sensor.
 
     Parameters
     ----------

@@ -215,7 +215,7 @@ class AtiCanSensor:
         return self._evaluate(answer)
 
     def health(self) -> LineHealth:
-        """Tell what went wrong between this computer and the sensor, and its status word."""
+        """Return the health of the line to the sensor, and the sensor's status word."""
         errors = self.polls.lost + self.bus_errors
         return LineHealth(errors=errors, status=self._status_word)
 

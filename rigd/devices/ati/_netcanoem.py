@@ -106,7 +106,7 @@ class _Frames:
 
 
 class GaugePolls:
-    """The polls, and what came of them.
+    """Polls of a box, and their answers.
 
     Parameters
     ----------
@@ -154,13 +154,13 @@ class GaugePolls:
         self.forget()
 
     def close(self) -> None:
-        """Use none."""
+        """Stop using the exchange."""
         self._exchange = None
         self.forget()
 
     @property
     def exchange(self) -> CanExchange:
-        """The open one.
+        """The open exchange.
 
         Raises
         ------

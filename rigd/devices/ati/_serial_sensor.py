@@ -216,7 +216,7 @@ class AtiSerialSensor:
         return False
 
     def health(self) -> LineHealth:
-        """Tell how the line is doing, and the status word that was read before the stream."""
+        """Return the health of the line, and the status word that was read before the stream."""
         return LineHealth(
             bits=self._arrived * _BITS_PER_BYTE,
             bit_rate_bit_s=self._settings.baud,

@@ -35,7 +35,7 @@ _STEADY_PERIODS = 3
 
 
 class Counter(Protocol):
-    """Where replies are counted as they come."""
+    """Count of the replies that have come."""
 
     replies: int
     """Since somebody set this to zero, whatever was in them."""

@@ -301,7 +301,7 @@ class PythonCanPort:
 
 
 def _words(error: Exception) -> str:
-    """Return what an adapter's driver says, and by which error: some say nothing else."""
+    """Return the text and the type of an adapter's error: some have no text."""
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 

@@ -162,7 +162,7 @@ class Cia402Drive:
         return self._outfit
 
     def statement(self) -> dict[str, str]:
-        """Return what a session's file has to say of the drive's own safeguards.
+        """Return the drive's own safeguards as metadata of a session file.
 
         Returns
         -------
@@ -307,7 +307,7 @@ class Cia402Drive:
         return sent / self._per_mille_per_nm
 
     def health(self) -> LineHealth:
-        """Tell how the bus is doing, as far as its frames are sent or received here."""
+        """Return the health of the bus, as far as its frames are sent or received here."""
         if self._node is None:
             return LineHealth()
         exchange = self._node.exchange
@@ -385,7 +385,7 @@ class Cia402Drive:
             self._link.close()
 
     def _own_end(self) -> str:
-        """Return how a drive ends that nobody can switch off, as a sentence."""
+        """Say what takes the torque off a drive that cannot be switched off."""
         outfit = self._outfit
         if outfit is None or outfit.watchdog is Watchdog.NONE:
             return "It has no watchdog that would end it by itself."

@@ -382,7 +382,7 @@ class Node:
         return True
 
     def await_alarm(self) -> None:
-        """Give a drive that has left operation a little time to say why."""
+        """Wait briefly for the reason of a drive that has left operation."""
         inbox = self.inbox
         if not inbox.alarm:
             self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)

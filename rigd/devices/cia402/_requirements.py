@@ -28,7 +28,7 @@ ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
 
 
 class Access(Flag):
-    """What rigd does with an object."""
+    """Kind of access to an object."""
 
     READ = auto()
     """Read by SDO."""
@@ -41,7 +41,7 @@ class Access(Flag):
 
 
 class Watchdog(Enum):
-    """What in the drive takes the torque off when this computer falls silent."""
+    """Watchdog in the drive that takes the torque off when this computer falls silent."""
 
     HEARTBEAT = "heartbeat consumer (1016:1)"
     RPDO_DEADLINE = "deadline of the RPDO (1400:5)"

@@ -49,7 +49,7 @@ _DUPLICATE_WATCHES = 127
 
 @dataclass(frozen=True, slots=True)
 class Outfit:
-    """What a drive turned out to have when it was set up.
+    """Equipment of a drive, as found when it was set up.
 
     Attributes
     ----------
@@ -299,7 +299,7 @@ class _SetUp:
         self._clear(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Have the drive not make the shaft ever faster, should nobody take a torque back."""
+        """Limit the speed that a torque which is never withdrawn can lead to."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
@@ -326,7 +326,7 @@ class _SetUp:
             self.settle(requirement(objects.INTERPOLATION_TIME, sub))
 
     def configure_guards(self) -> Watchdog:
-        """Set what the drive does when this computer falls silent, and how it is heard itself.
+        """Set the drive's reaction to this computer's silence, and its own heartbeat.
 
         Returns
         -------

@@ -42,7 +42,7 @@ class Grade(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What the file tells of one object, or of the drive as a whole."""
+    """Finding about one object, or about the drive as a whole."""
 
     what: str
     """``6072 Max torque``, or in words."""
@@ -174,7 +174,7 @@ class _Judge:
         return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
 
     def _watchdog(self) -> Finding:
-        """Tell what in the drive takes the torque off when this computer falls silent."""
+        """Judge which watchdog takes the torque off when this computer falls silent."""
         found = self._stands()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:

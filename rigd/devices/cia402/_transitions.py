@@ -112,7 +112,7 @@ class TorqueFollowing:
         self._departed = 0
 
     def command(self, per_mille: int) -> None:
-        """Note what the drive is told."""
+        """Note the torque that is commanded."""
         self._commanded = per_mille
         before = self._before = self._last
         self._last = before + self._share * (per_mille - before)

@@ -122,7 +122,7 @@ class LockStep:
         return passed
 
     def left_alone(self, now_ns: int) -> None:
-        """Wait no longer: nobody is connected any more."""
+        """End the waiting: nobody is connected any more."""
         self._stands_until_ns = min(self._stands_until_ns, now_ns)
 
 

@@ -21,7 +21,7 @@ _HISTORY = 8
 
 
 class Emergencies:
-    """What is wrong at present, and what was.
+    """Emergency messages: present errors, and the history.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class HeartbeatWatch:
 
     @property
     def node_id(self) -> int:
-        """Who is watched; 0 for nobody."""
+        """Number of the watched node; 0 for none."""
         return _watched(self._entry.value)
 
     def beat(self, now_s: float) -> None:

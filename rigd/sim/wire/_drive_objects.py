@@ -135,7 +135,7 @@ class StateMachine:
             self._enter(State.FAULT)
 
     def tick(self, now_s: float) -> None:
-        """End what takes its time."""
+        """Complete transitions that take time."""
         if self.state not in (State.QUICK_STOP, State.FAULT_REACTION):
             return
         if self._ramp_since_s is None:

@@ -18,7 +18,7 @@ from rigd.devices.contracts import DeviceError
 
 
 class WrongUseError(ValueError):
-    """What was asked for cannot be had; the message says why, for the operator."""
+    """A request that cannot be met; the message says why, for the operator."""
 
 
 # Specification of a fault
@@ -37,7 +37,7 @@ class FaultError(WrongUseError):
 
 @dataclass(frozen=True, slots=True)
 class _Key:
-    """What may stand behind a key, and what counts where the key is left out."""
+    """Values that a key may have, and its default."""
 
     read: Callable[[str], Value]
     says: str

@@ -119,7 +119,7 @@ class Hub:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         return len(self._clients)
 
     def open(self) -> None:

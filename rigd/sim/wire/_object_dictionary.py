@@ -52,7 +52,7 @@ class Abort(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a device's file says of one sub-index."""
+    """Description of one sub-index in a device's file."""
 
     kind: str
     """Type, as in `Entry`."""
@@ -167,7 +167,7 @@ class Entry:
 
     @property
     def most_bytes(self) -> int:
-        """How many bytes may be written at most."""
+        """Largest number of bytes that may be written."""
         if self.kind != "s":
             return self.bits // 8
         return len(self.text) if self.fixed else _LONGEST_TEXT
@@ -489,7 +489,7 @@ _PDO_DIRECTIONS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww":
 
 @dataclass(frozen=True, slots=True)
 class DeviceFile:
-    """What stands in such a file."""
+    """Content of an EDS or DCF file."""
 
     name: str
     entries: Mapping[tuple[int, int], Description]

@@ -218,7 +218,7 @@ _IDLE_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SimulatorOptions:
-    """How a simulated rig is run."""
+    """Options of a simulated rig."""
 
     lock_step: bool = False
     """Move on by one period a SYNC instead of by wall time."""
@@ -440,7 +440,7 @@ class _Process:
         return world
 
     def _sync_timeout_s(self) -> float:
-        """How long the drive bears that no SYNC comes."""
+        """Time after which the drive faults without a SYNC."""
         drive = self._rig.cia402
         assert drive is not None
         if drive.own_watchdog_s:
