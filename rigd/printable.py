@@ -1,4 +1,4 @@
-"""Text from outside, fit for a terminal and for a line of a message."""
+"""Printable text: what comes from outside, made fit for a terminal and for a message."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Shape of the beam from the measured motor angle, as it happens.
+"""Deflection of the beam from the measured motor angle, computed while it moves.
 
 What turns with the motor sees the beam bend by ``w(x) = y(x) - x theta``, clamped at the axis. The
 modes of the undamped clamped–free beam, which fractional damping does not couple, give it exactly::

@@ -1,4 +1,4 @@
-"""The loop itself, measured: real sessions of the real processes on a simulated rig."""
+"""Loops to measure: real sessions of the real processes on a simulated rig."""
 
 import os
 import subprocess

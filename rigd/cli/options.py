@@ -1,4 +1,4 @@
-"""What several commands share: options, exit codes, progress."""
+"""Options, exit codes and progress that several commands share."""
 
 import contextlib
 import time

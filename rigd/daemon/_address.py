@@ -1,4 +1,4 @@
-"""Where the daemon of a rig listens, and how its socket is made and found."""
+"""Address of a rig's daemon: its socket, how it is made and found."""
 
 import errno
 import grp

@@ -1,4 +1,4 @@
-"""``rigd serve`` from its first to its last moment: lock, socket, rig, signals."""
+"""Main program of ``rigd serve``: lock, socket, rig and signals, from start to end."""
 
 import asyncio
 import logging

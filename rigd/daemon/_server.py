@@ -1,4 +1,4 @@
-"""The daemon's socket: lines in, lines out, and clients that may be slow, rude, or a thousand.
+"""Server on the daemon's socket: lines in, lines out, for many clients, slow and rude ones too.
 
 Nothing that a client does may cost the supervisor of a running session more than a moment: lines
 are short, taken one at a time, and at a bounded pace; what a client does not read is kept up to a

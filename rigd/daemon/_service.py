@@ -1,4 +1,4 @@
-"""What the daemon does: it owns a rig, obeys requests, and says what happens. No sockets here.
+"""Service of the daemon: it owns a rig, obeys requests, and publishes events. No sockets here.
 
 Everything runs in one thread but the calls of the rig that take their time, which run one after the
 other in a second one. A stop does not wait for that one.

@@ -1,4 +1,4 @@
-"""The drivers a profile can name, found without importing those it does not name."""
+"""Registry of drivers: those that a profile names, found without importing the others."""
 
 import importlib
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Drive and sensor on their wires: connected as one rig, and reset by the operator."""
+"""Drive and sensor on a CAN bus or serial line, opened as one rig, and the reset of a fault."""
 
 from dataclasses import replace
 from pathlib import Path

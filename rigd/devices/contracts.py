@@ -1,4 +1,4 @@
-"""What the 1 kHz cycle asks of a drive and of a force-torque sensor.
+"""Contracts between the 1 kHz cycle and its devices: a drive and a force-torque sensor.
 
 Real and simulated devices stand behind the same two contracts, and one conformance suite runs on
 every implementation. Constructors touch no hardware; ``connect`` does.

@@ -1,4 +1,4 @@
-"""What a profile says of the hardware: plain data, one class a device, units in the names.
+"""Hardware parameters of a profile: plain data, one class per device, units in the names.
 
 The ranges (``Gt``, ``Ge``, …) are enforced where a profile is loaded (:mod:`rigd.profile`).
 """

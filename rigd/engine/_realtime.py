@@ -1,4 +1,4 @@
-"""What the processes of a rig ask of the scheduler: each is tried, and what was obtained recorded.
+"""Real-time settings of a rig's processes: each is tried, and what was obtained is recorded.
 
 The control process gets all that a 1 kHz loop wants (:func:`obtain`). Supervisor and recorder get a
 priority below the loop's and above that of every ordinary program (:class:`Precedence`), for nobody

@@ -1,4 +1,4 @@
-"""A session from rest to rest: tare, enable, hold, record, return, disable, check the tare.
+"""Sequence of a session: tare, enable, hold, record, return, disable, check the tare.
 
 The record is what lies between tick 0 and the last tick of the excitation; everything else runs
 through the same cycle and leaves its results in the metadata.

@@ -1,4 +1,4 @@
-"""An excitation by its name and its parameters, as a request or a command line gives them."""
+"""Excitations by name and parameters, as a request or a command line gives them."""
 
 import inspect
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""What viewers connect to: a Rerun server, the page for browsers, and the file that tells of both.
+"""Server of the live view: Rerun's server, the page for browsers, and the file with the address.
 
 Server
     It takes what the publisher sends, and passes it on to any number of viewers. It is a process of

@@ -1,4 +1,4 @@
-"""A profile for a drive that nobody has connected yet: from its EDS and another profile."""
+"""Draft of a profile for a drive not yet connected: from its EDS and another profile."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""What a profile consists of: its sections, and the settings that no other module declares."""
+"""Schema of a profile: its sections, and the settings that no other module declares."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields

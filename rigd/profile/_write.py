@@ -1,4 +1,4 @@
-"""A new profile in the text of another: other values, each with its source and its reason."""
+"""Writing of a profile in the text of another: new values, each with its source and its reason."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""What a session will do, before anything moves: stability of the loop, peaks, limits."""
+"""Planning of a session, before anything moves: stability of the loop, peaks, limits."""
 
 import math
 from collections.abc import Mapping

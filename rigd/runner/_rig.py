@@ -1,4 +1,4 @@
-"""A rig as whoever runs sessions on it sees it: connect, run, tare, zero, status, disconnect."""
+"""The rig on which sessions are run: connect, run, tare, zero, status, disconnect."""
 
 import contextlib
 import gc

@@ -1,4 +1,4 @@
-"""The drive on its bus: set-up, the exchange of every tick, its guards, enabling and disabling.
+"""Driver of a CiA 402 drive: set-up, the exchange of every tick, guards, enabling and disabling.
 
 A TPDO does not say which SYNC it answers: :mod:`rigd.devices.canbus._exchange` counts both, and
 where that is in doubt a SYNC is left out. A drive that takes more than a period for its answer is

@@ -1,4 +1,4 @@
-"""What rigd asks of a drive's object dictionary: one table for set-up, for EDS files and for docs.
+"""Requirements on a drive's object dictionary: one table for set-up, EDS files and docs.
 
 An object is *core* where no session is possible without it, and *optional* where something else
 stands in. An optional object that is read-only is fine as long as it holds what is needed

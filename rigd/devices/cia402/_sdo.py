@@ -1,4 +1,4 @@
-"""Reading and writing of the drive's objects by SDO, while no cycle runs.
+"""SDO access to the drive's objects, while no cycle runs.
 
 The canopen library does it, with a thread that receives; both are gone when the access is left.
 An object's type is taken from the drive's EDS file where the profile names one, else from

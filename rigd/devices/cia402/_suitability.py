@@ -1,4 +1,4 @@
-"""Can rigd drive this with torque? The answer of an EDS file, before anything is connected.
+"""Suitability of a drive for torque control, judged by its EDS file before it is connected.
 
 The file is compared with the table of :mod:`rigd.devices.cia402._requirements`, which the set-up
 goes by. What it does not state the drive is asked when it is connected.
