@@ -83,12 +83,6 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
     )
 
 
-def _quick_length(least: int) -> int:
-    """Length of which a transform is quick: at most an eighth more than the least one."""
-    unit = 1 << max(0, least.bit_length() - 4)
-    return -(-least // unit) * unit
-
-
 def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
     """Motion of the tip over the angle.
 
@@ -120,3 +114,9 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     displacement: Complex = beam.length_m * sines * reciprocal / z
     slope: Complex = cosines * reciprocal
     return displacement, slope
+
+
+def _quick_length(least: int) -> int:
+    """Length of which a transform is quick: at most an eighth more than the least one."""
+    unit = 1 << max(0, least.bit_length() - 4)
+    return -(-least // unit) * unit

@@ -215,14 +215,6 @@ class Bench:
         self._tell(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
 
 
-def _merit(one: Measurement) -> tuple[bool, float]:
-    return one.held >= HELD, one.held_between_stalls
-
-
-def _holds(one: Measurement) -> bool:
-    return one.held_between_stalls >= HELD
-
-
 def core_of(granted: dict[str, str]) -> int:
     """Return the core that the loop runs on."""
     text = granted["cpu"]
@@ -233,6 +225,14 @@ def cores_beside(granted: dict[str, str]) -> set[int]:
     """Return the cores that the loop does not run on; all where there is only one."""
     allowed = os.sched_getaffinity(0)
     return allowed - {core_of(granted)} or allowed
+
+
+def _merit(one: Measurement) -> tuple[bool, float]:
+    return one.held >= HELD, one.held_between_stalls
+
+
+def _holds(one: Measurement) -> bool:
+    return one.held_between_stalls >= HELD
 
 
 def _median(values: list[float]) -> float:

@@ -41,13 +41,6 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 Message = dict[str, Any]
 
 
-def _is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
-    waiting = select.poll()
-    waiting.register(fd, event)
-    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
-
-
 class ChildError(Exception):
     """A child process ended, or answered something else than it was asked."""
 
@@ -250,6 +243,13 @@ class LineReader:
             pieces.append(data)
             left -= len(data)
         return b"".join(pieces)
+
+
+def _is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
+    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
+    waiting = select.poll()
+    waiting.register(fd, event)
+    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
 
 
 class Parent:

@@ -126,6 +126,9 @@ def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> floa
     return value
 
 
+# Files that a user names
+
+
 def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
     """Open a text file of limited size; a pipe that nobody writes to is not waited for.
 

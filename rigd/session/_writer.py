@@ -83,72 +83,6 @@ _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
 _URGENT: Final = ("error", "fatal")
 
 
-def _fixed_records(
-    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
-) -> npt.NDArray[np.void]:
-    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
-    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
-    records["opcode"] = Opcode.MESSAGE
-    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
-    records["channel"] = channel
-    records["sequence"] = wire["tick"]
-    records["log_time"] = wire["t_ns"] + start_utc_ns
-    records["publish_time"] = records["log_time"]
-    records["data"] = wire
-    return records
-
-
-def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
-    index = np.empty(records.shape, INDEX_DTYPE)
-    index["log_time"] = records["log_time"]
-    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
-    return index
-
-
-def _event_records(
-    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
-) -> tuple[bytes, npt.NDArray[np.void]]:
-    """Make message records of events (log time, message), and their index."""
-    records = b""
-    index = np.empty(len(events), INDEX_DTYPE)
-    for i, (log_time, data) in enumerate(events):
-        index[i] = (log_time, offset + len(records))
-        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
-        records += MESSAGE_HEAD.pack(
-            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
-        )
-        records += data
-    return records, index
-
-
-def _chunk_samples(metadata: Mapping[str, str]) -> int:
-    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
-    try:
-        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
-    except (ValueError, OverflowError):
-        return CHUNK_SAMPLES
-    return min(max(in_time, 1), CHUNK_SAMPLES)
-
-
-def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
-    """Make the channels of a session; that of the samples repeats what the file says of them."""
-    schemas, channels = [], []
-    for topic, (number, schema_name) in _CHANNELS.items():
-        schemas.append(
-            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
-        )
-        channels.append(
-            Channel(
-                id=number,
-                topic=topic,
-                message_encoding="protobuf",
-                schema_id=number,
-                metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
-            )
-        )
-    return schemas, channels
-
-
 class SessionWriter:
     """Writes one session, durably, to ``NAME.mcap.part`` and in the end to ``NAME.mcap``.
 
@@ -476,7 +410,73 @@ class SessionWriter:
         self._dirty = False
 
 
-# Files that come into being
+def _fixed_records(
+    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
+) -> npt.NDArray[np.void]:
+    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
+    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
+    records["opcode"] = Opcode.MESSAGE
+    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
+    records["channel"] = channel
+    records["sequence"] = wire["tick"]
+    records["log_time"] = wire["t_ns"] + start_utc_ns
+    records["publish_time"] = records["log_time"]
+    records["data"] = wire
+    return records
+
+
+def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
+    index = np.empty(records.shape, INDEX_DTYPE)
+    index["log_time"] = records["log_time"]
+    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
+    return index
+
+
+def _event_records(
+    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
+) -> tuple[bytes, npt.NDArray[np.void]]:
+    """Make message records of events (log time, message), and their index."""
+    records = b""
+    index = np.empty(len(events), INDEX_DTYPE)
+    for i, (log_time, data) in enumerate(events):
+        index[i] = (log_time, offset + len(records))
+        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
+        records += MESSAGE_HEAD.pack(
+            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
+        )
+        records += data
+    return records, index
+
+
+def _chunk_samples(metadata: Mapping[str, str]) -> int:
+    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
+    try:
+        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
+    except (ValueError, OverflowError):
+        return CHUNK_SAMPLES
+    return min(max(in_time, 1), CHUNK_SAMPLES)
+
+
+def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
+    """Make the channels of a session; that of the samples repeats what the file says of them."""
+    schemas, channels = [], []
+    for topic, (number, schema_name) in _CHANNELS.items():
+        schemas.append(
+            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
+        )
+        channels.append(
+            Channel(
+                id=number,
+                topic=topic,
+                message_encoding="protobuf",
+                schema_id=number,
+                metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
+            )
+        )
+    return schemas, channels
+
+
+# New files on the disk
 
 _COPY_BYTES: Final = 1 << 20
 
