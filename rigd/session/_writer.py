@@ -1,8 +1,8 @@
 """Writer of session files.
 
-Samples, controls and timings come as arrays of records and are written chunk by chunk, events as
-they happen. The file has the suffix ``.part`` and carries a lock until it is complete, and is then
-renamed to its own name, never over another file.
+Samples, controls and timings come as blocks of records and are written chunk by chunk, events with
+them, an error at once. The file has the suffix ``.part`` and carries a lock until it is complete,
+and is then renamed to its own name, never over another file.
 """
 
 import contextlib
