@@ -174,7 +174,7 @@ class Service:
     worker
         Runs the calls of the rig, one at a time.
     publish
-        Takes the events that are for whoever watches.
+        Takes the events for clients that watch.
     moving
         Says what would move if the rig were connected now.
     fast, live

@@ -73,7 +73,7 @@ def reality(rig: RigParameters) -> Reality:
 
 
 def what_moves(rig: RigParameters, moving: Reality) -> str:
-    """Say what will move, hardware as loudly as what stands in for it."""
+    """Say what will move, the hardware or its simulation."""
     if moving is not Reality.HARDWARE:
         how = "in this process" if moving is Reality.SIMULATED else moving.value
         return f"No hardware: {rig.name} is simulated ({how})."

@@ -321,7 +321,7 @@ class Procedure:
             raise SessionEnd("fault", str(violation))
 
     def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
-        """One tick outside the record; what is missed there is nobody's loss, but has its limit."""
+        """Run one tick outside the record; missed ticks are not counted there, but limited."""
         missed = self._metronome.wait()
         self._cycle.watch.skip(missed)
         if missed > self._profile.limits.missed_ticks_in_a_row and not excused:

@@ -74,7 +74,7 @@ class Word(IntEnum):
     STOP = 0
     GO = 1
     SUPERVISOR_BEAT = 2
-    """Beats count up several times a second: whoever does not beat hangs."""
+    """Heartbeats count up several times a second: a process whose beat stands still hangs."""
     # Written by the control process
     PHASE = 3
     START_UTC_NS = 4

@@ -146,7 +146,7 @@ class _Attendance:
         self._cycle = self._make_cycle(profile)
 
     def remember(self) -> None:
-        """Keep how warm the motor is for whoever connects next, once nothing hurries."""
+        """Store the motor's heat for the next connection, at a time when nothing is urgent."""
         if not self._devices.simulated:
             remember_heat(self._profile, self._watch.heat_nm2)
 

@@ -133,7 +133,7 @@ _SMOOTHED_BINS = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The unknowns in the order of `moments`, and what the fit says of itself."""
+    """The unknowns in the order of `moments`, and the fit's own diagnostics."""
 
     values: Real
     """Scale, inertia, viscous, Coulomb, delay from command to angle, zeros of the sessions."""

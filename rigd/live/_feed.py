@@ -1,6 +1,6 @@
 """Connection from the publisher to the Rerun server, which never blocks and restores itself.
 
-With its server absent or frozen the SDK first buffers without telling, and then blocks for ever.
+With its server absent or frozen the SDK first buffers without telling, then blocks indefinitely.
 Therefore whatever is sent is flushed with a time limit, and nothing more is handed to the SDK until
 everything before it has left: what waits in the SDK is never more than what was sent at once.
 """

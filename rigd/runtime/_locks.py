@@ -17,7 +17,7 @@ _NAME_SIZE = 200
 
 
 class HeldError(Exception):
-    """Another program holds the file; carries what it says of itself."""
+    """Another program holds the file; carries its own description."""
 
 
 class HeldFile:
@@ -124,7 +124,7 @@ class RigLock:
     rig
         The profile's name.
     holder
-        Name of this program, for whoever comes second.
+        Name of this program, for messages to a second one.
     hardware
         The rig is none of a user's own: all users of this computer have to be asked.
     alone

@@ -390,7 +390,7 @@ def _plan(
     damage: str,
     skipped: list[str],
 ) -> Recovery:
-    """Decide what the new file says of itself."""
+    """Decide outcome and protection of the new file."""
     samples = survey.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
     # What it says of its end is of all its samples.

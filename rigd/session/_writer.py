@@ -212,7 +212,7 @@ class SessionWriter:
             self._sync_when_due()
 
     def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
-        """Record an event for whoever reads the file.
+        """Record an event in the file.
 
         It is written with the chunk in progress; an error or a fatal one at once, together with
         what that chunk has so far.

@@ -106,7 +106,7 @@ unpack_tpdo = Struct("<Hih").unpack
 """Statusword, position in counts, torque in 1/1000 of the rated one; ``struct.error`` if the
 length is not 8."""
 unpack_short_tpdo = Struct("<Hi").unpack
-"""The same of a drive that does not tell its torque."""
+"""The same for a drive that does not report its torque."""
 _unpack_emergency = Struct("<HB").unpack_from
 _pack_rpdo = Struct("<Hh4x").pack
 _pack_sdo = Struct("<BHBI").pack

@@ -98,7 +98,7 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     Returns
     -------
     Outfit
-        What the drive says of itself, and what it has.
+        Identity that the drive reports, and what it has.
 
     Raises
     ------
