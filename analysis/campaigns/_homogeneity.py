@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._orders import common_structure, freest_estimate
-from analysis.campaigns._pooling import chance_of, random_effects
+from analysis.campaigns._pooling import random_effects
 from analysis.identify import LOGARITHMIC
+from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -213,7 +214,7 @@ def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
     if logarithmic:
         estimate, std = np.log(estimate), std / estimate
     effects = random_effects(estimate[:, None], (std**2)[:, None, None])
-    chance = float(chance_of(effects.cochran_q, len(values))[0])
+    chance = float(chi_square_p_value(effects.cochran_q[0], len(values) - 1))
     mean = math.exp(effects.mean[0]) if logarithmic else float(effects.mean[0])
     significant = chance < level
     apart = groups(estimate, std) if significant else ()

@@ -13,9 +13,10 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.campaigns._pooling import by_structure, t_quantile
+from analysis.campaigns._pooling import by_structure
 from analysis.identify import STRONG, WIDEST_SHARE
 from analysis.models import ORDER_RANGE, STRUCTURES
+from analysis.statistics import student_t_quantile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -229,7 +230,7 @@ def _integer(estimate: PooledEstimate, order: Order) -> bool:
 
 def _excludes_one(order: PooledParameter, sessions: int) -> bool:
     """Whether 1 lies outside the interval of the level at which it is called excluded."""
-    return abs(order.value - 1) > t_quantile(_SURE, sessions - 1) * order.std
+    return abs(order.value - 1) > student_t_quantile(_SURE, sessions - 1) * order.std
 
 
 def _wide(interval: tuple[float, float]) -> float:

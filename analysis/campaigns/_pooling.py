@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
 from analysis.models import STRUCTURES
+from analysis.statistics import chi_square_p_value, student_t_quantile
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -106,31 +106,6 @@ def _combined(
     mean = spread @ np.einsum("kij,kj->i", precision, values)
     off = values - mean
     return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
-
-
-@cache
-def t_quantile(level: float, degrees_of_freedom: int) -> float:
-    """Two-sided point of Student's t: within it a share `level` lies.
-
-    With ``t = sqrt(nu) tan(theta)`` the density of theta is ``cos(theta)^(nu-1)`` up to a factor.
-    """
-    theta = np.linspace(0.0, np.pi / 2, 100_001)
-    density = np.cos(theta) ** (degrees_of_freedom - 1)
-    reached = np.concatenate(([0.0], np.cumsum(density[1:] + density[:-1])))
-    at = float(np.interp(level, reached / reached[-1], theta))
-    return float(np.sqrt(degrees_of_freedom) * np.tan(at))
-
-
-def chance_of(cochran_q: NDArray[np.float64], sessions: int) -> NDArray[np.float64]:
-    """Probability of at least that Q without scatter between sessions, shape (k,).
-
-    Chi-square of K − 1 degrees of freedom by the cube-root approximation of Wilson and Hilferty
-    (PNAS 17 (1931) 684-688).
-    """
-    freedom = sessions - 1
-    spread = 2 / (9 * freedom)
-    z = (np.cbrt(cochran_q / freedom) - 1 + spread) / np.sqrt(spread)
-    return np.array([math.erfc(each / math.sqrt(2)) / 2 for each in z])
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +270,7 @@ class PooledEstimate:
     def sizes(self) -> tuple[PooledSize, ...]:
         """Sizes of the dampings that all sessions together determine."""
         names = tuple(each.name for each in self.parameters)
-        t, found = t_quantile(0.95, self.sessions - 1), []
+        t, found = student_t_quantile(0.95, self.sessions - 1), []
         values = self.plant.parameters
         first = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPINGS:
@@ -349,8 +324,8 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
     within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
-    t = t_quantile(0.95, len(used) - 1)
-    chances = chance_of(effects.cochran_q, len(used))
+    t = student_t_quantile(0.95, len(used) - 1)
+    chances = chi_square_p_value(effects.cochran_q, len(used) - 1)
     columns = (effects.mean, std, within, effects.between_std, chances)
     parameters = tuple(
         _parameter(name, t, *row)

@@ -8,6 +8,7 @@ import numpy as np
 
 from analysis.campaigns._experiment import in_dispute, told
 from analysis.models import STRUCTURES
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -187,7 +188,6 @@ _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
 _SIGNIFICANT: Final = 0.01
-_NORMAL_95: Final = 1.959963984540054
 _AS_GOOD: Final = 1.01
 
 
@@ -311,7 +311,7 @@ def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
 
 
 def _mode(mode: PooledMode) -> str:
-    half = _NORMAL_95 * 100 * mode.damping_ratio_std
+    half = NORMAL_95 * 100 * mode.damping_ratio_std
     digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "

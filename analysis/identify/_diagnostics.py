@@ -10,9 +10,10 @@ from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._refit import vector
-from analysis.identify._residual_tests import SURE, of_chi_square
+from analysis.identify._residual_tests import SURE
 from analysis.identify._rig_findings import of_rig
 from analysis.identify._verdict import EVEN, STRONG, rivals
+from analysis.statistics import NORMAL_95, chi_square_deviate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -166,7 +167,7 @@ def _rings(field: Field) -> bool:
     # A hum begins and ends with the record, which looks a little like a decay.
     hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
     return loudest > hum and all(
-        of_chi_square(ringing.chi_square, ringing.degrees_of_freedom) > SURE
+        chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) > SURE
         for ringing in (c.fit.ringing for c in (field.best, *rivals(field, EVEN)))
         if ringing.degrees_of_freedom
     )
@@ -227,7 +228,6 @@ def _difference(field: Field, name: Setting) -> tuple[float, float, float]:
     return best.parameters[name] - stated, low - stated, high - stated
 
 
-_NORMAL_95: Final = 1.959963984540054
 _MAINS_WANDER: Final = 0.005
 _MODES_TO_JUDGE: Final = 2
 _SLOW_HZ: Final = 0.5
@@ -358,11 +358,11 @@ def _air(field: Field) -> Iterator[Finding]:
 
 def _force(force: NonlinearForce) -> Finding:
     size, std, mode = force.size, force.std, force.term.mode
-    percent = f"{100 * abs(size):.2g} % (± {100 * _NORMAL_95 * std:.1g} %)"
+    percent = f"{100 * abs(size):.2g} % (± {100 * NORMAL_95 * std:.1g} %)"
     if force.term.kind == "quadratic drag":
         sentence = (
             f"The damping of mode {mode} depends on its speed, as drag in air does: its damping "
-            f"ratio is {abs(size):.2g} (± {_NORMAL_95 * std:.1g}) "
+            f"ratio is {abs(size):.2g} (± {NORMAL_95 * std:.1g}) "
             f"{'higher' if size > 0 else 'lower'} at the highest speed than at rest."
         )
     elif force.term.kind == "cubic stiffness":
@@ -381,7 +381,7 @@ def _force(force: NonlinearForce) -> Finding:
         kind="nonlinear damping" if force.term.kind == "quadratic drag" else "nonlinear stiffness",
         sentence=sentence,
         value=size,
-        interval=(size - _NORMAL_95 * std, size + _NORMAL_95 * std),
+        interval=(size - NORMAL_95 * std, size + NORMAL_95 * std),
         unit="1",
         remedy="Repeat the sweep at half the amplitude: what is not linear all but vanishes.",
     )

@@ -31,6 +31,7 @@ from analysis.identify._candidate import Candidate
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
 from analysis.identify._refit import Refit, adapted, unexplained_part, vector
 from analysis.models import STRUCTURES
+from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
 
 if TYPE_CHECKING:
@@ -76,8 +77,6 @@ has two numbers, whether or not the second differs from nought, or its interval 
 
 _SLOWEST: Final = 0.02
 """Of the highest speed: slower air tells nothing."""
-
-_NORMAL_95: Final = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,7 +352,7 @@ def _estimate(field: Field) -> DragEstimate:
     return DragEstimate(
         value_m=value,
         std_m=std,
-        interval_95_m=(max(value - _NORMAL_95 * std, 0.0), value + _NORMAL_95 * std),
+        interval_95_m=(max(value - NORMAL_95 * std, 0.0), value + NORMAL_95 * std),
         speed_m_s=speed,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),

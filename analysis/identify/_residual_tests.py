@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.statistics import chi_square_deviate, kolmogorov_p_value
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -22,27 +24,9 @@ SURE: Final = 5.0
 """Standard deviations from which chance is ruled out: 3 in 10 million, whatever was looked at."""
 
 
-def of_chi_square(value: float, degrees_of_freedom: float) -> float:
-    """Turn a chi-square into a normal deviate, by the cube root of Wilson and Hilferty.
-
-    PNAS 17 (1931) 684-688.
-    """
-    spread = 2 / (9 * degrees_of_freedom)
-    cube_root = (max(value, 0.0) / degrees_of_freedom) ** (1 / 3)
-    return float((cube_root - 1 + spread) / math.sqrt(spread))
-
-
 def largest_of(count: int) -> float:
     """Add to `SURE`, squared and halved, what the largest of `count` may exceed: ln count."""
     return SURE**2 / 2 + math.log(max(count, 1))
-
-
-def kolmogorov(statistic: float) -> float:
-    """Probability that the Kolmogorov statistic, times the root of the count, exceeds a value."""
-    if statistic < 0.3:
-        return 1.0
-    total: float = sum((-1) ** (k - 1) * math.exp(-2 * (k * statistic) ** 2) for k in range(1, 20))
-    return min(max(2 * total, 0.0), 1.0)
 
 
 BAND_95: Final = 1.3581
@@ -160,7 +144,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
             continue
         total = sums[width:] - sums[:-width]
         i = int(np.argmax(total))
-        deviate = of_chi_square(float(total[i]), 2 * width)
+        deviate = chi_square_deviate(float(total[i]), 2 * width)
         if deviate > loudest:
             loudest = deviate
             edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
@@ -169,7 +153,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
     return Whiteness(
         distance=distance,
         band=BAND_95 / math.sqrt(count),
-        probability=kolmogorov(distance * math.sqrt(count)),
+        probability=kolmogorov_p_value(distance * math.sqrt(count)),
         loudest_hz=edges,
         loudest_ratio=ratio,
         loud=loud,
@@ -214,7 +198,7 @@ def input_relation(
     surprise = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
     worst = int(np.argmax(surprise))
     local = bool(surprise[worst] > largest_of(used.size))
-    deviate = of_chi_square(2 * float(surprise.sum()), 2 * used.size)
+    deviate = chi_square_deviate(2 * float(surprise.sum()), 2 * used.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
     length = 4 * residual.size
@@ -305,7 +289,7 @@ def harmonics(
             continue
         turned = np.sum(parts[inside] * np.exp(-1j * multiple * phase[inside]), axis=1)
         chi_square = 2 * np.abs(turned) ** 2 / np.sum(window**2)
-        deviate = of_chi_square(float(chi_square.sum()), 2 * chi_square.size)
+        deviate = chi_square_deviate(float(chi_square.sum()), 2 * chi_square.size)
         largest = int(np.argmax(chi_square))
         found.append(
             Harmonic(

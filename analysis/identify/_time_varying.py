@@ -35,6 +35,7 @@ from analysis.identify._refit import Refit, unexplained_part
 from analysis.identify._residual_tests import SURE
 from analysis.identify._verdict import STRONG
 from analysis.models import STRUCTURES
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,7 +111,6 @@ _UNIT_PLAY_RAD: Final = 1e-4
 _ROUNDS: Final = 4
 _SETTLED: Final = 0.01
 _MANY: Final = 40
-_NORMAL_95: Final = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,7 +341,7 @@ def _size(change: Change) -> str:
 
 
 def _finding(change: Change) -> Finding:
-    half = _NORMAL_95 * change.std
+    half = NORMAL_95 * change.std
     of_play = change.what == "play"
     scale = 1e3 if of_play else 100.0
     return Finding(

@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.identify._plant import LOGARITHMIC
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from analysis.identify._problem import Projected
     from analysis.identify._result import DampingSize
 
-_NORMAL_95: Final = 1.959963984540054
 _WORST_CONDITION: Final = 1e13
 _LARGEST_LN_OMEGA: Final = 50.0
 
@@ -63,7 +63,7 @@ def covariance_of_unknowns(
 
 def interval(name: str, value: float, std: float) -> tuple[float, float]:
     """95 % confidence interval; `std` is of the logarithm where that is what was estimated."""
-    half = _NORMAL_95 * std
+    half = NORMAL_95 * std
     if name in LOGARITHMIC:
         return value * math.exp(-half), value * math.exp(half)
     return value - half, value + half
@@ -82,7 +82,7 @@ def interval_from_zero(value: float, std: float) -> tuple[float, float]:
     std : float
         Standard deviation that it would have if it could be negative.
     """
-    half = _NORMAL_95 * std
+    half = NORMAL_95 * std
     return max(value - half, 0.0), value + half
 
 
