@@ -252,6 +252,9 @@ _RATE_OVER_BAND: Final = 2.4
 class Decimation:
     """A linear-phase low-pass filter, centred, and the samples that are kept after it.
 
+    Our own, since `scipy.signal`, which has `kaiserord`, `firwin` and `oaconvolve`, takes 0.64 s of
+    processor time to import when all else is there: a tenth of what a session of 76 s takes.
+
     Attributes
     ----------
     factor : int
