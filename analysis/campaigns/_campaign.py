@@ -47,7 +47,7 @@ class Campaign:
     ----------
     settings : WelchSettings
     record_band_hz : tuple of float
-        Of the whole-record fits of most sessions.
+        Band of the whole-record fits of most sessions.
     sessions : tuple of SessionResult
         In the order of the paths.
     failures : tuple of SessionFailure
@@ -117,7 +117,7 @@ def campaign(
     paths : sequence of Path
         Session files.
     settings : WelchSettings, optional
-        Of the paper's route, by default the paper's.
+        Settings of the Welch fits, by default the paper's.
     structures : sequence of str
         Types of the whole-record estimate to choose from; none leaves that estimate, the verdict
         and the estimate's validation out.

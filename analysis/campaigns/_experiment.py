@@ -1,4 +1,4 @@
-"""What the sessions of one campaign have in common, and what can go wrong with a campaign."""
+"""Experiment of a campaign: what its sessions have in common, and errors of a campaign."""
 
 from __future__ import annotations
 

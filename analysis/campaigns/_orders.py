@@ -1,10 +1,9 @@
-"""One structure for all sessions, and what they say together about the orders of the damping.
+"""Common structure of all sessions, and what they say together about the orders of the damping.
 
-The one structure by which all sessions are compared and pooled: the freest that they support.
-
-What a session selects by itself depends on its noise. Sessions compared by what each of them
-selected differ by the difference between structures, and forty sessions of one beam then seem to
-be of two. Intervals of the freest structure hold whichever simpler one is true.
+The structure by which all sessions are compared and pooled is the freest that they support. What a
+session selects by itself depends on its noise. Sessions compared by what each of them selected
+differ by the difference between structures, and forty sessions of one beam then seem to be of two.
+Intervals of the freest structure hold whichever simpler one is true.
 """
 
 from __future__ import annotations
@@ -25,6 +24,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._pooling import PooledEstimate, PooledParameter
     from analysis.campaigns._session import SessionResult
     from analysis.identify import Order, Verdict
+
+
+# Common structure
 
 _NEARLY_ALL: Final = 0.9
 """Share of the sessions that determine the selected structure that must determine a freer one."""
@@ -94,6 +96,8 @@ def _usual_beam(sessions: Sequence[SessionResult]) -> str:
 def _freedom(estimate: RecordEstimate) -> int:
     return len(STRUCTURES[estimate.structure].free)
 
+
+# Orders
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 
@@ -180,6 +184,11 @@ def pooled_order(
     )
 
 
+def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
+    """Return those whose BIC is less than so much above the lowest, without the best."""
+    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
+
+
 def _judged(
     order: Order,
     ranked: Sequence[PooledEstimate],
@@ -215,11 +224,6 @@ def _judged(
         return "compatible", None
     excluded = not integer and _excludes_one(free, freest.sessions)
     return ("fractional" if excluded else "open"), None
-
-
-def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
-    """Return those whose BIC is less than so much above the lowest, without the best."""
-    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
 
 
 def _integer(estimate: PooledEstimate, order: Order) -> bool:

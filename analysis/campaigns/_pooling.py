@@ -1,13 +1,15 @@
-"""Whole-record estimates of all sessions pooled: random effects, parameters, modes.
+"""Pooled whole-record estimates of all sessions, by a random-effects model.
 
-Estimates of many sessions pooled, when sessions differ by more than their own uncertainty.
+``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k states for itself, tau the
+scatter of each parameter between sessions, by the moments of DerSimonian and Laird [1]_. A full
+matrix in place of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
+likelihood, five sessions that do repeat then show two thirds of their own standard deviations as
+scatter in each of eight parameters.
 
-The random-effects model ``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k
-states for itself, tau the scatter of each parameter between sessions, by the moments of R.
-DerSimonian and N. Laird, "Meta-analysis in clinical trials", Controlled Clinical Trials 7 (1986)
-177-188. A full matrix in place of ``diag(tau²)`` would have more numbers than a campaign has
-sessions: by maximum likelihood, five sessions that do repeat then show two thirds of their own
-standard deviations as scatter in each of eight parameters.
+References
+----------
+.. [1] R. DerSimonian and N. Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7
+   (1986) 177-188.
 """
 
 from __future__ import annotations
@@ -31,6 +33,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._session import SessionResult
     from analysis.identify import Damping, Order
+
+
+# Random effects
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,17 +102,6 @@ def random_effects(
     )
 
 
-def _combined(
-    values: NDArray[np.float64], covariances: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Weighted mean, its covariance, and the sum of squares of what values are off it."""
-    precision = np.linalg.inv(covariances)
-    spread = np.linalg.inv(precision.sum(axis=0))
-    mean = spread @ np.einsum("kij,kj->i", precision, values)
-    off = values - mean
-    return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
-
-
 @cache
 def t_quantile(level: float, degrees_of_freedom: int) -> float:
     """Two-sided point of Student's t: within it a share `level` lies.
@@ -131,6 +125,20 @@ def chance_of(cochran_q: NDArray[np.float64], sessions: int) -> NDArray[np.float
     spread = 2 / (9 * freedom)
     z = (np.cbrt(cochran_q / freedom) - 1 + spread) / np.sqrt(spread)
     return np.array([math.erfc(each / math.sqrt(2)) / 2 for each in z])
+
+
+def _combined(
+    values: NDArray[np.float64], covariances: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Weighted mean, its covariance, and the sum of squares of what values are off it."""
+    precision = np.linalg.inv(covariances)
+    spread = np.linalg.inv(precision.sum(axis=0))
+    mean = spread @ np.einsum("kij,kj->i", precision, values)
+    off = values - mean
+    return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
+
+
+# Modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +185,8 @@ def _pooled(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, flo
     mean, variance, between = effects.mean[0], effects.covariance[0, 0], effects.between_std[0]
     return float(mean), math.sqrt(variance), float(between)
 
+
+# Structures
 
 _FEWEST: Final = 2
 _DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (

@@ -1,4 +1,4 @@
-"""The verdict on a campaign: one structure for the specimen, what is known of its damping."""
+"""Verdict on a campaign: one structure for the specimen, and what is known of its damping."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionResult
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.identify import Finding
+
+
+# Findings in common
 
 _FIGURE: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 """A number, but not that of a mode: it tells what is meant and not how much."""
@@ -86,6 +89,9 @@ def _counted(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
     middle = median_low(sizes)
     example = next(finding for _, finding in group if finding.value == middle)
     return CommonFinding(example, files, sessions, (min(sizes), max(sizes)))
+
+
+# Verdict
 
 
 @dataclass(frozen=True, slots=True)

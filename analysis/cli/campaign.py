@@ -38,7 +38,7 @@ def campaign_command(
     ----------
     files : sequence of Path
     settings : WelchSettings
-        Of the paper's route.
+        Settings of the Welch fits.
     structures : sequence of str
         Types fitted to the whole records.
     fixed : sequence of str

@@ -120,7 +120,7 @@ def _print_tables(
     *,
     single: bool,
 ) -> None:
-    """Print all of a single file, of several what the paper's route has together."""
+    """Print all tables of a single file, of several those of the Welch fits together."""
     from analysis.report import analysis_tables, record_text, summary_table
 
     if single or not analyses:

@@ -1,4 +1,4 @@
-"""All structures fitted to one record under one noise, the lowest BIC first."""
+"""Candidate set of a record: all structures fitted under one noise spectrum, ranked by BIC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Free decay of the beam's modes, as its spectrum over a record, and how the poles move.
+"""Free decay of the beam's modes: its poles, how they move, and its spectrum over a record.
 
 A beam that already rings when the record begins adds to the torque a sum of decays whose amplitudes
 nobody knows but whose poles are the model's own. Their spectra over the samples compared are

@@ -1,4 +1,4 @@
-"""What the predicted torque depends on: beam, damping and instruments."""
+"""Parameters that the predicted torque depends on: beam, damping, settings and extras."""
 
 from __future__ import annotations
 

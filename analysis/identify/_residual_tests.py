@@ -1,10 +1,18 @@
-"""Is what remains only noise? Tests of the residual: periodogram, loudness, harmonics, its input.
+"""Residual tests: whiteness, coherence with the input, harmonics of the sweep.
 
-Residual at multiples of the frequency that the sweep has at that moment.
+Chance is ruled out at one level throughout (`SURE`). The cumulative periodogram of a white residual
+is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that is coherent
+with the angle is linear dynamics that the model lacks.
 
 A linear beam answers at the frequency it is driven at, and rings at frequencies that the sweep has
 passed. Twice or three times the drive's frequency is another matter: something is not linear. No
 model of it is needed.
+
+References
+----------
+M. S. Bartlett, An Introduction to Stochastic Processes (1955): the cumulative periodogram.
+E. B. Wilson and M. M. Hilferty, The distribution of chi-square, Proc. Natl. Acad. Sci. 17 (1931)
+684-688: `of_chi_square`.
 """
 
 from __future__ import annotations
@@ -17,6 +25,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+
+# Chance
 
 SURE: Final = 5.0
 """Standard deviations from which chance is ruled out: 3 in 10 million, whatever was looked at."""
@@ -45,11 +56,13 @@ def kolmogorov(statistic: float) -> float:
     return min(max(2 * total, 0.0), 1.0)
 
 
+# Whiteness, and coherence with the input
+
 BAND_95: Final = 1.3581
 """95 % point of the Kolmogorov statistic times the root of the number of bins."""
 
 _LEVEL: Final = 1e-6
-"""Of probability: what `SURE` means for the other tests."""
+"""Probability of chance: what `SURE` means for the other tests."""
 
 _WINDOWS: Final = (8, 32)
 _LOUD: Final = 1.4
@@ -236,6 +249,16 @@ def input_relation(
     )
 
 
+def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
+    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
+    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
+    spectrum[bins] = residual
+    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
+    return values
+
+
+# Harmonics of the sweep
+
 MULTIPLES: Final = (2, 3)
 _BLOCK_S: Final = 1.0
 _LOWEST_HZ: Final = 2.0
@@ -318,14 +341,6 @@ def harmonics(
             )
         )
     return tuple(found)
-
-
-def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
-    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
-    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
-    spectrum[bins] = residual
-    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
-    return values
 
 
 def _analytic(values: NDArray[np.float64]) -> NDArray[np.complex128]:

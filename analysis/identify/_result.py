@@ -1,4 +1,4 @@
-"""What a whole-record fit finds, and how sure it is of it."""
+"""Result of a fit of the whole record: parameters, their uncertainty, modes and residual."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ModeEstimate:
 
     number: int
     frequency_hz: float
-    """Of the free decay, 0 if over-damped."""
+    """Frequency of the free decay, 0 if over-damped."""
     frequency_std_hz: float
     damping_ratio: float
     damping_ratio_std: float

@@ -37,6 +37,9 @@ BESIDE_DRAG: Final = (
 """Why external damping beside drag must not be taken for a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
 
+
+# One order of the damping
+
 _MODES_FOR_AN_ORDER: Final = 2
 
 
@@ -96,31 +99,6 @@ def order_verdict(
     )
 
 
-def _judged(
-    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
-) -> tuple[Status, str | None]:
-    freest, order = field.freest, profile.order
-    untold = untold_reason(field, visible)
-    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
-        return "absent", "no such damping shows"
-    if untold is not None:
-        return "not identifiable", untold
-    if not profile.identifiable:
-        return "not identifiable", "the record does not tell the order"
-    if doubt is not None:
-        return "open", doubt
-    if order == "lambda" and field.drag is not None:
-        return "open", BESIDE_DRAG
-    for rival in field.of_other_kinds(STRONG):
-        if _integer(rival, order):
-            return "open", "order 1 on another kind of rig explains the record about as well"
-        if _elsewhere(rival, profile):
-            return "open", "another order on another kind of rig explains the record about as well"
-    if profile.admits_one:
-        return "compatible", None
-    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
-
-
 def untold_reason(field: Field, visible: tuple[int, ...]) -> str | None:
     """Say why no order can be told from a record, whatever its likelihood says; None if it may.
 
@@ -151,6 +129,31 @@ def deviance_of_one(profile: Profile) -> float:
     return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
 
 
+def _judged(
+    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+) -> tuple[Status, str | None]:
+    freest, order = field.freest, profile.order
+    untold = untold_reason(field, visible)
+    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
+        return "absent", "no such damping shows"
+    if untold is not None:
+        return "not identifiable", untold
+    if not profile.identifiable:
+        return "not identifiable", "the record does not tell the order"
+    if doubt is not None:
+        return "open", doubt
+    if order == "lambda" and field.drag is not None:
+        return "open", BESIDE_DRAG
+    for rival in field.of_other_kinds(STRONG):
+        if _integer(rival, order):
+            return "open", "order 1 on another kind of rig explains the record about as well"
+        if _elsewhere(rival, profile):
+            return "open", "another order on another kind of rig explains the record about as well"
+    if profile.admits_one:
+        return "compatible", None
+    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
+
+
 def _integer(candidate: Candidate, order: Order) -> bool:
     """Whether a structure has this damping with an order of 1."""
     return candidate.structure.fixed.get(order) == 1.0
@@ -163,10 +166,7 @@ def _elsewhere(candidate: Candidate, profile: Profile) -> bool:
     return candidate.structure.has(profile.order) and not here
 
 
-def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
-    """Candidates whose BIC is less than so much above that of the first, without the first."""
-    limit = field.best.bic + within
-    return tuple(c for c in field.candidates[1:] if c.bic < limit)
+# Verdict on a record
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +254,12 @@ class Verdict:
         plain = _plain(dataclasses.asdict(self))
         assert isinstance(plain, dict)
         return plain
+
+
+def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
+    """Candidates whose BIC is less than so much above that of the first, without the first."""
+    limit = field.best.bic + within
+    return tuple(c for c in field.candidates[1:] if c.bic < limit)
 
 
 def _plain(value: object) -> object:
