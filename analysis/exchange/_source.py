@@ -65,14 +65,14 @@ class _Format:
 _MB: Final = 1_000_000
 
 _FORMATS: Final = {
-    ".csv": _Format("CSV", "csv_source", 512 * _MB),
-    ".txt": _Format("CSV", "csv_source", 512 * _MB),
-    ".dat": _Format("CSV", "csv_source", 512 * _MB),
-    ".mat": _Format("MATLAB", "mat_source", 512 * _MB),
-    ".tdms": _Format("TDMS", "tdms_source", 512 * _MB),
-    ".uff": _Format("UFF58", "uff_source", 128 * _MB),
-    ".unv": _Format("UFF58", "uff_source", 128 * _MB),
-    ".uf58": _Format("UFF58", "uff_source", 128 * _MB),
+    ".csv": _Format("CSV", "_csv_format", 512 * _MB),
+    ".txt": _Format("CSV", "_csv_format", 512 * _MB),
+    ".dat": _Format("CSV", "_csv_format", 512 * _MB),
+    ".mat": _Format("MATLAB", "_matlab_format", 512 * _MB),
+    ".tdms": _Format("TDMS", "_tdms_format", 512 * _MB),
+    ".uff": _Format("UFF58", "_uff_format", 128 * _MB),
+    ".unv": _Format("UFF58", "_uff_format", 128 * _MB),
+    ".uf58": _Format("UFF58", "_uff_format", 128 * _MB),
 }
 
 
