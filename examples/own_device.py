@@ -2,8 +2,8 @@
 
 Usage: python own_device.py
 
-`rigd.devices.contracts` says what the cycle asks of a device. This one moves a rigid body; to let a
-profile name it, see "A device" in CONTRIBUTING.md.
+What each method has to do stands in `rigd.devices.contracts`; how a profile comes to name a device,
+in CONTRIBUTING.md.
 """
 
 import math
@@ -11,71 +11,54 @@ from collections.abc import Callable
 
 from rigd.devices import Devices, LineHealth, Wrench
 
-PERIOD_NS = 1_000_000
+INERTIA_KG_M2, FRICTION_NM_S = 3.5e-3, 7e-3
 
 
 class RigidHub:
-    """Drive with encoder, and wrench sensor, of a rigid body: inertia (kg·m²), friction (N·m·s)."""
+    """Drive with encoder, and wrench sensor."""
 
-    angle_stale = wrench_stale = wrench_saturated = False
+    angle_rad = speed_rad_s = torque_nm = 0.0
+    angle_stale = wrench_stale = wrench_saturated = enabled = False
+    angle_time_ns = wrench_time_ns = 0
     off_doubt = ""
 
-    def __init__(self, inertia_kg_m2: float = 3.5e-3, friction_nm_s: float = 7e-3) -> None:
-        self._inertia, self._friction = inertia_kg_m2, friction_nm_s
-        self._angle_rad = self._speed_rad_s = self._torque_nm = 0.0
-        self._enabled = False
-        self.angle_time_ns = self.wrench_time_ns = 0
-
     def connect(self) -> None:
-        """Do nothing: there is no line."""
+        pass  # there is no line
 
     def enable(self, stop: Callable[[], bool] = lambda: False) -> None:  # noqa: ARG002
-        """Let commands through, at zero torque; `stop` matters where this takes its time."""
-        self._torque_nm, self._enabled = 0.0, True
+        self.torque_nm, self.enabled = 0.0, True
 
     def latch(self, due_ns: int) -> None:
-        """Move on to the tick at `due_ns`, the torque held: exact for a linear body."""
         time_s, self.angle_time_ns = (due_ns - self.angle_time_ns) / 1e9, due_ns
-        final_rad_s = self._torque_nm / self._friction
-        rate_1_s = self._friction / self._inertia
-        decay = math.exp(-rate_1_s * time_s)
-        excess_rad_s = self._speed_rad_s - final_rad_s
-        self._angle_rad += final_rad_s * time_s + excess_rad_s * (1 - decay) / rate_1_s
-        self._speed_rad_s = final_rad_s + excess_rad_s * decay
+        # Exact for a torque that is held: the speed tends to torque over friction.
+        final_rad_s, rate_1_s = self.torque_nm / FRICTION_NM_S, FRICTION_NM_S / INERTIA_KG_M2
+        excess_rad_s, decay = self.speed_rad_s - final_rad_s, math.exp(-rate_1_s * time_s)
+        self.angle_rad += final_rad_s * time_s + excess_rad_s * (1 - decay) / rate_1_s
+        self.speed_rad_s = final_rad_s + excess_rad_s * decay
 
     def read_angle(self) -> float:
-        """Return the latched angle in rad."""
-        return self._angle_rad
+        return self.angle_rad
 
     def command(self, torque_nm: float) -> float:
-        """Hold a torque in N·m until the next command; a drive that is disabled exerts none."""
-        self._torque_nm = torque_nm if self._enabled else 0.0
+        self.torque_nm = torque_nm if self.enabled else 0.0
         return torque_nm
 
     def disable(self) -> None:
-        """Take the torque away, in every state."""
-        self._torque_nm, self._enabled = 0.0, False
+        self.torque_nm, self.enabled = 0.0, False
 
     def calibration(self) -> dict[str, object]:
-        """Return what the session file states of the sensor."""
         return {"sensor": "computed torque of a rigid hub"}
 
     def request(self, due_ns: int) -> None:
-        """Ask for the wrench of the tick at `due_ns`."""
         self.wrench_time_ns = due_ns
 
     def read_wrench(self) -> Wrench:
-        """Return fx … tz: nothing but the torque that accelerates the body, about z."""
-        torque_nm = self._torque_nm - self._friction * self._speed_rad_s
-        return (0.0, 0.0, 0.0, 0.0, 0.0, torque_nm)
+        return (0.0, 0.0, 0.0, 0.0, 0.0, self.torque_nm - FRICTION_NM_S * self.speed_rad_s)
 
     def health(self) -> LineHealth:
-        """Tell that the sensor is well; of a line nothing is known."""
         return LineHealth(errors=0, status=0)
 
-    def close(self) -> None:
-        """Disable; there is no line to release."""
-        self.disable()
+    close = disable
 
 
 def open_rigid_hub() -> Devices:
@@ -84,24 +67,17 @@ def open_rigid_hub() -> Devices:
     return Devices(drive=hub, sensor=hub, simulated=True)
 
 
-def main() -> None:
-    """Turn the hub by 0.1 rad as the cycle would: latch, request, read, command in every tick."""
-    devices = open_rigid_hub()
+if __name__ == "__main__":
+    devices, last_rad = open_rigid_hub(), 0.0
     devices.sensor.connect()
     devices.drive.connect()
     devices.drive.enable()
-    last_rad = 0.0
-    for tick in range(1000):
-        devices.drive.latch(tick * PERIOD_NS)
-        devices.sensor.request(tick * PERIOD_NS)
-        angle_rad = devices.drive.read_angle()
-        wrench = devices.sensor.read_wrench()
-        speed_rad_s, last_rad = (angle_rad - last_rad) * 1e9 / PERIOD_NS, angle_rad
+    for tick in range(1000):  # as the cycle does: latch, request, read, command
+        devices.drive.latch(tick * 1_000_000)
+        devices.sensor.request(tick * 1_000_000)
+        angle_rad, wrench = devices.drive.read_angle(), devices.sensor.read_wrench()
+        speed_rad_s, last_rad = (angle_rad - last_rad) * 1e3, angle_rad
         devices.drive.command(1.4 * (0.1 - angle_rad) - 0.13 * speed_rad_s)
         if tick % 250 == 0 or tick == 999:
             print(f"{tick} ms: {angle_rad:.4f} rad, {wrench[5]:+.3f} N·m")
     devices.drive.close()
-
-
-if __name__ == "__main__":
-    main()

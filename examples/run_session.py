@@ -2,9 +2,8 @@
 
 Usage: python run_session.py [FOLDER]
 
-The files go to FOLDER (default: sessions). What `rigd run chirp --fast --repeat 2` does is done
-here by the same functions: the plan is checked against the profile's limits, and Ctrl-C stops
-safely.
+The files go to FOLDER (default: sessions). This is `rigd run chirp --fast --repeat 2`: the plan is
+checked against the profile's limits, and Ctrl-C stops safely.
 """
 
 import sys
