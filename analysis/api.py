@@ -111,7 +111,7 @@ def fit(
     ----------
     record : Record
     types : sequence of str, optional
-        Of "I" to "VII"; by default all seven, with "welch" the paper's six.
+        Names from "I" to "VII"; by default all seven, with "welch" the paper's six.
     method : {"record", "welch"}
         Output error on the whole record, or the paper's fit to Welch's estimate.
     fixed : iterable of str

@@ -87,7 +87,7 @@ class Structure:
         Parameters
         ----------
         name : str
-            Of `PARAMETERS`, or of beam and rig.
+            A name of `PARAMETERS`, or a parameter of beam or rig.
         """
         if name in ("zeta", "alpha"):
             return self.internal

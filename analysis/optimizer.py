@@ -158,7 +158,7 @@ def descend(
         Stop when a step promises less than this fraction of the cost, or is too short to be told
         from rounding.
     max_evaluations : int
-        Of `problem`, after which the best point so far is returned.
+        Most evaluations of `problem`, after which the best point so far is returned.
     second_part : ndarray, shape (k, k), optional
         As a descent on nearly the same problem has learned it; used from the first step on.
     learns : bool

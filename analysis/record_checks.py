@@ -260,7 +260,7 @@ def check_fillable(
     unknown : ndarray of bool, shape (n,)
         Samples of the sweep without a value of their own.
     first_tick : int
-        Of the sweep.
+        First tick of the sweep.
     rate_hz : float
     """
     much = too_much_unknown(f"the {channel} in the sweep", int(unknown.sum()), len(unknown))

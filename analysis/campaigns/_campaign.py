@@ -61,7 +61,7 @@ class Campaign:
     structures : tuple of RankedStructure
         Every structure fitted to the whole records, those pooled first.
     pooled : tuple of PooledEstimate
-        Of the structures that two sessions or more determine, the lowest BIC first; empty without
+        Structures that two sessions or more determine, the lowest BIC first; empty without
         whole-record fits.
     verdict : CampaignVerdict or None
         Which of them the data support, and what else they say; None without any.
@@ -124,7 +124,7 @@ def campaign(
     fixed : sequence of str
         Settings of rig and specimen that stay at the file's values in those fits.
     band_hz : tuple of float, optional
-        Of all fits and of the validation; by default what suits each record.
+        Band of all fits and of the validation; by default what suits each record.
     jobs : int, optional
         Worker processes, by default one a core.
     dask : str, optional

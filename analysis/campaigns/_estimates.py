@@ -87,7 +87,7 @@ class RecordEstimate:
     deviance : float
         ``-2 ln`` likelihood, but for a constant that all estimates of the session share.
     bic : float
-        Of the session by itself.
+        Criterion of the session by itself.
     values : int
         Real values compared.
     indices : Indices

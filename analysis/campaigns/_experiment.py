@@ -168,7 +168,7 @@ def stated_specimens(
     stated : iterable of (Path, Experiment or None)
         None of a file that could not be read.
     of_campaign : Experiment
-        Of the sessions that are pooled.
+        Experiment of the sessions that are pooled.
     """
     found: list[tuple[Experiment, list[Path]]] = [(of_campaign, [])]
     for path, experiment in stated:

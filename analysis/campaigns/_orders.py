@@ -70,7 +70,7 @@ def common_structure(
     Returns
     -------
     str or None
-        Of those fitted to every session, the freest: on the beam of what is pooled, or with nothing
+        The freest of those fitted to every session: on the beam of what is pooled, or with nothing
         pooled on the one that most sessions select. None without whole-record fits.
     """
     fitted = by_structure(sessions)
@@ -158,7 +158,7 @@ def pooled_order(
     ranked : sequence of PooledEstimate
         The lowest BIC first; not empty.
     verdicts : sequence of Verdict
-        Of the sessions.
+        Verdicts of the sessions.
     alike : Homogeneity
         Whether they are of one specimen.
     """

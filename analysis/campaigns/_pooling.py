@@ -46,7 +46,7 @@ class RandomEffects:
     ----------
     mean : ndarray, shape (k,)
     covariance : ndarray, shape (k, k)
-        Of the mean.
+        Covariance of the mean.
     between_std : ndarray, shape (k,)
         Scatter between sessions, tau; 0 where the sessions' own uncertainties explain all.
     cochran_q : ndarray, shape (k,)
@@ -75,7 +75,7 @@ def random_effects(
     Parameters
     ----------
     estimates : ndarray, shape (K, k)
-        Of two sessions at least.
+        Estimates of two sessions at least.
     covariances : ndarray, shape (K, k, k)
         Positive definite, of each estimate.
     """
@@ -203,9 +203,9 @@ class PooledParameter:
     ----------
     name : str
     value : float
-        Of a positive parameter that is estimated by its logarithm: the geometric mean.
+        Mean; of a positive parameter that is estimated by its logarithm the geometric mean.
     std : float
-        Of `value`.
+        Standard deviation of `value`.
     interval : (float, float)
         95 % confidence interval of the value, by Student's t with K − 1 degrees of freedom.
     within_std : float
@@ -269,11 +269,11 @@ class PooledEstimate:
     beam : str
         As of `RecordEstimate`.
     plant : Plant
-        Of the pooled parameters.
+        Plant of the pooled parameters.
     parameters : tuple of PooledParameter
         Those that every session used determines.
     covariance : ndarray, shape (k, k)
-        Of these, positive ones as logarithms.
+        Covariance of these, positive ones as logarithms.
     modes : tuple of PooledMode
     sessions : int
         Used: those that determine the structure's damping.
@@ -282,7 +282,7 @@ class PooledEstimate:
         nothing but noise. Where it is far beyond 1 the structure is wrong, and its standard
         deviations mean little.
     bic : float
-        Of all sessions together, see `pooled_bic`.
+        Criterion of all sessions together, see `pooled_bic`.
     """
 
     structure: str

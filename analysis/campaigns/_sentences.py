@@ -205,7 +205,7 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     freest : PooledEstimate
         On the beam that all sessions support.
     best : PooledEstimate
-        Of the lowest BIC.
+        Estimate of the lowest BIC.
     """
     given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
     are = "is" if len(given) == 1 else "are"

@@ -125,7 +125,7 @@ class SessionTask:
     fixed : tuple of str
         Settings that stay at the file's values in those fits.
     band_hz : tuple of float or None
-        Of all fits; None takes what suits each record.
+        Band of all fits; None takes what suits each record.
     """
 
     settings: WelchSettings

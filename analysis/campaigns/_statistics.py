@@ -126,7 +126,7 @@ class NominalModel:
     response : ndarray of complex, shape (n,)
         With the tool's inertia, in N·m/rad.
     peaks : tuple of Peak or None
-        Of that response, mode by mode.
+        Peaks of that response, mode by mode.
     indices : tuple of Indices
         Its distance from each session's response, session by session.
     deviations : tuple of MeanPeakDeviation
@@ -180,7 +180,7 @@ def mean_deviations(
     Parameters
     ----------
     measured : sequence of sequence of Peak or None
-        Of each session, mode by mode.
+        Peaks of each session, mode by mode.
     modelled : sequence of Peak or None
         Mode by mode.
     """

@@ -31,7 +31,7 @@ class LeftOutError:
     Attributes
     ----------
     path : Path
-        Of the session.
+        File of the session.
     method : {"record", "welch"}
         Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
         of the others by the Welch method.

@@ -39,11 +39,11 @@ class CommonFinding:
     Attributes
     ----------
     example : Finding
-        Of the session in the middle, by size.
+        Finding of the session in the middle, by size.
     files : tuple of str
         Names of the sessions that have it.
     sessions : int
-        Of how many.
+        Number of sessions looked at.
     span : tuple of float or None
         Least and largest size, in the finding's unit.
     """
@@ -122,7 +122,7 @@ class CampaignVerdict:
     headline : str
         Structure that the numbers are of, as tables call it: the freest on the beam selected.
     structure : str
-        Of the lowest BIC: "I" to "VII".
+        Structure of the lowest BIC: "I" to "VII".
     uniform : bool
         Whether the beam selected is uniform.
     rivals : tuple of str

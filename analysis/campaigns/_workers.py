@@ -233,7 +233,7 @@ def dask_cluster(address: str) -> Iterator[DaskWorkers]:
     Parameters
     ----------
     address : str
-        Of its scheduler, such as ``tcp://10.0.0.5:8786``.
+        Address of the scheduler, such as ``tcp://10.0.0.5:8786``.
 
     Raises
     ------

@@ -44,7 +44,7 @@ def campaign_command(
     fixed : sequence of str
         Settings that those fits take from the files.
     band_hz : tuple of float, optional
-        Of all fits; by default what suits each record.
+        Band of all fits; by default what suits each record.
     report : Path, optional
         Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
         exists ``campaign.report-2`` and so on.

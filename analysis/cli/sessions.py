@@ -38,7 +38,7 @@ class Routes:
     fixed : tuple of str
         Settings of rig and specimen that stay at the file's values.
     band_hz : tuple of float or None
-        Of both; None takes what suits the record.
+        Band of both; None takes what suits the record.
     """
 
     settings: WelchSettings

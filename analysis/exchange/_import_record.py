@@ -447,7 +447,7 @@ def unlikely_torque(
     Parameters
     ----------
     angle_rad, torque_nm : ndarray of float, shape (n,)
-        Of the whole record, finite.
+        The whole record, finite.
     rate_hz : float
     specimen : Specimen
 

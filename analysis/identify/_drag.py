@@ -95,7 +95,7 @@ class DragEstimate:
     law : DragLaw
         For all speeds.
     covariance : tuple of tuple of float
-        Of the law's numbers that were free: of the first, or of both.
+        Covariance of the law's numbers that were free: of the first, or of both.
     """
 
     value_m: float

@@ -126,7 +126,7 @@ class DragTorque:
     law : DragLaw
     torque_nm : ndarray, shape (m,)
     by_pole : dict of int to ndarray, shape (2, m)
-        Of each mode: derivatives by the real and the imaginary part of its upper pole.
+        For each mode: derivatives by the real and the imaginary part of its upper pole.
     by_external : ndarray, shape (2, m)
         By gamma and by lambda, the poles held: external damping also drives the modes.
     by_law : ndarray, shape (2, m)
@@ -263,7 +263,7 @@ class DragResponse:
 
     @property
     def _leverage(self) -> Real:
-        """Of the modes, L b_i, shape (MODES,)."""
+        """Leverage of the modes, L b_i, shape (MODES,)."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
     def _mean_speed(self, speed: Real) -> float:
@@ -501,11 +501,11 @@ class DragExpansion:
     law : DragLaw
         At these the torque was taken out of the record.
     response : DragResponse
-        Of that beam.
+        What drag does to that beam.
     band : callable
         Spectrum in the band of samples of the angle's times.
     by_pole : dict of int to ndarray of complex, shape (2, K)
-        Of each mode: by the real and the imaginary part of its upper pole.
+        For each mode: by the real and the imaginary part of its upper pole.
     by_external : ndarray of complex, shape (2, K)
         By gamma and lambda, the poles held.
     by_ln_density, by_delay : ndarray of complex, shape (K,)

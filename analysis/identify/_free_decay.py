@@ -190,8 +190,8 @@ class DecaySpectra:
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
         """Spectra of oscillations all through the record, shape (4 n, K).
 
-        Of either phase, and growing from nought: together any amplitude and phase at the beginning
-        and any other at the end, and that is what leaks into distant bins.
+        Columns of either phase, constant and growing from nought: together any amplitude and phase
+        at the beginning and any other at the end, and that is what leaks into distant bins.
         """
         none = np.zeros(0, dtype=np.complex128)
         # All but steady: on a bin's own frequency the sums would be 0 / 0.

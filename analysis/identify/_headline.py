@@ -180,7 +180,7 @@ class Headline(Numbers):
     Attributes
     ----------
     fit : RecordFit
-        Of the freest structure that the record supports.
+        Fit of the freest structure that the record supports.
     explained : bool
         Whether it leaves nothing but noise; else every number carries a flag.
     """

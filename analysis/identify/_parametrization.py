@@ -123,7 +123,7 @@ class Unknowns:
         modes : int
             How many modes count; with 1 the beam is uniform.
         extras : collection of str
-            Of `EXTRAS`, those that are free.
+            Those of the `EXTRAS` that are free.
         """
         first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
         ordered = tuple(name for name in SETTINGS if name in free)
@@ -320,12 +320,12 @@ _NEWTON_STEPS: Final = 30
 def bare_beam(share: float) -> tuple[float, float]:
     """Logarithms of rho/EI and EI of a beam with a tip mass, over those of one without.
 
-    Of one whose first mode is at the same frequency, and whose torque is the same to first order.
+    The bare beam has its first mode at the same frequency, and to first order the same torque.
 
     Parameters
     ----------
     share : float
-        Of the tip's mass, relative to the nominal beam's.
+        Mass of the tip, relative to the nominal beam's.
     """
     (ln_ratio, _), (ln_stiffness, _) = _bare_beam(share)
     return ln_ratio, ln_stiffness
@@ -339,7 +339,7 @@ def ln_stiffness_with_tip(mode: int, share: float) -> float:
     mode : int
         From 1.
     share : float
-        Of the tip's mass, relative to the beam's.
+        Mass of the tip, relative to the beam's.
     """
     return _with_tip(float(eigenvalues(mode)[-1]), share)[0]
 

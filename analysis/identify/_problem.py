@@ -447,7 +447,7 @@ class Projected:
         Real and imaginary parts of variance 1 where the noise is as assumed.
     jacobian : ndarray of complex, shape (k, K)
     amplitudes : ndarray, shape (m,)
-        Of the free decays, in N·m, at the first sample compared.
+        Amplitudes of the free decays, in N·m, at the first sample compared.
     amplitude_gram : ndarray, shape (m, m)
         Inverse covariance of the amplitudes.
     """

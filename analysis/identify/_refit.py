@@ -100,7 +100,7 @@ def adapted(unknowns: Unknowns, plant: Plant, of: Structure) -> NDArray[np.float
     Parameters
     ----------
     unknowns : Unknowns
-        Of the one.
+        Unknowns of the one.
     plant : Plant
     of : Structure
         The other.
@@ -124,7 +124,7 @@ def resonances_kept(
     Parameters
     ----------
     unknowns : Unknowns
-        Of the beam that is not uniform.
+        Unknowns of the beam that is not uniform.
     damped_as : RecordFit
         Its damping is where that of the start comes from.
     modes : sequence of ModeEstimate
@@ -206,7 +206,7 @@ class Refit:
         columns : ndarray of complex, shape (c, K), or None
             Spectra to be projected out beside the free decay.
         max_evaluations : int
-            Of the sum of squares; with 1 nothing moves.
+            Most evaluations of the sum of squares; with 1 nothing moves.
         relative_tolerance : float
             As `descend` takes it.
         hold : str, optional

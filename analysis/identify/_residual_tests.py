@@ -92,7 +92,7 @@ class Whiteness:
     band : float
         Within which it stays in 95 % of the records that hold nothing but noise.
     probability : float
-        Of such a distance by chance.
+        Probability of such a distance by chance.
     loudest_hz : tuple of float
         Edges of the window that is loudest for its width.
     loudest_ratio : float
@@ -128,7 +128,7 @@ class InputRelation:
     local : bool
         Whether chance is ruled out there.
     deviate : float
-        Of the coherence over the whole band, in standard deviations beyond chance.
+        Deviate of the coherence over the whole band, in standard deviations beyond chance.
     correlation : float
         Largest correlation of residual and angle, both whitened, in standard deviations.
     lag_s : float
@@ -277,7 +277,7 @@ class Harmonic:
     multiple : int
         2 or 3.
     deviate : float
-        Of its power along the whole sweep, in standard deviations beyond chance.
+        Deviate of its power along the whole sweep, in standard deviations beyond chance.
     drive_hz : float
         Frequency of the drive at which it is largest.
     present : bool

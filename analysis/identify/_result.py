@@ -58,7 +58,7 @@ class Ringing:
     amplitude_nm : tuple of float
         By mode, at the first sample compared.
     chi_square : float
-        Of all its amplitudes together, beside the hum if there is some.
+        Chi-square of all its amplitudes together, beside the hum if there is some.
     degrees_of_freedom : int
     """
 
@@ -103,8 +103,8 @@ class RecordFit:
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
-        Of the determined parameters, zeta, gamma, density over stiffness and stiffness counted as
-        logarithms.
+        Covariance of the determined parameters; zeta, gamma, density over stiffness and stiffness
+        counted as logarithms.
     at_bounds : tuple of str
         Free parameters that rest on the edge of their range.
     internal, external : DampingSize or None

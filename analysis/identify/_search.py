@@ -51,7 +51,7 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     Parameters
     ----------
     cost : callable
-        Of a plant, on few points of a frequency response.
+        Cost of a plant, on few points of a frequency response.
     unknowns : Unknowns
     """
     moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
@@ -301,7 +301,7 @@ class Search:
     first : ndarray, shape (k,)
         Where the orders are 1.
     minima : list of Minimum
-        Of the rough response, noise taken for white; the lowest first.
+        Minima of the coarse response, noise taken as white; the lowest first.
     """
 
     objective: Objective

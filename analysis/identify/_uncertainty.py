@@ -47,7 +47,7 @@ def covariance_of_unknowns(
     Parameters
     ----------
     jacobian : ndarray of complex, shape (k, K)
-        Of the whitened residual.
+        Derivatives of the whitened residual.
     scatter : float
         Variance of the whitened residual's parts.
     held : ndarray of bool, shape (k,)
@@ -226,7 +226,7 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
     poles : sequence of Pole
         Differentiated by the unknowns; of over-damped modes both.
     covariance : ndarray, shape (k, k)
-        Of the unknowns.
+        Covariance of the unknowns.
     """
     table = []
     for number in dict.fromkeys(pole.mode for pole in poles):

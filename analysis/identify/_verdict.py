@@ -81,7 +81,7 @@ def order_verdict(
     ----------
     field : Field
     profile : Profile
-        Of the order, in the freest structure on the beam selected.
+        Profile of the order, in the freest structure on the beam selected.
     visible : tuple of int
         Modes that the record shows.
     doubt : str or None
@@ -203,14 +203,14 @@ class Verdict:
     name : str
         The file.
     structure : str
-        Of the lowest BIC: "I" to "VII".
+        Structure of the lowest BIC: "I" to "VII".
     uniform : bool
         Whether its beam is uniform.
     rivals : tuple of str
         Structures that the data cannot tell from it.
     parameters : mapping of str to float
-        Of the freest structure on that beam, as `RecordFit` names them; those that carry a flag
-        are left out.
+        Those of the freest structure on that beam, as `RecordFit` names them, but for those that
+        carry a flag.
     adequate : bool
         Whether what remains of that is noise.
     alpha, lambda_ : OrderVerdict
@@ -228,7 +228,7 @@ class Verdict:
     experiments : tuple of str
         What would tell more.
     damping_with_amplitude : tuple of DampingAt
-        Of free vibration, where the air brakes the beam; else empty.
+        Damping in free vibration, where the air brakes the beam; else empty.
     """
 
     name: str

@@ -303,7 +303,7 @@ def thinned(
     ----------
     measured : ndarray of complex, shape (n,)
     weights : ndarray, shape (n,)
-        Of sum 1.
+        Weights, of sum 1.
     count : int
         How many points to choose at most.
 

@@ -239,7 +239,7 @@ class FittedModel:
         The model with the tool's inertia on the bins that were fitted, in N·m/rad.
     indices : Indices
     modes : tuple of Mode
-        Of the beam alone, from its poles; empty where damping is so strong that one has none.
+        Modes of the beam alone, from its poles; empty where damping is so strong that one has none.
     followed : tuple of bool
         Mode by mode, whether it vibrates, and within `LARGEST_SHIFT` of the undamped beam's
         frequency. If not, the fit has let go of that resonance: the mode is not the antenna's.
