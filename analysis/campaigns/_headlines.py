@@ -1,4 +1,4 @@
-"""What a campaign says first, for programs: each session's headline, then that of all together."""
+"""Headline numbers of a campaign, for programs: of each session, then of all together."""
 
 from __future__ import annotations
 

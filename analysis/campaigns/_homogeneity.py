@@ -1,8 +1,12 @@
-"""Whether the sessions of a campaign are of one specimen: what files state, what estimates show.
+"""Homogeneity of a campaign: whether its sessions are of one specimen, by files and by estimates.
 
 Cochran's Q and I², the share of the variance between sessions that their own uncertainties do not
-explain (J. P. T. Higgins and S. G. Thompson, "Quantifying heterogeneity in a meta-analysis",
-Statistics in Medicine 21 (2002) 1539-1558), of each mode and of each parameter by itself.
+explain [1]_, of each mode and of each parameter by itself.
+
+References
+----------
+.. [1] J. P. T. Higgins and S. G. Thompson, Quantifying heterogeneity in a meta-analysis, Statistics
+   in Medicine 21 (2002) 1539-1558.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ Values = tuple[tuple[str, float, float], ...]
 """File, estimate and its standard deviation, session by session."""
 
 SIGNIFICANT: Final = 0.01
-"""Of all quantities together: one alarm in a hundred campaigns that repeat is false."""
+"""Level of all quantities together: one alarm in a hundred campaigns that repeat is false."""
 
 _LARGE: Final = 0.9
 """I² from which sessions are said to differ in kind: a scatter of three own standard deviations."""

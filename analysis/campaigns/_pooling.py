@@ -1,13 +1,15 @@
-"""Whole-record estimates of all sessions pooled: random effects, parameters, modes.
+"""Pooled whole-record estimates of all sessions, by a random-effects model.
 
-Estimates of many sessions pooled, when sessions differ by more than their own uncertainty.
+``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k states for itself, tau the
+scatter of each parameter between sessions, by the moments of DerSimonian and Laird [1]_. A full
+matrix in place of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
+likelihood, five sessions that do repeat then show two thirds of their own standard deviations as
+scatter in each of eight parameters.
 
-The random-effects model ``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k
-states for itself, tau the scatter of each parameter between sessions, by the moments of R.
-DerSimonian and N. Laird, "Meta-analysis in clinical trials", Controlled Clinical Trials 7 (1986)
-177-188. A full matrix in place of ``diag(tau²)`` would have more numbers than a campaign has
-sessions: by maximum likelihood, five sessions that do repeat then show two thirds of their own
-standard deviations as scatter in each of eight parameters.
+References
+----------
+.. [1] R. DerSimonian and N. Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7
+   (1986) 177-188.
 """
 
 from __future__ import annotations
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
     from analysis.identify import Damping, Order
 
 
+# Random effects
+
+
 @dataclass(frozen=True, slots=True)
 class RandomEffects:
     """Pooled estimate of k parameters over K sessions.
@@ -41,7 +46,7 @@ class RandomEffects:
     ----------
     mean : ndarray, shape (k,)
     covariance : ndarray, shape (k, k)
-        Of the mean.
+        Covariance of the mean.
     between_std : ndarray, shape (k,)
         Scatter between sessions, tau; 0 where the sessions' own uncertainties explain all.
     cochran_q : ndarray, shape (k,)
@@ -70,7 +75,7 @@ def random_effects(
     Parameters
     ----------
     estimates : ndarray, shape (K, k)
-        Of two sessions at least.
+        Estimates of two sessions at least.
     covariances : ndarray, shape (K, k, k)
         Positive definite, of each estimate.
     """
@@ -106,6 +111,9 @@ def _combined(
     mean = spread @ np.einsum("kij,kj->i", precision, values)
     off = values - mean
     return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
+
+
+# Modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +161,8 @@ def _pooled(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, flo
     return float(mean), math.sqrt(variance), float(between)
 
 
+# Structures
+
 _FEWEST: Final = 2
 _DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (
     ("internal", "zeta", "alpha"),
@@ -168,9 +178,9 @@ class PooledParameter:
     ----------
     name : str
     value : float
-        Of a positive parameter that is estimated by its logarithm: the geometric mean.
+        Mean; of a positive parameter that is estimated by its logarithm the geometric mean.
     std : float
-        Of `value`.
+        Standard deviation of `value`.
     interval : (float, float)
         95 % confidence interval of the value, by Student's t with K − 1 degrees of freedom.
     within_std : float
@@ -234,11 +244,11 @@ class PooledEstimate:
     beam : str
         As of `RecordEstimate`.
     plant : Plant
-        Of the pooled parameters.
+        Plant of the pooled parameters.
     parameters : tuple of PooledParameter
         Those that every session used determines.
     covariance : ndarray, shape (k, k)
-        Of these, positive ones as logarithms.
+        Covariance of these, positive ones as logarithms.
     modes : tuple of PooledMode
     sessions : int
         Used: those that determine the structure's damping.
@@ -247,7 +257,7 @@ class PooledEstimate:
         nothing but noise. Where it is far beyond 1 the structure is wrong, and its standard
         deviations mean little.
     bic : float
-        Of all sessions together, see `pooled_bic`.
+        Criterion of all sessions together, see `pooled_bic`.
     """
 
     structure: str

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
     from analysis.exchange._table import Table
 
+
+# Reading
+
 _HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 _HDF5_AT: Final = (0, 512)  # MATLAB puts its own header of 512 bytes before it
 
@@ -152,6 +155,9 @@ def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  
     check_samples(path, f"'{name}'", max(dataset.shape, default=0))
     # MATLAB's columns are the rows of HDF5, which counts its dimensions from the other end.
     return _column(path, name, dataset[()].T, column)
+
+
+# Writing
 
 
 def write_mat(table: Table, stream: BinaryIO) -> None:

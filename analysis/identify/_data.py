@@ -1,4 +1,15 @@
-"""What the estimator is given: two channels on a uniform grid, gaps closed, decimated."""
+"""Measured angle and torque as an estimator takes them: gaps interpolated, decimated to the band.
+
+A missing angle is interpolated, since the convolution with the response needs one at every tick; a
+missing torque is not compared. Decimation is by a linear-phase FIR filter (Kaiser window), so that
+all of the band is kept and neither channel is delayed against the other.
+
+References
+----------
+N. Wiener, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
+J. F. Kaiser, Nonrecursive digital filter design using the I0-sinh window function, Proc. IEEE Int.
+Symp. Circuits and Systems (1974) 20-23.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._plant import Plant
-from analysis.record_checks import too_much_unknown
+from analysis.record_checks import longest_run, too_much_unknown
 from rigd.beam import Damping
 
 if TYPE_CHECKING:
@@ -17,6 +28,9 @@ if TYPE_CHECKING:
 
     from analysis.record import Record
     from rigd.beam import Beam
+
+
+# Measurement
 
 MAX_ANGLE_GAP_PERIODS: Final = 0.4
 """Longest gap of the angle that is bridged, in periods of the band's upper end."""
@@ -177,18 +191,11 @@ class Measurement:
         return angle - origin
 
 
+# Interpolation of gaps
+
 _REACH_PERIODS: Final = 2.0
 _MARGIN: Final = 1.2
 _NOISE_POWER: Final = 1e-6
-
-
-def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
-    """Length and start of the longest run of True, (0, 0) without any."""
-    starts, ends = _runs(mask)
-    if starts.size == 0:
-        return 0, 0
-    longest = int(np.argmax(ends - starts))
-    return int(ends[longest] - starts[longest]), int(starts[longest])
 
 
 def bridged(
@@ -226,12 +233,6 @@ def bridged(
     return filled
 
 
-def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First places of the runs of True, and those after their last."""
-    edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-
-
 @lru_cache(maxsize=64)
 def _weights(neighbours: tuple[int, ...], length: int, highest: float) -> NDArray[np.float64]:
     """Weights of the neighbours in each of `length` values from place 0 on."""
@@ -242,6 +243,14 @@ def _weights(neighbours: tuple[int, ...], length: int, highest: float) -> NDArra
     weights: NDArray[np.float64] = np.linalg.solve(among, across.T).T
     return weights
 
+
+def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First places of the runs of True, and those after their last."""
+    edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+
+
+# Decimation
 
 _ATTENUATION_DB: Final = 100.0
 _RATE_OVER_BAND: Final = 2.4

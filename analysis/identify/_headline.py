@@ -1,4 +1,4 @@
-"""The numbers that a record stands for: from the freest structure that it supports, with flags.
+"""Headline numbers of a record: from the freest structure that it supports, with flags.
 
 A structure that fixes an order gives narrow intervals which hold only if that order is right, and
 the criterion that selected it forgives an error of 2.7 standard deviations. So what is told first
@@ -180,7 +180,7 @@ class Headline(Numbers):
     Attributes
     ----------
     fit : RecordFit
-        Of the freest structure that the record supports.
+        Fit of the freest structure that the record supports.
     explained : bool
         Whether it leaves nothing but noise; else every number carries a flag.
     """

@@ -1,10 +1,18 @@
-"""Is what remains only noise? Tests of the residual: periodogram, loudness, harmonics, its input.
+"""Residual tests: whiteness, coherence with the input, harmonics of the sweep.
 
-Residual at multiples of the frequency that the sweep has at that moment.
+Chance is ruled out at one level throughout (`SURE`). The cumulative periodogram of a white residual
+is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that is coherent
+with the angle is linear dynamics that the model lacks.
 
 A linear beam answers at the frequency it is driven at, and rings at frequencies that the sweep has
 passed. Twice or three times the drive's frequency is another matter: something is not linear. No
 model of it is needed.
+
+References
+----------
+M. S. Bartlett, An Introduction to Stochastic Processes (1955): the cumulative periodogram.
+E. B. Wilson and M. M. Hilferty, The distribution of chi-square, Proc. Natl. Acad. Sci. 17 (1931)
+684-688: `of_chi_square`.
 """
 
 from __future__ import annotations
@@ -20,6 +28,9 @@ from analysis.statistics import chi_square_deviate, kolmogorov_p_value
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+
+# Chance
+
 SURE: Final = 5.0
 """Standard deviations from which chance is ruled out: 3 in 10 million, whatever was looked at."""
 
@@ -29,11 +40,13 @@ def largest_of(count: int) -> float:
     return SURE**2 / 2 + math.log(max(count, 1))
 
 
+# Whiteness, and coherence with the input
+
 BAND_95: Final = 1.3581
 """95 % point of the Kolmogorov statistic times the root of the number of bins."""
 
 _LEVEL: Final = 1e-6
-"""Of probability: what `SURE` means for the other tests."""
+"""Probability of chance: what `SURE` means for the other tests."""
 
 _WINDOWS: Final = (8, 32)
 _LOUD: Final = 1.4
@@ -63,7 +76,7 @@ class Whiteness:
     band : float
         Within which it stays in 95 % of the records that hold nothing but noise.
     probability : float
-        Of such a distance by chance.
+        Probability of such a distance by chance.
     loudest_hz : tuple of float
         Edges of the window that is loudest for its width.
     loudest_ratio : float
@@ -99,7 +112,7 @@ class InputRelation:
     local : bool
         Whether chance is ruled out there.
     deviate : float
-        Of the coherence over the whole band, in standard deviations beyond chance.
+        Deviate of the coherence over the whole band, in standard deviations beyond chance.
     correlation : float
         Largest correlation of residual and angle, both whitened, in standard deviations.
     lag_s : float
@@ -220,6 +233,16 @@ def input_relation(
     )
 
 
+def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
+    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
+    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
+    spectrum[bins] = residual
+    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
+    return values
+
+
+# Harmonics of the sweep
+
 MULTIPLES: Final = (2, 3)
 _BLOCK_S: Final = 1.0
 _LOWEST_HZ: Final = 2.0
@@ -238,7 +261,7 @@ class Harmonic:
     multiple : int
         2 or 3.
     deviate : float
-        Of its power along the whole sweep, in standard deviations beyond chance.
+        Deviate of its power along the whole sweep, in standard deviations beyond chance.
     drive_hz : float
         Frequency of the drive at which it is largest.
     present : bool
@@ -302,14 +325,6 @@ def harmonics(
             )
         )
     return tuple(found)
-
-
-def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
-    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
-    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
-    spectrum[bins] = residual
-    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
-    return values
 
 
 def _analytic(values: NDArray[np.float64]) -> NDArray[np.complex128]:

@@ -1,4 +1,4 @@
-"""What a whole-record fit finds, and how sure it is of it."""
+"""Result of a fit of the whole record: parameters, their uncertainty, modes and residual."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ModeEstimate:
 
     number: int
     frequency_hz: float
-    """Of the free decay, 0 if over-damped."""
+    """Frequency of the free decay, 0 if over-damped."""
     frequency_std_hz: float
     damping_ratio: float
     damping_ratio_std: float
@@ -63,7 +63,7 @@ class Ringing:
     amplitude_nm : tuple of float
         By mode, at the first sample compared.
     chi_square : float
-        Of all its amplitudes together, beside the hum if there is some.
+        Chi-square of all its amplitudes together, beside the hum if there is some.
     degrees_of_freedom : int
     """
 
@@ -102,8 +102,8 @@ class RecordFit:
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
-        Of the determined parameters, zeta, gamma, density over stiffness and stiffness counted as
-        logarithms.
+        Covariance of the determined parameters; zeta, gamma, density over stiffness and stiffness
+        counted as logarithms.
     at_bounds : tuple of str
         Free parameters that rest on the edge of their range.
     internal, external : DampingSize or None

@@ -1,4 +1,4 @@
-"""What a rig has beside a uniform beam, a rigid clamp and ideal channels, in words."""
+"""Findings on the rig beside a uniform beam, a rigid clamp and ideal channels, in words."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import Field
 
 
