@@ -24,6 +24,17 @@ _START_S: Final = 30.0
 _LOOK_S: Final = 0.05
 
 
+def _fault_of(program: RerunProgram) -> str:
+    """Say in a sentence why a window was closed by a fault."""
+    if program.without_graphics:
+        return (
+            "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's viewer "
+            "needs. Install one; on Debian and Ubuntu the package mesa-vulkan-drivers has those "
+            "for most graphics cards, and one that needs none."
+        )
+    return f"The window was closed by a fault ({program.last_words})."
+
+
 class _Playback:
     """Rerun's program with a file, as long as this context is entered."""
 
@@ -88,6 +99,11 @@ class Window(_Playback):
             ),
             {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
         )
+
+    @property
+    def fault(self) -> str:
+        """Why it was closed, if not by the user: a sentence."""
+        return _fault_of(self._program)
 
 
 class PageOfFile(_Playback):
@@ -210,6 +226,16 @@ class Viewer:
     def last_words(self) -> str:
         """What it said last."""
         return self._program.last_words
+
+    @property
+    def without_graphics(self) -> bool:
+        """Whether it said that it cannot draw: that the computer has no graphics it can use."""
+        return self._program.without_graphics
+
+    @property
+    def fault(self) -> str:
+        """Why it was closed, if not by the user: a sentence."""
+        return _fault_of(self._program)
 
     @property
     def control_url(self) -> str:
