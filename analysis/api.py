@@ -111,7 +111,7 @@ def fit(
     ----------
     record : Record
     types : sequence of str, optional
-        Of "I" to "VII"; by default all seven, with "welch" the paper's six.
+        Names from "I" to "VII"; by default all seven, with "welch" the paper's six.
     method : {"record", "welch"}
         Output error on the whole record, or the paper's fit to Welch's estimate.
     fixed : iterable of str
@@ -218,9 +218,9 @@ def campaign(
     paths : iterable of Path or str
         Session files.
     settings : WelchSettings, optional
-        Of the paper's route; by default the paper's.
+        Settings of the Welch fits; by default the paper's.
     types : sequence of str, optional
-        Fitted to the whole records; by default all seven.
+        Structures fitted to the whole records; by default all seven.
     fixed : sequence of str
         Settings that stay at the file's values in those fits.
     jobs : int, optional

@@ -1,20 +1,21 @@
-"""Model structures and what is fitted: damping parameters, weights of the cost, settings, unknowns.
+"""Damping structures, their parametrization, and the settings with which they are fitted.
 
-The model structures: which damping parameters are fitted and which stay fixed.
-
-Types I to VI with the fixed values of the paper's Table 2. Type VII is the one its conclusions
-point to: internal damping of integer order (alpha = 1) with external damping of fractional order.
-
-The unknowns in which damping is fitted, and the way to and from its parameters.
+A structure says which damping parameters are fitted and which stay fixed. Types I to VI have the
+fixed values of the paper's Table 2. Type VII is the one its conclusions point to: internal damping
+of integer order (alpha = 1) with external damping of fractional order.
 
 A coefficient and its order are all but interchangeable near the frequencies where they act:
 fitting ``zeta`` and ``alpha`` themselves means descending a curved valley (their correlation is
--0.99). The unknowns here are the logarithm of the damping's size at one frequency, and the order:
+-0.99). So the unknowns of a fit to a frequency response (`Unknowns`) are the logarithm of the
+damping's size at one frequency, and the order:
 
 * ``ln(zeta omega_2^alpha)``: internal damping relative to the stiffness at the undamped second
   mode, and ``alpha``;
 * ``ln(gamma omega_1^lambda / (rho/EI omega_1²))``: external damping relative to the inertia at the
   undamped first mode, and ``lambda``.
+
+The whole-record fits have a parametrization of their own (`analysis.identify.Unknowns`), in which
+beam and rig are free as well.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ from rigd.spectral import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from rigd.spectral import Estimator
+
+
+# Structures
 
 Parameter = Literal["zeta", "alpha", "gamma", "lambda"]
 PARAMETERS: Final[tuple[Parameter, ...]] = ("zeta", "alpha", "gamma", "lambda")
@@ -85,7 +87,7 @@ class Structure:
         Parameters
         ----------
         name : str
-            Of `PARAMETERS`, or of beam and rig.
+            A name of `PARAMETERS`, or a parameter of beam or rig.
         """
         if name in ("zeta", "alpha"):
             return self.internal
@@ -125,6 +127,9 @@ STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
 )
 
 
+# Response of a structure
+
+
 class FrequencyResponseModel:
     """Measured torque per motor angle, ``G(j omega) + J_tool (j omega)²``, on one frequency grid.
 
@@ -160,6 +165,8 @@ class FrequencyResponseModel:
         response, gradient = self._grid.evaluate_with_gradient(self.beam, damping, wrt)
         return response + self._tool, gradient
 
+
+# Weights of the cost
 
 WeightingFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Weighting = str | WeightingFunction
@@ -247,8 +254,10 @@ def _exponent(weighting: str) -> float:
     return exponent
 
 
+# Settings of the fits
+
 RECORD_BAND_HZ: Final = (0.0, 50.0)
-"""Of the whole-record fits, where the record's rate holds it."""
+"""Band of the whole-record fits, where the record's rate holds it."""
 
 LARGEST_SHARE_OF_RATE: Final = 0.4
 """Highest frequency that is fitted, over the sampling rate: filters need room up to half of it."""
@@ -315,6 +324,8 @@ class WelchSettings:
             nfft = max(round(PAPER_NFFT * scale), length)
         return Segmentation(length, overlap, nfft)
 
+
+# Unknowns of a fit to a frequency response
 
 # Orders as the paper sweeps them, inside (0, 2). Sizes run from what no response could show to
 # far beyond what lets a beam vibrate, much wider than the paper's sweep, which its own results

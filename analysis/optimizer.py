@@ -1,18 +1,20 @@
-"""What was computed last: a descent ends at one of the last points that it looked at.
-
-Descent to a minimum of a sum of squares within bounds: damped steps on the normal equations.
+"""Minimum of a sum of squares within bounds: damped Gauss-Newton steps on the normal equations.
 
 For problems of a few unknowns and thousands of residuals, where forming the normal equations is
 cheap and a general solver's overhead (and its import, longer than all the fits of a session) is
-not. Steps are damped after H. B. Nielsen, "Damping parameter in Marquardt's method",
-IMM-REP-1999-05.
+not. Steps are damped after Nielsen [1]_.
 
 The Hessian of a sum of squares is ``J'J`` and a second part: the residuals times their own second
 derivatives. Gauss-Newton and Levenberg-Marquardt leave the second part out. Where the residual
 stays large, because the model cannot follow the data, they creep: each step shortens the way that
 remains by the same share. Here the second part is learned from how the gradient changes from step
-to step (J. E. Dennis, D. M. Gay and R. E. Welsch, ACM TOMS 7 (1981) 348-368: NL2SOL), and used when
-it would have foretold the last step better.
+to step (NL2SOL [2]_), and used when it would have foretold the last step better.
+
+References
+----------
+.. [1] H. B. Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05.
+.. [2] J. E. Dennis, D. M. Gay and R. E. Welsch, An adaptive nonlinear least-squares algorithm, ACM
+   TOMS 7 (1981) 348-368.
 """
 
 from __future__ import annotations
@@ -25,48 +27,10 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
     from numpy.typing import NDArray
 
-_Value = TypeVar("_Value")
 
-_KEPT: Final = 2
-"""The last step of a descent may have been taken back."""
-
-
-class Recent(Generic[_Value]):
-    """Values at the last two points, for an objective that is asked for them again.
-
-    Covariances are asked for where a descent ended, and the next one begins there.
-    """
-
-    __slots__ = ("_values",)
-
-    def __init__(self) -> None:
-        self._values: dict[bytes, _Value] = {}
-
-    def at(
-        self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
-    ) -> _Value:
-        """Value at `x`, computed if it is not one of the last."""
-        key = x.tobytes()
-        if key not in self._values:
-            if len(self._values) == _KEPT:
-                del self._values[next(iter(self._values))]
-            self._values[key] = compute(x)
-        return self._values[key]
-
-
-_FIRST_DAMPING: Final = 1e-3
-_LARGEST_DAMPING: Final = 1e16
-_LEAST_RELIEF: Final = 0.1
-"""Share of the damping that a step which kept its promise leaves."""
-
-_LEAST_RELIEF_STRAIGHT: Final = 1 / 3
-
-_SHORTEST_STEP: Final = 1e-13
-_FLOOR: Final = 1e-14
-"""Least curvature, relative to the largest: an unknown without effect takes no huge step."""
+# Problem, bounds and minimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +120,20 @@ class Box:
         return np.clip(x + step, self.lower, self.upper)
 
 
+# Descent
+
+_FIRST_DAMPING: Final = 1e-3
+_LARGEST_DAMPING: Final = 1e16
+_LEAST_RELIEF: Final = 0.1
+"""Share of the damping that a step which kept its promise leaves."""
+
+_LEAST_RELIEF_STRAIGHT: Final = 1 / 3
+
+_SHORTEST_STEP: Final = 1e-13
+_FLOOR: Final = 1e-14
+"""Least curvature, relative to the largest: an unknown without effect takes no huge step."""
+
+
 def descend(
     problem: Callable[[NDArray[np.float64]], NormalEquations],
     start: NDArray[np.float64],
@@ -180,7 +158,7 @@ def descend(
         Stop when a step promises less than this fraction of the cost, or is too short to be told
         from rounding.
     max_evaluations : int
-        Of `problem`, after which the best point so far is returned.
+        Most evaluations of `problem`, after which the best point so far is returned.
     second_part : ndarray, shape (k, k), optional
         As a descent on nearly the same problem has learned it; used from the first step on.
     learns : bool
@@ -296,3 +274,34 @@ def _learned(
         + (both + both.T) / along
         - (float(miss @ step) / along**2) * np.outer(change, change)
     )
+
+
+# Values at the last points
+
+_Value = TypeVar("_Value")
+
+_KEPT: Final = 2
+"""The last step of a descent may have been taken back."""
+
+
+class Recent(Generic[_Value]):
+    """Values at the last two points, for an objective that is asked for them again.
+
+    Covariances are asked for where a descent ended, and the next one begins there.
+    """
+
+    __slots__ = ("_values",)
+
+    def __init__(self) -> None:
+        self._values: dict[bytes, _Value] = {}
+
+    def at(
+        self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
+    ) -> _Value:
+        """Value at `x`, computed if it is not one of the last."""
+        key = x.tobytes()
+        if key not in self._values:
+            if len(self._values) == _KEPT:
+                del self._values[next(iter(self._values))]
+            self._values[key] = compute(x)
+        return self._values[key]

@@ -44,7 +44,7 @@ MAX_SAMPLES = MAX_TICKS
 """Most samples of a session that are read."""
 
 _FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
-"""Of the samples, what an analysis needs."""
+"""Fields of the samples that an analysis needs."""
 
 _REPORTED_FLAGS = (
     (Status.TORQUE_SATURATED, "torque command saturated"),

@@ -1,7 +1,9 @@
-"""Numbers that a session's file states of rig and specimen, each within what can be.
+"""Checks of a session before it is analysed: values that its file states, and samples.
 
 A unit mistaken for another, or a file from somewhere else, is told here by its key; no estimator
-could say so half as well, and some would overflow.
+could say so half as well, and some would overflow. Of the samples, what cannot be analysed is
+refused: an empty or endless span, a clock that contradicts the rate, values that are not finite, a
+dead sensor, gaps too long to be interpolated.
 """
 
 from __future__ import annotations
@@ -20,6 +22,13 @@ if TYPE_CHECKING:
 
     from rigd.session import Session
 
+
+class RecordError(ValueError):
+    """A session that was read but cannot be analysed; the message names file, cause and remedy."""
+
+
+# Values that the file states
+
 _BEAM_RANGES: Final = {
     "beam_length_m": (1e-3, 1e3, "m"),
     "beam_density_kg_per_m": (1e-6, 1e6, "kg/m"),
@@ -28,7 +37,7 @@ _BEAM_RANGES: Final = {
 _MAX_INERTIA_KG_M2: Final = 1e3
 _MAX_DELAY_S: Final = 1.0
 _FIRST_ROOT: Final = 1.8751040687119611
-"""Of 1 + cos z cosh z: the first mode of a clamped beam has (root / length)² √(EI/rho) rad/s."""
+"""First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
 _LEAST_PERIODS: Final = 0.1
 """Periods of the first mode that a record holds at least, with a beam's data ten times off."""
@@ -146,6 +155,8 @@ def _wrong(session: Session, key: str, value: float, unit: str, rule: str) -> Re
     )
 
 
+# Samples
+
 MAX_UNKNOWN_SHARE = 0.05
 """Largest share of angle or torque that may be missing or flagged: one limit for import, loading
 and estimation. Whole-record fits stand so much of it (within their own uncertainty at 4.5 %)."""
@@ -166,10 +177,6 @@ MAX_VALUE = 1e9
 
 MAX_CLOCK_ERROR = 1e-3
 """Largest relative difference between the rate stated and the rate of the time stamps."""
-
-
-class RecordError(ValueError):
-    """A session that was read but cannot be analysed; the message names file, cause and remedy."""
 
 
 def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
@@ -253,7 +260,7 @@ def check_fillable(
     unknown : ndarray of bool, shape (n,)
         Samples of the sweep without a value of their own.
     first_tick : int
-        Of the sweep.
+        First tick of the sweep.
     rate_hz : float
     """
     much = too_much_unknown(f"the {channel} in the sweep", int(unknown.sum()), len(unknown))

@@ -1,4 +1,4 @@
-"""What a report is about."""
+"""Result of the analysis of one record, as reports take it: fits, selection, verdict, warnings."""
 
 from __future__ import annotations
 
@@ -80,11 +80,11 @@ class Subject:
         The numbers that are told first; its fit is one of `fits`.
     verdict : Verdict
     band_hz : tuple of float
-        Of the whole-record fits.
+        Band of the whole-record fits.
     fixed : tuple of str
         Settings that stayed at the file's values in them.
     welch : WelchAnalysis or None
-        The paper's route on the same record; None if it was not gone.
+        Welch fits of the same record; None if they were not run.
     """
 
     record: Record

@@ -38,6 +38,8 @@ for _number, _default in (
 # No test meets a rig that somebody simulates on this computer, nor one of another worker.
 _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
+# Nor a profile of the user's own that hides a shipped one.
+os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 # The same examples each time, and however long they take: what fails is a change's fault. Others

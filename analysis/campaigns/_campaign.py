@@ -47,7 +47,7 @@ class Campaign:
     ----------
     settings : WelchSettings
     record_band_hz : tuple of float
-        Of the whole-record fits of most sessions.
+        Band of the whole-record fits of most sessions.
     sessions : tuple of SessionResult
         In the order of the paths.
     failures : tuple of SessionFailure
@@ -61,7 +61,7 @@ class Campaign:
     structures : tuple of RankedStructure
         Every structure fitted to the whole records, those pooled first.
     pooled : tuple of PooledEstimate
-        Of the structures that two sessions or more determine, the lowest BIC first; empty without
+        Structures that two sessions or more determine, the lowest BIC first; empty without
         whole-record fits.
     verdict : CampaignVerdict or None
         Which of them the data support, and what else they say; None without any.
@@ -117,14 +117,14 @@ def campaign(
     paths : sequence of Path
         Session files.
     settings : WelchSettings, optional
-        Of the paper's route, by default the paper's.
+        Settings of the Welch fits, by default the paper's.
     structures : sequence of str
         Types of the whole-record estimate to choose from; none leaves that estimate, the verdict
         and the estimate's validation out.
     fixed : sequence of str
         Settings of rig and specimen that stay at the file's values in those fits.
     band_hz : tuple of float, optional
-        Of all fits and of the validation; by default what suits each record.
+        Band of all fits and of the validation; by default what suits each record.
     jobs : int, optional
         Worker processes, by default one a core.
     dask : str, optional

@@ -1,4 +1,4 @@
-"""What a campaign keeps of the fits of one session."""
+"""Estimates of one session that a campaign keeps: Welch fits and whole-record fits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WelchFit:
-    """One structure fitted to one session by the paper's route, with one weighting.
+    """One structure fitted to one session by the Welch method, with one weighting.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class RecordEstimate:
     deviance : float
         ``-2 ln`` likelihood, but for a constant that all estimates of the session share.
     bic : float
-        Of the session by itself.
+        Criterion of the session by itself.
     values : int
         Real values compared.
     indices : Indices

@@ -1,4 +1,4 @@
-"""What the sessions of one campaign have in common, and what can go wrong with a campaign."""
+"""Experiment of a campaign: what its sessions have in common, and errors of a campaign."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def stated_specimens(
     stated : iterable of (Path, Experiment or None)
         None of a file that could not be read.
     of_campaign : Experiment
-        Of the sessions that are pooled.
+        Experiment of the sessions that are pooled.
     """
     found: list[tuple[Experiment, list[Path]]] = [(of_campaign, [])]
     for path, experiment in stated:

@@ -1,13 +1,13 @@
-"""What a campaign says first, for programs: each session's headline, then that of all together."""
+"""Headline numbers of a campaign, for programs: of each session, then of all together."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.campaigns._pooling import t_quantile
 from analysis.identify import STRONG, Mode, Numbers, Quantity, Simpler, Size, headline_json
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
+from analysis.statistics import student_t_quantile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -128,7 +128,7 @@ def _sizes(
 
 
 def _modes(campaign: Campaign, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
-    t, mixed = t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
+    t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
     def told(value: float, std: float, quantity: str) -> Quantity:
         flag = every or (_MIXTURE if mixed(quantity) else None)

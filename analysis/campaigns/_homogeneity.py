@@ -1,8 +1,12 @@
-"""Whether the sessions of a campaign are of one specimen: what files state, what estimates show.
+"""Homogeneity of a campaign: whether its sessions are of one specimen, by files and by estimates.
 
 Cochran's Q and I², the share of the variance between sessions that their own uncertainties do not
-explain (J. P. T. Higgins and S. G. Thompson, "Quantifying heterogeneity in a meta-analysis",
-Statistics in Medicine 21 (2002) 1539-1558), of each mode and of each parameter by itself.
+explain [1]_, of each mode and of each parameter by itself.
+
+References
+----------
+.. [1] J. P. T. Higgins and S. G. Thompson, Quantifying heterogeneity in a meta-analysis, Statistics
+   in Medicine 21 (2002) 1539-1558.
 """
 
 from __future__ import annotations
@@ -14,8 +18,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._orders import common_structure, freest_estimate
-from analysis.campaigns._pooling import chance_of, random_effects
+from analysis.campaigns._pooling import random_effects
 from analysis.identify import LOGARITHMIC
+from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -31,7 +36,7 @@ Values = tuple[tuple[str, float, float], ...]
 """File, estimate and its standard deviation, session by session."""
 
 SIGNIFICANT: Final = 0.01
-"""Of all quantities together: one alarm in a hundred campaigns that repeat is false."""
+"""Level of all quantities together: one alarm in a hundred campaigns that repeat is false."""
 
 _LARGE: Final = 0.9
 """I² from which sessions are said to differ in kind: a scatter of three own standard deviations."""
@@ -213,7 +218,7 @@ def _judged(quantity: str, values: Values, level: float) -> Heterogeneity:
     if logarithmic:
         estimate, std = np.log(estimate), std / estimate
     effects = random_effects(estimate[:, None], (std**2)[:, None, None])
-    chance = float(chance_of(effects.cochran_q, len(values))[0])
+    chance = float(chi_square_p_value(effects.cochran_q[0], len(values) - 1))
     mean = math.exp(effects.mean[0]) if logarithmic else float(effects.mean[0])
     significant = chance < level
     apart = groups(estimate, std) if significant else ()

@@ -1,10 +1,9 @@
-"""One structure for all sessions, and what they say together about the orders of the damping.
+"""Common structure of all sessions, and what they say together about the orders of the damping.
 
-The one structure by which all sessions are compared and pooled: the freest that they support.
-
-What a session selects by itself depends on its noise. Sessions compared by what each of them
-selected differ by the difference between structures, and forty sessions of one beam then seem to
-be of two. Intervals of the freest structure hold whichever simpler one is true.
+The structure by which all sessions are compared and pooled is the freest that they support. What a
+session selects by itself depends on its noise. Sessions compared by what each of them selected
+differ by the difference between structures, and forty sessions of one beam then seem to be of two.
+Intervals of the freest structure hold whichever simpler one is true.
 """
 
 from __future__ import annotations
@@ -13,9 +12,10 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.campaigns._pooling import by_structure, t_quantile
+from analysis.campaigns._pooling import by_structure
 from analysis.identify import STRONG, WIDEST_SHARE
 from analysis.models import ORDER_RANGE, STRUCTURES
+from analysis.statistics import student_t_quantile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._pooling import PooledEstimate, PooledParameter
     from analysis.campaigns._session import SessionResult
     from analysis.identify import Order, Verdict
+
+
+# Common structure
 
 _NEARLY_ALL: Final = 0.9
 """Share of the sessions that determine the selected structure that must determine a freer one."""
@@ -68,7 +71,7 @@ def common_structure(
     Returns
     -------
     str or None
-        Of those fitted to every session, the freest: on the beam of what is pooled, or with nothing
+        The freest of those fitted to every session: on the beam of what is pooled, or with nothing
         pooled on the one that most sessions select. None without whole-record fits.
     """
     fitted = by_structure(sessions)
@@ -94,6 +97,8 @@ def _usual_beam(sessions: Sequence[SessionResult]) -> str:
 def _freedom(estimate: RecordEstimate) -> int:
     return len(STRUCTURES[estimate.structure].free)
 
+
+# Orders
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 
@@ -154,7 +159,7 @@ def pooled_order(
     ranked : sequence of PooledEstimate
         The lowest BIC first; not empty.
     verdicts : sequence of Verdict
-        Of the sessions.
+        Verdicts of the sessions.
     alike : Homogeneity
         Whether they are of one specimen.
     """
@@ -178,6 +183,11 @@ def pooled_order(
         alone=alone,
         mixture=mixture,
     )
+
+
+def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
+    """Return those whose BIC is less than so much above the lowest, without the best."""
+    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
 
 
 def _judged(
@@ -217,11 +227,6 @@ def _judged(
     return ("fractional" if excluded else "open"), None
 
 
-def rivals(ranked: Sequence[PooledEstimate], within: float) -> tuple[PooledEstimate, ...]:
-    """Return those whose BIC is less than so much above the lowest, without the best."""
-    return tuple(each for each in ranked[1:] if each.bic < ranked[0].bic + within)
-
-
 def _integer(estimate: PooledEstimate, order: Order) -> bool:
     """Whether a structure has this damping with an order of 1."""
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
@@ -229,7 +234,7 @@ def _integer(estimate: PooledEstimate, order: Order) -> bool:
 
 def _excludes_one(order: PooledParameter, sessions: int) -> bool:
     """Whether 1 lies outside the interval of the level at which it is called excluded."""
-    return abs(order.value - 1) > t_quantile(_SURE, sessions - 1) * order.std
+    return abs(order.value - 1) > student_t_quantile(_SURE, sessions - 1) * order.std
 
 
 def _wide(interval: tuple[float, float]) -> float:

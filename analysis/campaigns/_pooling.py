@@ -1,26 +1,28 @@
-"""Whole-record estimates of all sessions pooled: random effects, parameters, modes.
+"""Pooled whole-record estimates of all sessions, by a random-effects model.
 
-Estimates of many sessions pooled, when sessions differ by more than their own uncertainty.
+``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k states for itself, tau the
+scatter of each parameter between sessions, by the moments of DerSimonian and Laird [1]_. A full
+matrix in place of ``diag(tau²)`` would have more numbers than a campaign has sessions: by maximum
+likelihood, five sessions that do repeat then show two thirds of their own standard deviations as
+scatter in each of eight parameters.
 
-The random-effects model ``y_k ~ N(mu, S_k + diag(tau²))``: S_k is the covariance that session k
-states for itself, tau the scatter of each parameter between sessions, by the moments of R.
-DerSimonian and N. Laird, "Meta-analysis in clinical trials", Controlled Clinical Trials 7 (1986)
-177-188. A full matrix in place of ``diag(tau²)`` would have more numbers than a campaign has
-sessions: by maximum likelihood, five sessions that do repeat then show two thirds of their own
-standard deviations as scatter in each of eight parameters.
+References
+----------
+.. [1] R. DerSimonian and N. Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7
+   (1986) 177-188.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
 from analysis.models import STRUCTURES
+from analysis.statistics import chi_square_p_value, student_t_quantile
 from rigd.beam import Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
     from analysis.identify import Damping, Order
 
 
+# Random effects
+
+
 @dataclass(frozen=True, slots=True)
 class RandomEffects:
     """Pooled estimate of k parameters over K sessions.
@@ -41,7 +46,7 @@ class RandomEffects:
     ----------
     mean : ndarray, shape (k,)
     covariance : ndarray, shape (k, k)
-        Of the mean.
+        Covariance of the mean.
     between_std : ndarray, shape (k,)
         Scatter between sessions, tau; 0 where the sessions' own uncertainties explain all.
     cochran_q : ndarray, shape (k,)
@@ -70,7 +75,7 @@ def random_effects(
     Parameters
     ----------
     estimates : ndarray, shape (K, k)
-        Of two sessions at least.
+        Estimates of two sessions at least.
     covariances : ndarray, shape (K, k, k)
         Positive definite, of each estimate.
     """
@@ -108,29 +113,7 @@ def _combined(
     return mean, spread, float(np.einsum("ki,kij,kj->", off, precision, off))
 
 
-@cache
-def t_quantile(level: float, degrees_of_freedom: int) -> float:
-    """Two-sided point of Student's t: within it a share `level` lies.
-
-    With ``t = sqrt(nu) tan(theta)`` the density of theta is ``cos(theta)^(nu-1)`` up to a factor.
-    """
-    theta = np.linspace(0.0, np.pi / 2, 100_001)
-    density = np.cos(theta) ** (degrees_of_freedom - 1)
-    reached = np.concatenate(([0.0], np.cumsum(density[1:] + density[:-1])))
-    at = float(np.interp(level, reached / reached[-1], theta))
-    return float(np.sqrt(degrees_of_freedom) * np.tan(at))
-
-
-def chance_of(cochran_q: NDArray[np.float64], sessions: int) -> NDArray[np.float64]:
-    """Probability of at least that Q without scatter between sessions, shape (k,).
-
-    Chi-square of K − 1 degrees of freedom by the cube-root approximation of Wilson and Hilferty
-    (PNAS 17 (1931) 684-688).
-    """
-    freedom = sessions - 1
-    spread = 2 / (9 * freedom)
-    z = (np.cbrt(cochran_q / freedom) - 1 + spread) / np.sqrt(spread)
-    return np.array([math.erfc(each / math.sqrt(2)) / 2 for each in z])
+# Modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +161,8 @@ def _pooled(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, flo
     return float(mean), math.sqrt(variance), float(between)
 
 
+# Structures
+
 _FEWEST: Final = 2
 _DAMPINGS: Final[tuple[tuple[Damping, str, Order], ...]] = (
     ("internal", "zeta", "alpha"),
@@ -193,9 +178,9 @@ class PooledParameter:
     ----------
     name : str
     value : float
-        Of a positive parameter that is estimated by its logarithm: the geometric mean.
+        Mean; of a positive parameter that is estimated by its logarithm the geometric mean.
     std : float
-        Of `value`.
+        Standard deviation of `value`.
     interval : (float, float)
         95 % confidence interval of the value, by Student's t with K − 1 degrees of freedom.
     within_std : float
@@ -259,11 +244,11 @@ class PooledEstimate:
     beam : str
         As of `RecordEstimate`.
     plant : Plant
-        Of the pooled parameters.
+        Plant of the pooled parameters.
     parameters : tuple of PooledParameter
         Those that every session used determines.
     covariance : ndarray, shape (k, k)
-        Of these, positive ones as logarithms.
+        Covariance of these, positive ones as logarithms.
     modes : tuple of PooledMode
     sessions : int
         Used: those that determine the structure's damping.
@@ -272,7 +257,7 @@ class PooledEstimate:
         nothing but noise. Where it is far beyond 1 the structure is wrong, and its standard
         deviations mean little.
     bic : float
-        Of all sessions together, see `pooled_bic`.
+        Criterion of all sessions together, see `pooled_bic`.
     """
 
     structure: str
@@ -295,7 +280,7 @@ class PooledEstimate:
     def sizes(self) -> tuple[PooledSize, ...]:
         """Sizes of the dampings that all sessions together determine."""
         names = tuple(each.name for each in self.parameters)
-        t, found = t_quantile(0.95, self.sessions - 1), []
+        t, found = student_t_quantile(0.95, self.sessions - 1), []
         values = self.plant.parameters
         first = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPINGS:
@@ -349,8 +334,8 @@ def pooled(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None:
     effects = random_effects(values, covariances)
     std = np.sqrt(np.diag(effects.covariance))
     within = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
-    t = t_quantile(0.95, len(used) - 1)
-    chances = chance_of(effects.cochran_q, len(used))
+    t = student_t_quantile(0.95, len(used) - 1)
+    chances = chi_square_p_value(effects.cochran_q, len(used) - 1)
     columns = (effects.mean, std, within, effects.between_std, chances)
     parameters = tuple(
         _parameter(name, t, *row)

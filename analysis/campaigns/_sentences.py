@@ -1,4 +1,4 @@
-"""The verdict on a campaign and on its specimen in words."""
+"""Sentences of a campaign's verdict: whether it is of one specimen, and what its damping is."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from analysis.campaigns._experiment import in_dispute, told
 from analysis.models import STRUCTURES
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.identify import Order
 
+
+# Names and numbers
+
 _LABELS: Final = {
     "zeta": ("ζ", 1e5, "10⁻⁵ s^α"),
     "alpha": ("α", 1.0, ""),
@@ -29,7 +33,6 @@ _LABELS: Final = {
     "delay_s": ("delay of the torque", 1e6, "µs"),
     "tool_inertia_kg_m2": ("tool's inertia", 1e6, "10⁻⁶ kg·m²"),
 }
-
 
 _LEAST: Final = 1e-99
 _OF_MODES: Final = {
@@ -59,6 +62,13 @@ def probability(chance: float) -> str:
     return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
 
 
+def percent(share: float) -> str:
+    """Write a share that may be next to 1, but is not 1."""
+    return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
+
+
+# One specimen or several
+
 MIXTURE_MARK: Final = "‡"
 _OF_MIXTURE: Final = "of a mixture"
 MIXTURE_NOTE: Final = (
@@ -75,6 +85,11 @@ def specimens(found: Homogeneity) -> list[str]:
     said = _stated(found.specimens) if len(found.specimens) > 1 else []
     leading = found.leading
     return said if leading is None else [*said, *_differing(found, leading)]
+
+
+def title(text: str, found: Homogeneity) -> str:
+    """Say in a title that what is under it is pooled over a mixture."""
+    return f"{text}, {_OF_MIXTURE}" if found.mixed else text
 
 
 def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
@@ -133,16 +148,6 @@ def _scatter(each: Heterogeneity) -> str:
     )
 
 
-def percent(share: float) -> str:
-    """Write a share that may be next to 1, but is not 1."""
-    return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
-
-
-def title(text: str, found: Homogeneity) -> str:
-    """Say in a title that what is under it is pooled over a mixture."""
-    return f"{text}, {_OF_MIXTURE}" if found.mixed else text
-
-
 def _where(each: Heterogeneity) -> str:
     """Say which sessions lie together, or where the outermost are."""
     name, _, _ = label(each.quantity)
@@ -180,6 +185,8 @@ def _files(names: Sequence[str]) -> str:
     return f"{len(names)} file{'' if len(names) == 1 else 's'} ({shown})"
 
 
+# Verdict
+
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
 _SIZES: Final = {"internal": "material", "external": "surroundings"}
@@ -187,7 +194,6 @@ _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
 _SIGNIFICANT: Final = 0.01
-_NORMAL_95: Final = 1.959963984540054
 _AS_GOOD: Final = 1.01
 
 
@@ -199,7 +205,7 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     freest : PooledEstimate
         On the beam that all sessions support.
     best : PooledEstimate
-        Of the lowest BIC.
+        Estimate of the lowest BIC.
     """
     given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
     are = "is" if len(given) == 1 else "are"
@@ -258,34 +264,6 @@ def selected(
     return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
 
 
-def _on_beam(estimate: PooledEstimate) -> str:
-    modes = "" if estimate.uniform else ", on a beam whose modes each have a stiffness of their own"
-    more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
-    return f"{modes}, with {more}" if more else modes
-
-
-def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
-    """Say how many sessions select or say what when each is looked at by itself."""
-    (first, count), *others = counts.items()
-    verb = do if count > 1 else f"{do}s"
-    more = "".join(f", {n} {what}" for what, n in others)
-    return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
-
-
-def _damping(structure: str) -> str:
-    """Say which kinds of damping a structure has, and of which orders."""
-    shape = STRUCTURES[structure]
-    kinds = [
-        f"by the {what} ({'order free' if order in shape.free else 'of order 1'})"
-        for what, order, present in (
-            ("material", "alpha", shape.internal),
-            ("surroundings", "lambda", shape.external),
-        )
-        if present
-    ]
-    return " and ".join(kinds)
-
-
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
     """Say whether what the structure leaves is noise."""
     if best.misfit > _WRONG:
@@ -308,15 +286,6 @@ def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
     said = "; ".join(map(_mode, best.modes))
     of = "the sessions, which are a mixture" if mixed else "the sessions"
     return [f"Modes: {said} (± 95 % of the mean over {of})."]
-
-
-def _mode(mode: PooledMode) -> str:
-    half = _NORMAL_95 * 100 * mode.damping_ratio_std
-    digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
-    return (
-        f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
-        f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"
-    )
 
 
 def order(found: PooledOrder) -> str:
@@ -406,3 +375,40 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
         f"{'was' if len(lost) == 1 else 'were'} not ({each}{more}). Errors of prediction are over "
         "those that were."
     ]
+
+
+def _on_beam(estimate: PooledEstimate) -> str:
+    modes = "" if estimate.uniform else ", on a beam whose modes each have a stiffness of their own"
+    more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
+    return f"{modes}, with {more}" if more else modes
+
+
+def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
+    """Say how many sessions select or say what when each is looked at by itself."""
+    (first, count), *others = counts.items()
+    verb = do if count > 1 else f"{do}s"
+    more = "".join(f", {n} {what}" for what, n in others)
+    return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
+
+
+def _damping(structure: str) -> str:
+    """Say which kinds of damping a structure has, and of which orders."""
+    shape = STRUCTURES[structure]
+    kinds = [
+        f"by the {what} ({'order free' if order in shape.free else 'of order 1'})"
+        for what, order, present in (
+            ("material", "alpha", shape.internal),
+            ("surroundings", "lambda", shape.external),
+        )
+        if present
+    ]
+    return " and ".join(kinds)
+
+
+def _mode(mode: PooledMode) -> str:
+    half = NORMAL_95 * 100 * mode.damping_ratio_std
+    digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
+    return (
+        f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
+        f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"
+    )

@@ -1,4 +1,4 @@
-"""What a worker does to one session, and the little it sends back."""
+"""Analysis of one session of a campaign by a worker, and the little that it sends back."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class SessionResult:
     settings : WelchSettings
         As used.
     record_band_hz : tuple of float
-        Of the whole-record fits.
+        Band of the whole-record fits.
     """
 
     path: Path
@@ -125,7 +125,7 @@ class SessionTask:
     fixed : tuple of str
         Settings that stay at the file's values in those fits.
     band_hz : tuple of float or None
-        Of all fits; None takes what suits each record.
+        Band of all fits; None takes what suits each record.
     """
 
     settings: WelchSettings

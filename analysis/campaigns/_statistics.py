@@ -1,9 +1,8 @@
-"""Scatter of the parameters over the sessions, nominal models, and the ranking of structures.
+"""Statistics of the Welch fits over the sessions: parameters, nominal models, ranking.
 
-Nominal models, of the mean parameters, and how far each session's response is from them.
-
-The paper's Figure 7 (mean square error, its weighted kind, maximum deviation: Eqs. 28-30) and
-Table 4 (mean deviation of the resonant peaks: Eqs. 31 and 32).
+Scatter of the parameters (the paper's Table 3); nominal models, of the mean parameters, and how far
+each session's response is from them: Figure 7 (mean square error, its weighted kind, maximum
+deviation: Eqs. 28-30) and Table 4 (mean deviation of the resonant peaks: Eqs. 31 and 32).
 """
 
 from __future__ import annotations
@@ -30,6 +29,9 @@ if TYPE_CHECKING:
     from analysis.models import Parameter
     from analysis.paper import Indices, Peak
     from rigd.beam import Beam, Damping
+
+
+# Parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,11 @@ def parameter_statistics(sessions: Sequence[SessionResult]) -> tuple[ParameterSt
     return tuple(found)
 
 
+# Nominal models
+
+_BEST: Final = (("III", "omega"), ("VI", "omega"))
+
+
 @dataclass(frozen=True, slots=True)
 class MeanPeakDeviation:
     """Mean deviation of one resonance (MDR), Eqs. (31) and (32).
@@ -119,7 +126,7 @@ class NominalModel:
     response : ndarray of complex, shape (n,)
         With the tool's inertia, in N·m/rad.
     peaks : tuple of Peak or None
-        Of that response, mode by mode.
+        Peaks of that response, mode by mode.
     indices : tuple of Indices
         Its distance from each session's response, session by session.
     deviations : tuple of MeanPeakDeviation
@@ -139,9 +146,6 @@ class NominalModel:
     def mean_wmse(self) -> float:
         """Mean over the sessions of the weighted mean square error, in (N·m/rad)²."""
         return float(np.mean([each.wmse for each in self.indices]))
-
-
-_BEST: Final = (("III", "omega"), ("VI", "omega"))
 
 
 def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
@@ -176,7 +180,7 @@ def mean_deviations(
     Parameters
     ----------
     measured : sequence of sequence of Peak or None
-        Of each session, mode by mode.
+        Peaks of each session, mode by mode.
     modelled : sequence of Peak or None
         Mode by mode.
     """
@@ -236,6 +240,9 @@ def _wmse(model: NominalModel) -> float:
 
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values)) if values else float("nan")
+
+
+# Ranking of structures
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Each session predicted from the others: what a model is worth for data it has not seen."""
+"""Leave-one-out validation: each session predicted from the others, as data not seen before."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class LeftOutError:
     Attributes
     ----------
     path : Path
-        Of the session.
+        File of the session.
     method : {"record", "welch"}
         Whose parameters: pooled whole-record estimates of the other sessions, or the nominal model
-        of the others by the paper's route.
+        of the others by the Welch method.
     name : str
         The structure, as tables call it.
     weighting : str or None

@@ -1,4 +1,4 @@
-"""The verdict on a campaign: one structure for the specimen, what is known of its damping."""
+"""Verdict on a campaign: one structure for the specimen, and what is known of its damping."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from analysis.campaigns._validation import LeftOutError, LostTrial
     from analysis.identify import Finding
 
+
+# Findings in common
+
 _FIGURE: Final = re.compile(r"(?<!mode )[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 """A number, but not that of a mode: it tells what is meant and not how much."""
 
@@ -36,11 +39,11 @@ class CommonFinding:
     Attributes
     ----------
     example : Finding
-        Of the session in the middle, by size.
+        Finding of the session in the middle, by size.
     files : tuple of str
         Names of the sessions that have it.
     sessions : int
-        Of how many.
+        Number of sessions looked at.
     span : tuple of float or None
         Least and largest size, in the finding's unit.
     """
@@ -88,6 +91,9 @@ def _counted(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
     return CommonFinding(example, files, sessions, (min(sizes), max(sizes)))
 
 
+# Verdict
+
+
 @dataclass(frozen=True, slots=True)
 class Dissent:
     """A session that by itself dismisses what all together select.
@@ -116,7 +122,7 @@ class CampaignVerdict:
     headline : str
         Structure that the numbers are of, as tables call it: the freest on the beam selected.
     structure : str
-        Of the lowest BIC: "I" to "VII".
+        Structure of the lowest BIC: "I" to "VII".
     uniform : bool
         Whether the beam selected is uniform.
     rivals : tuple of str

@@ -83,6 +83,8 @@ def unheard(_number: int) -> None:
     """Do without progress."""
 
 
+# Processes of this machine
+
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -213,6 +215,8 @@ def _begin() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
+# Dask cluster
+
 _CONNECT_S: Final = 5.0
 _WORKERS_S: Final = 10.0
 _LOOK_S: Final = 2.0
@@ -229,7 +233,7 @@ def dask_cluster(address: str) -> Iterator[DaskWorkers]:
     Parameters
     ----------
     address : str
-        Of its scheduler, such as ``tcp://10.0.0.5:8786``.
+        Address of the scheduler, such as ``tcp://10.0.0.5:8786``.
 
     Raises
     ------
@@ -258,31 +262,6 @@ def dask_cluster(address: str) -> Iterator[DaskWorkers]:
                 yield DaskWorkers(client, address)
         finally:
             client.close()
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep from Dask what is told here in a sentence: what goes wrong, and versions that differ."""
-    log = logging.getLogger("distributed.client")
-    level = log.level
-    log.setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="(?s).*Mismatched versions")
-            yield
-    finally:
-        log.setLevel(level)
-
-
-def _knock(address: str) -> None:
-    """Raise an OSError if nobody listens; Dask's client would go on trying after it has failed."""
-    name = address.rsplit("://", maxsplit=1)[-1]
-    if "://" in address and not address.startswith(("tcp://", "tls://")):
-        return
-    host, _, port = name.rpartition(":")
-    if not (host and port.isdecimal()):
-        raise ValueError("no host and port")
-    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
 
 
 class DaskWorkers:
@@ -384,10 +363,6 @@ class DaskWorkers:
         )
 
 
-def _distributed() -> Any:  # noqa: ANN401 - Dask has no types
-    return import_module("distributed")
-
-
 def versions() -> dict[str, str]:
     """Versions on which results depend, and whether objects can be passed on."""
     import numpy as np
@@ -427,3 +402,32 @@ def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask ha
                 f"The Dask worker at {worker} has {', '.join(other)}: install the versions of this "
                 "machine there, and start it again."
             )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from Dask what is told here in a sentence: what goes wrong, and versions that differ."""
+    log = logging.getLogger("distributed.client")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="(?s).*Mismatched versions")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def _knock(address: str) -> None:
+    """Raise an OSError if nobody listens; Dask's client would go on trying after it has failed."""
+    name = address.rsplit("://", maxsplit=1)[-1]
+    if "://" in address and not address.startswith(("tcp://", "tls://")):
+        return
+    host, _, port = name.rpartition(":")
+    if not (host and port.isdecimal()):
+        raise ValueError("no host and port")
+    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
+
+
+def _distributed() -> Any:  # noqa: ANN401 - Dask has no types
+    return import_module("distributed")

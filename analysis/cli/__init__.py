@@ -1,1 +1,5 @@
-"""Commands of `analyze` beside the analysis itself."""
+"""The command `analyze`: `app` parses options, the other modules run what was asked for.
+
+`sessions` analyses files one by one, `campaign` several together, `exchange` imports and exports.
+They print and return exit codes; what they print is made by `analysis.report`.
+"""

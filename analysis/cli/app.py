@@ -285,7 +285,7 @@ def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
 
 
 def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Path | None) -> None:
-    """Refuse what is made of the paper's route where that is left out, and say what has no say."""
+    """Refuse outputs of the Welch fits where these are left out; name options without effect."""
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "

@@ -38,13 +38,13 @@ def campaign_command(
     ----------
     files : sequence of Path
     settings : WelchSettings
-        Of the paper's route.
+        Settings of the Welch fits.
     structures : sequence of str
         Types fitted to the whole records.
     fixed : sequence of str
         Settings that those fits take from the files.
     band_hz : tuple of float, optional
-        Of all fits; by default what suits each record.
+        Band of all fits; by default what suits each record.
     report : Path, optional
         Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
         exists ``campaign.report-2`` and so on.

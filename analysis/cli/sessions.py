@@ -38,7 +38,7 @@ class Routes:
     fixed : tuple of str
         Settings of rig and specimen that stay at the file's values.
     band_hz : tuple of float or None
-        Of both; None takes what suits the record.
+        Band of both; None takes what suits the record.
     """
 
     settings: WelchSettings
@@ -120,7 +120,7 @@ def _print_tables(
     *,
     single: bool,
 ) -> None:
-    """Print all of a single file, of several what the paper's route has together."""
+    """Print all tables of a single file, of several those of the Welch fits together."""
     from analysis.report import analysis_tables, record_text, summary_table
 
     if single or not analyses:

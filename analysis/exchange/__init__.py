@@ -1,4 +1,9 @@
-"""Records of other programs in, records and frequency responses out."""
+"""Import of records of other programs, export of records and frequency responses.
+
+`import_record` makes a session file of a measurement by an `ImportPlan`; `export_record` and
+`export_frf` write files that other programs read. Each format is a module behind one table
+(`_source`), and knows names and numbers only. Responses are estimated by `analysis.paper`.
+"""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""Which channel becomes which field of a session, in which unit, at which ticks."""
+"""Channels of a foreign file: which becomes which field of a session, in which unit, and when."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+
+# Units
 
 _INCH_M: Final = 0.0254
 _POUND_N: Final = 4.4482216152605
@@ -107,12 +110,6 @@ def stated_unit(unit: str) -> str:
     return known if size == 1.0 else f"{size!r} {known}"
 
 
-def _scaled(unit: str) -> tuple[float, str]:
-    """Take a number and a unit apart, ``0.02 N.m``; 1 where there is no number."""
-    found = _NUMBER.match(unit.strip())
-    return (float(found[0]), unit.strip()[found.end() :]) if found else (1.0, unit)
-
-
 def unit_in_brackets(name: str) -> str | None:
     """Return the unit in brackets behind a name, as in ``Angle [deg]`` or ``Tz (mN.m)``."""
     found = _IN_BRACKETS.search(name)
@@ -125,6 +122,12 @@ def unit_in_suffix(name: str) -> str | None:
     return _NAME_SUFFIXES.get(last) if underscore else None
 
 
+def _scaled(unit: str) -> tuple[float, str]:
+    """Take a number and a unit apart, ``0.02 N.m``; 1 where there is no number."""
+    found = _NUMBER.match(unit.strip())
+    return (float(found[0]), unit.strip()[found.end() :]) if found else (1.0, unit)
+
+
 def _bare(text: str) -> str:
     return re.sub(
         r"[\s.·⋅*]", "", text.strip().replace("µ", "u").replace("μ", "u").replace("°", "deg")
@@ -133,6 +136,8 @@ def _bare(text: str) -> str:
 
 _SPELLINGS: Final = {_bare(name): name for names in UNITS.values() for name in names}
 
+
+# Fields
 
 QUANTITIES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -196,6 +201,8 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
     size = factor(quantity, unit)
     return ChannelChoice(channel.strip(), stated_unit(unit), size)
 
+
+# Time base
 
 MAX_JITTER: Final = 0.1
 """Largest distance of a time stamp from its tick, in periods.

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
     from analysis.exchange._table import Column, Table
 
+
+# Reading
+
 _MAX_LINE: Final = 65_536
 """Longest line, characters: hundreds of columns. A longer one is not split into its cells."""
 
@@ -170,6 +173,8 @@ def _is_number(text: str) -> bool:
         return False
     return True
 
+
+# Writing
 
 _BLOCK: Final = 20_000
 

@@ -32,7 +32,7 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Table
     target : Path
         A new file; its ending, one of `SUFFIXES`, is its format.
     binary : bool
-        Of a universal file: numbers as 8-byte floats instead of text.
+        Write a universal file's numbers as 8-byte floats instead of text.
 
     Returns
     -------

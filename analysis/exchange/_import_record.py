@@ -1,4 +1,10 @@
-"""A measurement of another program becomes a session file, and is checked on the way."""
+"""Import: a measurement of another program becomes a session file, and is checked on the way.
+
+Nothing is guessed: channels, units and circumstances are the user's to state (`ImportPlan`). Stated
+units are compared with those of the file, the time stamps with a uniform rate, and the torque with
+what the undamped beam would ask for. Values that are not finite are held and flagged, as in the
+session format.
+"""
 
 from __future__ import annotations
 
@@ -33,136 +39,8 @@ if TYPE_CHECKING:
     from analysis.exchange._source import SourceChannel
     from analysis.exchange._specimen import Specimen
 
-_FLAGS: Final = {
-    "angle_rad": Status.ANGLE_STALE,
-    "coupling_torque_nm": Status.WRENCH_STALE,
-}
-"""Field of a sample → the flag that says its value is that of the sample before."""
 
-
-def hold(
-    path: Path, names: Mapping[str, str], columns: Mapping[str, NDArray[np.float64]]
-) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
-    """Replace values that are not finite as the session format does: by the last good one.
-
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    names : mapping of str to str
-        Field → name of its channel in the file, for messages.
-    columns : mapping of str to ndarray of float, shape (n,)
-        Field → values.
-
-    Returns
-    -------
-    columns : dict of str to ndarray of float, shape (n - first,)
-    status : ndarray of uint32, shape (n - first,)
-        Bits of `rigd.session.Status`.
-    first : int
-        Samples at the beginning that had to be left out, having nothing to hold.
-
-    Raises
-    ------
-    ExchangeError
-        If it is too many values, or those of a channel that cannot be flagged.
-    """
-    bad = {name: ~np.isfinite(values) for name, values in columns.items()}
-    for name, mask in bad.items():
-        count = int(mask.sum())
-        if count and name not in _FLAGS:
-            raise ExchangeError(
-                f"{path}: '{names[name]}' is not finite in {count} of {len(mask)} samples, first "
-                f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
-                "analysis needs it."
-            )
-        much = too_much_unknown(f"'{names[name]}'", count, len(mask))
-        if much:
-            raise ExchangeError(
-                f"{path}: {much} Or choose another channel, or cut the session out of the file."
-            )
-    first = max(int(np.argmin(mask)) for mask in bad.values())
-    held = {name: _held(values, bad[name])[first:] for name, values in columns.items()}
-    status = np.zeros(len(next(iter(held.values()))), dtype=np.uint32)
-    for name, flag in _FLAGS.items():
-        if name in bad:
-            status[bad[name][first:]] |= np.uint32(flag)
-    return held, status, first
-
-
-def _held(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
-    if not bad.any():
-        return values
-    last_good = np.maximum.accumulate(np.where(bad, 0, np.arange(len(values))))
-    return values[last_good]
-
-
-_RATE_TOLERANCE: Final = 2e-5
-"""Largest relative difference between the rate stated and the file's own, of which UFF58 has six
-digits."""
-
-_NO_UNIT: Final = ("", "NONE", "none", "-")
-
-
-def check_units(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> list[str]:
-    """Compare the units stated with those that the file has beside its channels.
-
-    Returns
-    -------
-    list of str
-        Warnings, where the file says something that is not understood.
-
-    Raises
-    ------
-    ExchangeError
-        If the file clearly says another unit.
-    """
-    warnings = []
-    for choice in plan.choices:
-        label = channels[choice.channel].unit_label.strip()
-        said = canonical_unit(label) if label else unit_in_brackets(choice.channel)
-        if said is not None and said != choice.unit:
-            raise ExchangeError(
-                f"{path}: the file says that '{choice.channel}' is in {said}, and {choice.unit} "
-                f"was stated; state '{choice.channel}:{said}', or correct the file."
-            )
-        if said is None and label not in _NO_UNIT:
-            warnings.append(
-                f"The file says '{printable(label, 20)}' of '{choice.channel}', which was taken "
-                f"to be in {choice.unit} as stated."
-            )
-        suffix = unit_in_suffix(choice.channel)
-        if said is None and suffix not in (None, choice.unit):
-            warnings.append(
-                f"The name '{choice.channel}' sounds like {suffix}; it was taken to be in "
-                f"{choice.unit} as stated."
-            )
-    return warnings
-
-
-def timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
-    """Place the samples in time, by the channel of times or by the rate stated.
-
-    Raises
-    ------
-    ExchangeError
-        If the times are no time base, or the file has another rate than was stated.
-    """
-    if plan.time is not None:
-        time_s = channels[plan.time.channel].values * plan.time.factor
-        found = from_time_stamps(path, plan.time.channel, time_s)
-    else:
-        samples = len(next(iter(channels.values())).values)
-        found = uniform(path, samples, plan.rate_hz or 0.0)
-    for name, channel in channels.items():
-        own_hz = channel.rate_hz
-        if own_hz is not None and abs(own_hz / found.rate_hz - 1) > _RATE_TOLERANCE:
-            raise ExchangeError(
-                f"{path}: the file says that '{name}' was sampled at {own_hz:.6g} Hz, and "
-                f"{found.rate_hz:.6g} Hz was stated; state the true rate with --rate-hz."
-            )
-    return found
-
+# Import
 
 REQUIRED: Final = ("angle_rad", "coupling_torque_nm")
 """Fields of a sample without which nothing can be analysed."""
@@ -216,84 +94,6 @@ class ImportPlan:
         return (*self.channels.values(), *(() if self.time is None else (self.time,)))
 
 
-_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
-"""In first natural frequencies: on either side of the first resonance, far enough from it and from
-the first antiresonance (at 4.4) for damping not to matter, and above the frequencies at which the
-paper's external damping outweighs the inertia."""
-
-_CERTAIN: Final = 6.0
-"""Standard deviations from zero that the factor between torque and model must have to judge at
-all: a motion that does not reach these frequencies tells nothing."""
-
-_TAPER: Final = 0.05
-"""Share of the record at either end over which it is faded: a record may begin and end in motion,
-and the paper's chirp passes these frequencies early."""
-
-_FACTOR: Final = 3.0
-"""Largest factor between torque and model that damping and a wrong mass may account for. The units
-that are easily mixed up differ by more than ten."""
-
-
-def unlikely_torque(
-    angle_rad: NDArray[np.float64],
-    torque_nm: NDArray[np.float64],
-    rate_hz: float,
-    specimen: Specimen,
-) -> str | None:
-    """Compare the torque with what the undamped beam would ask for, beside its first resonance.
-
-    Parameters
-    ----------
-    angle_rad, torque_nm : ndarray of float, shape (n,)
-        Of the whole record, finite.
-    rate_hz : float
-    specimen : Specimen
-
-    Returns
-    -------
-    str or None
-        What is odd and what to check; None if nothing is, or the motion does not tell.
-    """
-    frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
-    first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
-    band = np.zeros(frequency_hz.shape, dtype=np.bool_)
-    for low, high in _BANDS:
-        band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
-    s = 2j * np.pi * frequency_hz[band]
-    place = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
-    window = np.sin(np.pi / 2 * np.minimum((1 - place) / (2 * _TAPER), 1)) ** 2
-    with np.errstate(over="ignore", invalid="ignore"):
-        angle, torque = (
-            np.fft.rfft(window * (values - values.mean()))[band]
-            for values in (angle_rad, torque_nm)
-        )
-        model = (transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2) * angle
-        power, total = (float(np.vdot(each, each).real) for each in (model, torque))
-        if not (0.0 < power < np.inf and 0.0 < total < np.inf):
-            return None
-        ratio = complex(np.vdot(model, torque) / power)
-    size = abs(ratio)
-    explained = size**2 * power
-    unexplained_per_bin = max(total - explained, 0.0) / np.count_nonzero(band)
-    if explained < _CERTAIN**2 * unexplained_per_bin:
-        return None
-    if not 1 / _FACTOR < size < _FACTOR:
-        return (
-            f"The torque is {size:.3g} times what this beam asks for: check the units of "
-            "angle and torque, and the beam's length and density."
-        )
-    if ratio.real < 0.0:
-        return (
-            "The torque has the opposite sign of what this beam asks for: a sensor that reports "
-            "the reaction is imported with --reverse-torque."
-        )
-    return None
-
-
-_JITTER_TOLD: Final = 0.01
-"""Distance of a time stamp from its tick, in periods, from which on it is worth a word."""
-
-
 @dataclass(frozen=True, slots=True)
 class ImportedRecord:
     """What became of a file.
@@ -315,6 +115,10 @@ class ImportedRecord:
     rate_hz: float
     segments: Mapping[str, tuple[int, int]]
     warnings: tuple[str, ...]
+
+
+_JITTER_TOLD: Final = 0.01
+"""Distance of a time stamp from its tick, in periods, from which on it is worth a word."""
 
 
 def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecord:
@@ -475,3 +279,214 @@ def _metadata(
         "import_time": "rate stated" if plan.time is None else str(plan.time),
         **mapping,
     }
+
+
+# Values that are not finite
+
+_FLAGS: Final = {
+    "angle_rad": Status.ANGLE_STALE,
+    "coupling_torque_nm": Status.WRENCH_STALE,
+}
+"""Field of a sample → the flag that says its value is that of the sample before."""
+
+
+def hold(
+    path: Path, names: Mapping[str, str], columns: Mapping[str, NDArray[np.float64]]
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
+    """Replace values that are not finite as the session format does: by the last good one.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    names : mapping of str to str
+        Field → name of its channel in the file, for messages.
+    columns : mapping of str to ndarray of float, shape (n,)
+        Field → values.
+
+    Returns
+    -------
+    columns : dict of str to ndarray of float, shape (n - first,)
+    status : ndarray of uint32, shape (n - first,)
+        Bits of `rigd.session.Status`.
+    first : int
+        Samples at the beginning that had to be left out, having nothing to hold.
+
+    Raises
+    ------
+    ExchangeError
+        If it is too many values, or those of a channel that cannot be flagged.
+    """
+    bad = {name: ~np.isfinite(values) for name, values in columns.items()}
+    for name, mask in bad.items():
+        count = int(mask.sum())
+        if count and name not in _FLAGS:
+            raise ExchangeError(
+                f"{path}: '{names[name]}' is not finite in {count} of {len(mask)} samples, first "
+                f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
+                "analysis needs it."
+            )
+        much = too_much_unknown(f"'{names[name]}'", count, len(mask))
+        if much:
+            raise ExchangeError(
+                f"{path}: {much} Or choose another channel, or cut the session out of the file."
+            )
+    first = max(int(np.argmin(mask)) for mask in bad.values())
+    held = {name: _held(values, bad[name])[first:] for name, values in columns.items()}
+    status = np.zeros(len(next(iter(held.values()))), dtype=np.uint32)
+    for name, flag in _FLAGS.items():
+        if name in bad:
+            status[bad[name][first:]] |= np.uint32(flag)
+    return held, status, first
+
+
+def _held(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    if not bad.any():
+        return values
+    last_good = np.maximum.accumulate(np.where(bad, 0, np.arange(len(values))))
+    return values[last_good]
+
+
+# Units and time base
+
+_RATE_TOLERANCE: Final = 2e-5
+"""Largest relative difference between the rate stated and the file's own, of which UFF58 has six
+digits."""
+
+_NO_UNIT: Final = ("", "NONE", "none", "-")
+
+
+def check_units(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> list[str]:
+    """Compare the units stated with those that the file has beside its channels.
+
+    Returns
+    -------
+    list of str
+        Warnings, where the file says something that is not understood.
+
+    Raises
+    ------
+    ExchangeError
+        If the file clearly says another unit.
+    """
+    warnings = []
+    for choice in plan.choices:
+        label = channels[choice.channel].unit_label.strip()
+        said = canonical_unit(label) if label else unit_in_brackets(choice.channel)
+        if said is not None and said != choice.unit:
+            raise ExchangeError(
+                f"{path}: the file says that '{choice.channel}' is in {said}, and {choice.unit} "
+                f"was stated; state '{choice.channel}:{said}', or correct the file."
+            )
+        if said is None and label not in _NO_UNIT:
+            warnings.append(
+                f"The file says '{printable(label, 20)}' of '{choice.channel}', which was taken "
+                f"to be in {choice.unit} as stated."
+            )
+        suffix = unit_in_suffix(choice.channel)
+        if said is None and suffix not in (None, choice.unit):
+            warnings.append(
+                f"The name '{choice.channel}' sounds like {suffix}; it was taken to be in "
+                f"{choice.unit} as stated."
+            )
+    return warnings
+
+
+def timebase(path: Path, plan: ImportPlan, channels: Mapping[str, SourceChannel]) -> Timebase:
+    """Place the samples in time, by the channel of times or by the rate stated.
+
+    Raises
+    ------
+    ExchangeError
+        If the times are no time base, or the file has another rate than was stated.
+    """
+    if plan.time is not None:
+        time_s = channels[plan.time.channel].values * plan.time.factor
+        found = from_time_stamps(path, plan.time.channel, time_s)
+    else:
+        samples = len(next(iter(channels.values())).values)
+        found = uniform(path, samples, plan.rate_hz or 0.0)
+    for name, channel in channels.items():
+        own_hz = channel.rate_hz
+        if own_hz is not None and abs(own_hz / found.rate_hz - 1) > _RATE_TOLERANCE:
+            raise ExchangeError(
+                f"{path}: the file says that '{name}' was sampled at {own_hz:.6g} Hz, and "
+                f"{found.rate_hz:.6g} Hz was stated; state the true rate with --rate-hz."
+            )
+    return found
+
+
+# Plausibility of the torque
+
+_BANDS: Final = ((0.25, 0.6), (1.5, 3.5))
+"""In first natural frequencies: on either side of the first resonance, far enough from it and from
+the first antiresonance (at 4.4) for damping not to matter, and above the frequencies at which the
+paper's external damping outweighs the inertia."""
+
+_CERTAIN: Final = 6.0
+"""Standard deviations from zero that the factor between torque and model must have to judge at
+all: a motion that does not reach these frequencies tells nothing."""
+
+_TAPER: Final = 0.05
+"""Share of the record at either end over which it is faded: a record may begin and end in motion,
+and the paper's chirp passes these frequencies early."""
+
+_FACTOR: Final = 3.0
+"""Largest factor between torque and model that damping and a wrong mass may account for. The units
+that are easily mixed up differ by more than ten."""
+
+
+def unlikely_torque(
+    angle_rad: NDArray[np.float64],
+    torque_nm: NDArray[np.float64],
+    rate_hz: float,
+    specimen: Specimen,
+) -> str | None:
+    """Compare the torque with what the undamped beam would ask for, beside its first resonance.
+
+    Parameters
+    ----------
+    angle_rad, torque_nm : ndarray of float, shape (n,)
+        The whole record, finite.
+    rate_hz : float
+    specimen : Specimen
+
+    Returns
+    -------
+    str or None
+        What is odd and what to check; None if nothing is, or the motion does not tell.
+    """
+    frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
+    first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
+    band = np.zeros(frequency_hz.shape, dtype=np.bool_)
+    for low, high in _BANDS:
+        band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
+    s = 2j * np.pi * frequency_hz[band]
+    place = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
+    window = np.sin(np.pi / 2 * np.minimum((1 - place) / (2 * _TAPER), 1)) ** 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        angle, torque = (
+            np.fft.rfft(window * (values - values.mean()))[band]
+            for values in (angle_rad, torque_nm)
+        )
+        model = (transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2) * angle
+        power, total = (float(np.vdot(each, each).real) for each in (model, torque))
+        if not (0.0 < power < np.inf and 0.0 < total < np.inf):
+            return None
+        ratio = complex(np.vdot(model, torque) / power)
+    size = abs(ratio)
+    explained = size**2 * power
+    unexplained_per_bin = max(total - explained, 0.0) / np.count_nonzero(band)
+    if explained < _CERTAIN**2 * unexplained_per_bin:
+        return None
+    if not 1 / _FACTOR < size < _FACTOR:
+        return (
+            f"The torque is {size:.3g} times what this beam asks for: check the units of "
+            "angle and torque, and the beam's length and density."
+        )
+    if ratio.real < 0.0:
+        return (
+            "The torque has the opposite sign of what this beam asks for: a sensor that reports "
+            "the reaction is imported with --reverse-torque."
+        )
+    return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.exchange._source import (
@@ -11,7 +10,6 @@ from analysis.exchange._source import (
     as_column,
     bounded_memory,
     check_samples,
-    missing_library,
     no_such_channel,
 )
 
@@ -23,6 +21,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.exchange._table import Table
+
+
+# Reading
 
 _HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 _HDF5_AT: Final = (0, 512)  # MATLAB puts its own header of 512 bytes before it
@@ -42,10 +43,8 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 
 def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
-    try:
-        from scipy.io import loadmat, whosmat
-    except ImportError as error:
-        raise missing_library(path, "scipy") from error
+    from scipy.io import loadmat, whosmat
+
     try:
         with bounded_memory():
             return _vectors(path, names, whosmat(path), loadmat)
@@ -158,18 +157,13 @@ def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  
     return _column(path, name, dataset[()].T, column)
 
 
-def write_mat(table: Table, stream: BinaryIO) -> None:
-    """Write each column as a variable of its name, n×1, and ``information``, a struct of texts.
+# Writing
 
-    Raises
-    ------
-    ExchangeError
-        If scipy is not installed.
-    """
-    try:
-        from scipy.io import savemat
-    except ImportError as error:
-        raise missing_library(Path(table.source), "scipy") from error
+
+def write_mat(table: Table, stream: BinaryIO) -> None:
+    """Write each column as a variable of its name, n×1, and ``information``, a struct of texts."""
+    from scipy.io import savemat
+
     variables = {column.name: column.values for column in (table.axis, *table.columns)}
     savemat(
         stream,

@@ -15,7 +15,6 @@ from rigd.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -28,46 +27,7 @@ class TargetError(ExchangeError):
     """A name under which nothing can be written."""
 
 
-MAX_MEMORY: Final = 800_000_000
-"""Most memory that reading a file may take, bytes."""
-
-
-@contextmanager
-def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
-    """Let the process grow by so much and no further: what asks for more gets a MemoryError.
-
-    Formats such as MATLAB's are compressed and nested, and their readers believe what a file says
-    of its sizes; a kilobyte can ask for all the memory there is. The kernel's own limit holds for
-    every library alike. Where there is none (Windows, macOS) nothing is limited. Libraries are to
-    be imported before, as the address space that they reserve would count too.
-    """
-    try:
-        import resource
-    except ImportError:
-        yield
-        return
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    except OSError:
-        yield
-        return
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    ceiling = pages * resource.getpagesize() + extra_bytes
-    bounds = [limit for limit in (soft, hard, ceiling) if limit != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_AS, (min(bounds), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-MAX_SAMPLES: Final = 3_000_000
-"""Most samples of a channel: 50 minutes at 1 kHz. Ten such channels are a quarter of a gigabyte."""
-
-_NAMES_SHOWN: Final = 12
-"""Channel names that a message lists."""
-_NAME_SHOWN: Final = 60
-"""Characters of each."""
+# Reading
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +65,14 @@ class _Format:
 _MB: Final = 1_000_000
 
 _FORMATS: Final = {
-    ".csv": _Format("CSV", "csv_source", 512 * _MB),
-    ".txt": _Format("CSV", "csv_source", 512 * _MB),
-    ".dat": _Format("CSV", "csv_source", 512 * _MB),
-    ".mat": _Format("MATLAB", "mat_source", 512 * _MB),
-    ".tdms": _Format("TDMS", "tdms_source", 512 * _MB),
-    ".uff": _Format("UFF58", "uff_source", 128 * _MB),
-    ".unv": _Format("UFF58", "uff_source", 128 * _MB),
-    ".uf58": _Format("UFF58", "uff_source", 128 * _MB),
+    ".csv": _Format("CSV", "_csv_format", 512 * _MB),
+    ".txt": _Format("CSV", "_csv_format", 512 * _MB),
+    ".dat": _Format("CSV", "_csv_format", 512 * _MB),
+    ".mat": _Format("MATLAB", "_matlab_format", 512 * _MB),
+    ".tdms": _Format("TDMS", "_tdms_format", 512 * _MB),
+    ".uff": _Format("UFF58", "_uff_format", 128 * _MB),
+    ".unv": _Format("UFF58", "_uff_format", 128 * _MB),
+    ".uf58": _Format("UFF58", "_uff_format", 128 * _MB),
 }
 
 
@@ -187,6 +147,45 @@ def _check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
     check_samples(path, "The file", length)
 
 
+# Bounds on memory and length
+
+MAX_MEMORY: Final = 800_000_000
+"""Most memory that reading a file may take, bytes."""
+
+
+@contextmanager
+def bounded_memory(extra_bytes: int = MAX_MEMORY) -> Iterator[None]:
+    """Let the process grow by so much and no further: what asks for more gets a MemoryError.
+
+    Formats such as MATLAB's are compressed and nested, and their readers believe what a file says
+    of its sizes; a kilobyte can ask for all the memory there is. The kernel's own limit holds for
+    every library alike. Where there is none (Windows, macOS) nothing is limited. Libraries are to
+    be imported before, as the address space that they reserve would count too.
+    """
+    try:
+        import resource
+    except ImportError:
+        yield
+        return
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except OSError:
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    ceiling = pages * resource.getpagesize() + extra_bytes
+    bounds = [limit for limit in (soft, hard, ceiling) if limit != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_AS, (min(bounds), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+MAX_SAMPLES: Final = 3_000_000
+"""Most samples of a channel: 50 minutes at 1 kHz. Ten such channels are a quarter of a gigabyte."""
+
+
 def check_samples(path: Path, what: str, samples: int) -> None:
     """Refuse a channel that is, or claims to be, longer than `MAX_SAMPLES`."""
     if samples > MAX_SAMPLES:
@@ -194,6 +193,14 @@ def check_samples(path: Path, what: str, samples: int) -> None:
             f"{path}: {what} has {samples} samples, more than the {MAX_SAMPLES} that are read; cut "
             "the session out of the file first."
         )
+
+
+# What the readers of formats share
+
+_NAMES_SHOWN: Final = 12
+"""Channel names that a message lists."""
+_NAME_SHOWN: Final = 60
+"""Characters of each."""
 
 
 def no_such_channel(path: Path, name: str, available: Iterable[str]) -> ExchangeError:

@@ -1,9 +1,8 @@
-"""Universal files: channels of data sets of type 58, and a table as such sets.
+"""Universal files (UFF): channels of data sets of type 58, and a table as such sets.
 
-A table as a universal file: one data set of type 58 for each column, in text or binary.
-
-Written by hand from the definition of the University of Cincinnati (SDRL), as the libraries there
-are state the wrong number of bytes for complex values or write abscissae with six digits only.
+Reading is by pyuff. Writing, in text or binary, is by hand from the definition of the University of
+Cincinnati (SDRL), as the libraries there are state the wrong number of bytes for complex values or
+write abscissae with six digits only.
 """
 
 from __future__ import annotations
@@ -32,6 +31,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.exchange._table import Column, Table
+
+
+# Reading
 
 ABSCISSA: Final = "abscissa"
 """Name of the channel of times that the data sets have in common."""
@@ -136,6 +138,8 @@ def _common_times(path: Path, names: Sequence[str], times: Sequence[Any]) -> Any
             )
     return times[0]
 
+
+# Writing
 
 _EVEN_IN_TEXT, _EVEN_IN_BINARY = 1e-2, 1e-6
 """Largest error of an abscissa, in spacings, at which first value and increment stand for all: the

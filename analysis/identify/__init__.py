@@ -1,4 +1,9 @@
-"""Output-error estimation on whole records: the exact model against every sample in the band."""
+"""Output-error identification of one record: the exact model against every sample in the band.
+
+`Measurement` is what a record gives; `fit_record` fits structures to it, and `select` chooses the
+one that the data support, with a `Verdict` in words and a `Headline` in numbers. It knows
+nothing of other sessions, of report pages, or of how a record came into its file.
+"""
 
 import lazy_loader as lazy
 

@@ -1,4 +1,4 @@
-"""One structure fitted to one record, and what the information criteria say of it."""
+"""Candidate: one structure fitted to one record, with its information criteria."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Candidate:
 
     @property
     def kind(self) -> Kind:
-        """Of rig: whether the beam is uniform, and what else was free."""
+        """Kind of rig: whether the beam is uniform, and what else was free."""
         return self.uniform, self.extras
 
     @property

@@ -1,4 +1,4 @@
-"""All structures fitted to one record under one noise, the lowest BIC first."""
+"""Candidate set of a record: all structures fitted under one noise spectrum, ranked by BIC."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Field:
     columns : ndarray of complex, shape (c, K)
         What all were allowed beside the linear beam.
     drag : DragEstimate, optional
-        Of the air, if the record calls for it; it is then in all candidates.
+        Drag of the air, if the record calls for it; it is then in all candidates.
     misread : tuple of Finding
         A wrong sign or unit, which makes every number wrong; empty where there is none.
     """

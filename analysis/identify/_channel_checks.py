@@ -1,8 +1,7 @@
-"""What is wrong with a channel as recorded: clipping, a stop, a wrong sign or unit, drift.
+"""Checks of the recorded channels: clipping, stopped motor, wrong sign or unit, sensor drift.
 
-A sign reversed or a unit mistaken, from torque over angle against the beam that the file states.
-
-The median over the band sees neither where the modes are exactly, nor how they are damped.
+Sign and unit are judged by the median, over the band, of torque over angle against the beam that
+the file states; it depends neither on where the modes are exactly, nor on how they are damped.
 """
 
 from __future__ import annotations
@@ -23,6 +22,9 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import Field
     from analysis.identify._data import Measurement
     from analysis.identify._problem import Comparison
+
+
+# Clipping and stops
 
 _FEWEST_FLAT: Final = 4
 """Known values next to another at the very extreme: noise does not repeat its largest."""
@@ -95,6 +97,8 @@ def _longest(true: NDArray[np.bool_]) -> tuple[int, int]:
     longest = int(np.argmax(ends - starts))
     return int(starts[longest]), int(ends[longest])
 
+
+# Sign and unit
 
 _LOSS_S: Final = 1e-4
 """Internal damping of order 1, in s: of some per cent, for want of a better."""
@@ -177,6 +181,8 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
         remedy="Check the units of angle and torque, and import the record again.",
     )
 
+
+# Drift of the zero
 
 _PARTS: Final = 16
 _BEYOND_CHANCE: Final = 10.0

@@ -1,4 +1,8 @@
-"""What is in the record beside the beam of Eq. 25, each by its name and size."""
+"""Diagnostics of a record: what is in it beside the beam of Eq. 25, each by its name and size.
+
+Settings at the edge of what is searched or not as the file states them, disturbances of the torque,
+forces that are not linear, drag, a free decay at the start, and what remains unexplained.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,10 @@ from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._refit import vector
-from analysis.identify._residual_tests import SURE, of_chi_square
+from analysis.identify._residual_tests import SURE
 from analysis.identify._rig_findings import of_rig
 from analysis.identify._verdict import EVEN, STRONG, rivals
+from analysis.statistics import NORMAL_95, chi_square_deviate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,6 +27,50 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Setting
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
     from analysis.identify._result import ModeEstimate
+
+
+_MODES_TO_JUDGE: Final = 2
+
+
+def findings(
+    field: Field,
+    forces: tuple[NonlinearForce, ...],
+    multiples: tuple[Harmonic, ...],
+    visible: tuple[int, ...],
+) -> tuple[Finding, ...]:
+    """Name what is there: of a record with a wrong sign or unit, only what needs no model.
+
+    Parameters
+    ----------
+    field : Field
+    forces : tuple of NonlinearForce
+        Those the record calls for.
+    multiples : tuple of Harmonic
+        What the residual holds at multiples of the sweep's frequency.
+    visible : tuple of int
+        Modes that stand out of the noise. With fewer than two, what the file states is not
+        doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
+    """
+    measurement = field.comparison.measurement
+    seen = (*field.misread, *clipping(measurement), *stops(measurement))
+    if field.misread:
+        return seen
+    found = (
+        *seen,
+        *_hum(field),
+        *_air(field),
+        *map(_force, forces),
+        *_harmonics(multiples),
+    )
+    edges = tuple(at_edges(field))
+    if edges:
+        return (*found, *edges)
+    if len(visible) < _MODES_TO_JUDGE:
+        return found
+    return (*found, *of_settings(field))
+
+
+# Settings at an edge, or not as the file states them
 
 _MANY: Final = 40
 """Evaluations of a descent that is to end."""
@@ -166,7 +215,7 @@ def _rings(field: Field) -> bool:
     # A hum begins and ends with the record, which looks a little like a decay.
     hum = max((line.amplitude_nm for line in field.noise.lines), default=0.0)
     return loudest > hum and all(
-        of_chi_square(ringing.chi_square, ringing.degrees_of_freedom) > SURE
+        chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) > SURE
         for ringing in (c.fit.ringing for c in (field.best, *rivals(field, EVEN)))
         if ringing.degrees_of_freedom
     )
@@ -227,53 +276,16 @@ def _difference(field: Field, name: Setting) -> tuple[float, float, float]:
     return best.parameters[name] - stated, low - stated, high - stated
 
 
-_NORMAL_95: Final = 1.959963984540054
+# Disturbances, forces, and what remains
+
 _MAINS_WANDER: Final = 0.005
-_MODES_TO_JUDGE: Final = 2
+
 _SLOW_HZ: Final = 0.5
 _FEWEST_PERIODS: Final = 5.0
 """In the record: what is slower is no hum but a sensor that drifts."""
 
 _SAME_TURN: Final = 0.5
-"""Of a turn over the whole record, within which a line's frequency is that of a harmonic."""
-
-
-def findings(
-    field: Field,
-    forces: tuple[NonlinearForce, ...],
-    multiples: tuple[Harmonic, ...],
-    visible: tuple[int, ...],
-) -> tuple[Finding, ...]:
-    """Name what is there: of a record with a wrong sign or unit, only what needs no model.
-
-    Parameters
-    ----------
-    field : Field
-    forces : tuple of NonlinearForce
-        Those the record calls for.
-    multiples : tuple of Harmonic
-        What the residual holds at multiples of the sweep's frequency.
-    visible : tuple of int
-        Modes that stand out of the noise. With fewer than two, what the file states is not
-        doubted: delay, inertias and stiffness then make up for whatever a structure lacks.
-    """
-    measurement = field.comparison.measurement
-    seen = (*field.misread, *clipping(measurement), *stops(measurement))
-    if field.misread:
-        return seen
-    found = (
-        *seen,
-        *_hum(field),
-        *_air(field),
-        *map(_force, forces),
-        *_harmonics(multiples),
-    )
-    edges = tuple(at_edges(field))
-    if edges:
-        return (*found, *edges)
-    if len(visible) < _MODES_TO_JUDGE:
-        return found
-    return (*found, *of_settings(field))
+"""Phase over the whole record, in turns, within which a line's frequency is a harmonic's."""
 
 
 def mains(frequency_hz: float) -> str:
@@ -283,6 +295,59 @@ def mains(frequency_hz: float) -> str:
             if abs(frequency_hz - n * base) < _MAINS_WANDER * n * base:
                 return "the mains" if n == 1 else f"{n} times the mains frequency"
     return ""
+
+
+def unexplained(
+    white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
+) -> Finding:
+    """Describe what remains and has no name."""
+    low, high = white.loudest_hz
+    at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
+    if related.related:
+        where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
+        what = (
+            f"Part of the torque follows the motor, {where}, in a way that no uniform or nearly "
+            "uniform beam does: something else moves along."
+        )
+        remedy = (
+            "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "
+            "what stays belongs to the rig."
+        )
+    elif white.loud and at_mode:
+        what = (
+            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise at mode "
+            f"{at_mode[0]} ({low:.2f} to {high:.2f} Hz): steps of the encoder, which the resonance "
+            "magnifies, or something of that mode that the model lacks."
+        )
+        remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
+    elif white.loud and high < _SLOW_HZ:
+        what = (
+            f"What remains below {high:.2f} Hz is {white.loudest_ratio:.1f} times as loud as the "
+            "noise and does not follow the motor: drift of the torque sensor's zero."
+        )
+        remedy = ""
+    else:
+        near = mains((low + high) / 2)
+        what = (
+            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise from "
+            f"{low:.2f} to {high:.2f} Hz, and does not follow the motor: a disturbance"
+            f"{', as of the mains that come and go' if near else ''}."
+            if white.loud
+            else "What remains is not spread over the frequencies as the noise is (most from "
+            f"{low:.2f} to {high:.2f} Hz), and does not follow the motor."
+        )
+        remedy = (
+            "Record for as long with the motor held (rigd run hold): if it is there as well, look "
+            "for what else runs near by, and at the sensor's shield and earth."
+        )
+    return Finding(
+        kind="unexplained",
+        sentence=f"{what} Until it is known, take intervals and orders with care.",
+        value=white.loudest_ratio,
+        interval=None,
+        unit="1",
+        remedy=remedy,
+    )
 
 
 def _hum(field: Field) -> Iterator[Finding]:
@@ -358,11 +423,11 @@ def _air(field: Field) -> Iterator[Finding]:
 
 def _force(force: NonlinearForce) -> Finding:
     size, std, mode = force.size, force.std, force.term.mode
-    percent = f"{100 * abs(size):.2g} % (± {100 * _NORMAL_95 * std:.1g} %)"
+    percent = f"{100 * abs(size):.2g} % (± {100 * NORMAL_95 * std:.1g} %)"
     if force.term.kind == "quadratic drag":
         sentence = (
             f"The damping of mode {mode} depends on its speed, as drag in air does: its damping "
-            f"ratio is {abs(size):.2g} (± {_NORMAL_95 * std:.1g}) "
+            f"ratio is {abs(size):.2g} (± {NORMAL_95 * std:.1g}) "
             f"{'higher' if size > 0 else 'lower'} at the highest speed than at rest."
         )
     elif force.term.kind == "cubic stiffness":
@@ -381,7 +446,7 @@ def _force(force: NonlinearForce) -> Finding:
         kind="nonlinear damping" if force.term.kind == "quadratic drag" else "nonlinear stiffness",
         sentence=sentence,
         value=size,
-        interval=(size - _NORMAL_95 * std, size + _NORMAL_95 * std),
+        interval=(size - NORMAL_95 * std, size + NORMAL_95 * std),
         unit="1",
         remedy="Repeat the sweep at half the amplitude: what is not linear all but vanishes.",
     )
@@ -403,56 +468,3 @@ def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
                 unit="standard deviations",
                 remedy="Repeat the sweep at half the amplitude; look for play in the clamp.",
             )
-
-
-def unexplained(
-    white: Whiteness, related: InputRelation, modes: tuple[ModeEstimate, ...]
-) -> Finding:
-    """Describe what remains and has no name."""
-    low, high = white.loudest_hz
-    at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
-    if related.related:
-        where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
-        what = (
-            f"Part of the torque follows the motor, {where}, in a way that no uniform or nearly "
-            "uniform beam does: something else moves along."
-        )
-        remedy = (
-            "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "
-            "what stays belongs to the rig."
-        )
-    elif white.loud and at_mode:
-        what = (
-            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise at mode "
-            f"{at_mode[0]} ({low:.2f} to {high:.2f} Hz): steps of the encoder, which the resonance "
-            "magnifies, or something of that mode that the model lacks."
-        )
-        remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
-    elif white.loud and high < _SLOW_HZ:
-        what = (
-            f"What remains below {high:.2f} Hz is {white.loudest_ratio:.1f} times as loud as the "
-            "noise and does not follow the motor: drift of the torque sensor's zero."
-        )
-        remedy = ""
-    else:
-        near = mains((low + high) / 2)
-        what = (
-            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise from "
-            f"{low:.2f} to {high:.2f} Hz, and does not follow the motor: a disturbance"
-            f"{', as of the mains that come and go' if near else ''}."
-            if white.loud
-            else "What remains is not spread over the frequencies as the noise is (most from "
-            f"{low:.2f} to {high:.2f} Hz), and does not follow the motor."
-        )
-        remedy = (
-            "Record for as long with the motor held (rigd run hold): if it is there as well, look "
-            "for what else runs near by, and at the sensor's shield and earth."
-        )
-    return Finding(
-        kind="unexplained",
-        sentence=f"{what} Until it is known, take intervals and orders with care.",
-        value=white.loudest_ratio,
-        interval=None,
-        unit="1",
-        remedy=remedy,
-    )

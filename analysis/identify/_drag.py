@@ -1,12 +1,8 @@
-"""Whether the air brakes the beam, how large C_D d is, and the damping by amplitude that follows.
-
-Whether the air brakes the beam, and how large C_D d is.
+"""Air drag on the beam: whether it is there, how large C_D d is, and the damping by amplitude.
 
 Drag along the whole beam is one number, or two where the coefficient falls with the speed. Left
 out, it passes for a fractional order, a delay, modes of their own stiffness and another density:
 it damps each mode by as much as the mode is fast at the time.
-
-Damping of a mode against its amplitude, where the air brakes the beam.
 
 In free vibration of one mode, the tip moving by ``A sin(omega t)``, a force per metre
 ``rho_air/2 C v^p`` takes from each cycle as much as linear damping of the ratio::
@@ -31,6 +27,7 @@ from analysis.identify._candidate import Candidate
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
 from analysis.identify._refit import Refit, adapted, unexplained_part, vector
 from analysis.models import STRUCTURES
+from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
 
 if TYPE_CHECKING:
@@ -41,6 +38,9 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.models import Structure
+
+
+# Search for drag
 
 _SCORED: Final = ("III", "VI", "VII")
 """Structures beside which drag is looked for: those that have either damping."""
@@ -75,9 +75,7 @@ has two numbers, whether or not the second differs from nought, or its interval 
 """
 
 _SLOWEST: Final = 0.02
-"""Of the highest speed: slower air tells nothing."""
-
-_NORMAL_95: Final = 1.959963984540054
+"""Least speed that tells anything, relative to the highest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +95,7 @@ class DragEstimate:
     law : DragLaw
         For all speeds.
     covariance : tuple of tuple of float
-        Of the law's numbers that were free: of the first, or of both.
+        Covariance of the law's numbers that were free: of the first, or of both.
     """
 
     value_m: float
@@ -145,6 +143,23 @@ def with_air_drag(field: Field) -> Field:
         found = _all(field, settled)
     assert found.drag is not None
     return found if found.drag.value_m > 0 and found.bic < field.bic else field
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """Where a search with drag stands."""
+
+    plant: Plant
+    structure: Structure
+    law: DragLaw
+    noise: Noise
+    two: bool = False
+
+    @classmethod
+    def of(cls, refit: Refit) -> _Point:
+        structure = refit.objective.unknowns.structure
+        two = len(refit.columns) > 1
+        return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
 
 
 def _without_extras(field: Field) -> tuple[Candidate, ...]:
@@ -202,23 +217,6 @@ def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
         return 0.0, 0.0, projected.cost
     along = float(np.vdot(column, residual).real)
     return -along / square, along**2 / square, projected.cost
-
-
-@dataclass(frozen=True, slots=True)
-class _Point:
-    """Where a search with drag stands."""
-
-    plant: Plant
-    structure: Structure
-    law: DragLaw
-    noise: Noise
-    two: bool = False
-
-    @classmethod
-    def of(cls, refit: Refit) -> _Point:
-        structure = refit.objective.unknowns.structure
-        two = len(refit.columns) > 1
-        return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
 
 
 def _start(field: Field, lead: Candidate) -> _Point | None:
@@ -353,19 +351,21 @@ def _estimate(field: Field) -> DragEstimate:
     return DragEstimate(
         value_m=value,
         std_m=std,
-        interval_95_m=(max(value - _NORMAL_95 * std, 0.0), value + _NORMAL_95 * std),
+        interval_95_m=(max(value - NORMAL_95 * std, 0.0), value + NORMAL_95 * std),
         speed_m_s=speed,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
     )
 
 
+# Damping of a mode against its amplitude
+
 _MODES: Final = (1, 2)
 _DEFLECTIONS: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
-"""Of the tip, relative to the length, as far as slopes are small."""
+"""Deflections of the tip relative to the length, as far as slopes are small."""
 
 _POWERS: Final = (2.0, 4 / 3)
-"""Of the speed, for the two numbers of a `DragLaw`."""
+"""Powers of the speed, for the two numbers of a `DragLaw`."""
 
 _POINTS: Final = 64
 

@@ -1,6 +1,4 @@
-"""Torque by the drag of the air along the beam, and how it changes with beam and drag.
-
-Torque by the drag of the air along the beam, and how it changes with beam and drag.
+"""Torque by air drag along the beam, and how it changes with beam and drag.
 
 Mode i, relative to its root, feels of a force f per metre ``F_i = ∫ phi_i f dx / L``; with p, c and
 k of `analysis.identify._predictor`, ``Z_i = p + c k_i⁴`` and ``b_i = ∫ x phi_i dx / L``::
@@ -12,7 +10,7 @@ k of `analysis.identify._predictor`, ``Z_i = p + c k_i⁴`` and ``b_i = ∫ x ph
 
 The moment of the force is exact, the sum over the modes all that inertia makes of it. C is C_D d of
 a constant coefficient. S is the part of it that falls with the speed as in White's law for a
-cylinder, ``C_D = 1 + 10 Re^(-2/3)``.
+cylinder, ``C_D = 1 + 10 Re^(-2/3)`` [1]_.
 
 What the motor's motion makes of the speeds is exact (by transforms over the whole record, as in
 `Prediction`). What the drag makes of them is followed step by step, for drag halves a peak and no
@@ -20,11 +18,9 @@ repeated substitution converges there. Of each mode the two poles, with their re
 the force between the steps is the cubic through the last four of them. From the forces so found
 the torque again follows by transforms, exactly.
 
-Drag in a whole-record fit: its torque at one beam, and what it changes by beside it.
-
-The torque by drag is not linear in the motion, so no response function gives it. At a beam and a
-drag it is computed (`analysis.identify._drag_torque`) and taken out of the measured torque; what it
-changes by when beam or drag change is linear in
+This torque is not linear in the motion, so no response function gives it. In a fit it is computed
+at one beam and drag and taken out of the measured torque; what it changes by when beam or drag
+change is linear (`DragExpansion`) in
 
 * the poles of the modes, on which the motion near a resonance depends,
 * the external damping, which also drives the modes,
@@ -38,6 +34,10 @@ those of a free decay are. A fit with drag repeats both steps until they agree.
 Without drag a peak grows as the damping falls, beyond all bounds; with it, it hardly grows. Where
 the linear torque curves with a pole, the torque by drag curves against it. So of the linear torque
 too only the first order in the poles counts: its remainder is taken away again.
+
+References
+----------
+.. [1] F. M. White, Viscous Fluid Flow, McGraw-Hill.
 """
 
 from __future__ import annotations
@@ -90,6 +90,9 @@ _SLOWING: Final = 1 / 3
 """Power of the speed that is left where C_D falls as its power of -2/3."""
 
 
+# Torque at one beam and drag
+
+
 class DragError(ArithmeticError):
     """So much drag on so light a beam cannot be followed from sample to sample."""
 
@@ -123,7 +126,7 @@ class DragTorque:
     law : DragLaw
     torque_nm : ndarray, shape (m,)
     by_pole : dict of int to ndarray, shape (2, m)
-        Of each mode: derivatives by the real and the imaginary part of its upper pole.
+        For each mode: derivatives by the real and the imaginary part of its upper pole.
     by_external : ndarray, shape (2, m)
         By gamma and by lambda, the poles held: external damping also drives the modes.
     by_law : ndarray, shape (2, m)
@@ -260,7 +263,7 @@ class DragResponse:
 
     @property
     def _leverage(self) -> Real:
-        """Of the modes, L b_i, shape (MODES,)."""
+        """Leverage of the modes, L b_i, shape (MODES,)."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
     def _mean_speed(self, speed: Real) -> float:
@@ -482,6 +485,12 @@ def _polynomial_inputs(pole: Complex, step_s: float) -> Complex:
     return inputs
 
 
+# Change with beam and drag
+
+_OF_DENSITY = ("density_over_stiffness", "bending_stiffness_n_m2")
+"""Parameters whose logarithms add up to that of the mass per length."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DragExpansion:
     """Changes of the torque by drag round one beam and drag, as spectra in the band.
@@ -492,11 +501,11 @@ class DragExpansion:
     law : DragLaw
         At these the torque was taken out of the record.
     response : DragResponse
-        Of that beam.
+        What drag does to that beam.
     band : callable
         Spectrum in the band of samples of the angle's times.
     by_pole : dict of int to ndarray of complex, shape (2, K)
-        Of each mode: by the real and the imaginary part of its upper pole.
+        For each mode: by the real and the imaginary part of its upper pole.
     by_external : ndarray of complex, shape (2, K)
         By gamma and lambda, the poles held.
     by_ln_density, by_delay : ndarray of complex, shape (K,)
@@ -593,7 +602,3 @@ class DragExpansion:
         spectra = torque * np.array([grown - 1 - first, real, imaginary])
         curved, *steeper = self.band(self.response.in_time(spectra))
         return curved, np.array(steeper)
-
-
-_OF_DENSITY = ("density_over_stiffness", "bending_stiffness_n_m2")
-"""Parameters whose logarithms add up to that of the mass per length."""

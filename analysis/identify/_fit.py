@@ -29,84 +29,12 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._noise import Noise
     from analysis.identify._plant import Setting
-    from analysis.identify._problem import Objective, Projected
+    from analysis.identify._problem import Projected
     from analysis.models import Structure
-
-
-def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> RecordFit:
-    """Parameters, uncertainty, modes and residual at a minimum.
-
-    Parameters
-    ----------
-    objective : Objective
-    x : ndarray, shape (k,)
-        The minimum.
-    noise : Noise
-        What was taken for noise when it was found.
-    """
-    unknowns, comparison = objective.unknowns, objective.comparison
-    at = objective.linearise(x)
-    projected = objective.project(at, noise.weight)
-    # Where a torque is unknown the residual is nought and adds nothing to the sum.
-    compared = round(2 * np.sum(noise.counts) * comparison.measurement.torque_share)
-    freedom = compared - x.size - projected.amplitudes.size
-    scatter = projected.cost / freedom
-    lower, upper = unknowns.bounds
-    held = (x <= lower) | (x >= upper)
-    jacobian = _compared_jacobian(objective, x, projected, noise)
-    of_unknowns, known = covariance_of_unknowns(jacobian, scatter, held)
-    names, plant = unknowns.names, unknowns.plant(x)
-    values = unknowns.parameters(x)
-    of = parameter_uncertainty(unknowns, x, held, of_unknowns, known)
-    std, intervals = dict(of.std), dict(of.interval)
-    tool = "tool_inertia_kg_m2"
-    if tool in names and held[names.index(tool)]:
-        place = names.index(tool)
-        free = held & (np.arange(held.size) != place)
-        every, _ = covariance_of_unknowns(jacobian, scatter, free)
-        chain = unknowns.estimates_by_unknowns(x)
-        std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
-    spread = std.get(tool)
-    if tool in names and spread:
-        intervals[tool] = interval_from_zero(values[tool], spread)
-    hum = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
-    return RecordFit(
-        structure=unknowns.structure,
-        plant=plant,
-        parameters=values,
-        std=std,
-        interval=intervals,
-        determined=of.determined,
-        covariance=of.covariance,
-        at_bounds=of.at_bounds,
-        internal=of.internal,
-        external=of.external,
-        modes=mode_table(at.poles, of_unknowns),
-        ringing=ringing(at.poles, projected, scatter, at.columns * noise.weight, hum),
-        cost=projected.cost,
-        degrees_of_freedom=freedom,
-        residual=projected.residual,
-    )
-
-
-def _compared_jacobian(
-    objective: Objective,
-    x: NDArray[np.float64],
-    projected: Projected,
-    noise: Noise,
-) -> NDArray[np.complex128]:
-    """Jacobian of the torques that are known, shape (k, K)."""
-    comparison, unknowns = objective.comparison, objective.unknowns
-    if comparison.measurement.torque_known.all():
-        return projected.jacobian
-    lost = comparison.lost_gradient(unknowns.plant(x), unknowns.gradient_names)
-    weighted = noise.weight * (unknowns.gradient_by_unknowns(x).T @ lost)
-    return projected.jacobian - weighted
-
 
 BAND_HZ: Final[tuple[float, float]] = RECORD_BAND_HZ
 _TOLERANCE: Final = 1e-9
-"""Of the sum of squares: less than a hundredth of a standard deviation."""
+"""Relative tolerance of the sum of squares: less than a hundredth of a standard deviation."""
 
 _BEFORE_LINES: Final = 1e-4
 """The same while noise and lines are still to be found: a standard deviation."""
@@ -129,7 +57,7 @@ def fit_record(
     measurement differs by, whitened with the spectrum of the noise found in it, are minimised over
     the damping and over density over stiffness, stiffness, delay and tool inertia. For noise in
     the torque alone that is the maximum-likelihood estimate, whatever the excitation. Where a
-    controller held the motor to a reference, only what follows that is taken for input
+    controller held the motor to a reference, the part coherent with that is used as input
     (`analysis.identify._problem`): the noise then moves the motor as well.
 
     Parameters
@@ -207,3 +135,77 @@ def _followed_again(clean: Descent, whole: Comparison) -> Descent:
         clean = clean.settled(clean.noise(), _TOLERANCE)
         hum = clean.hum() or hum
     return Descent(Objective(clean.objective.comparison.without_hum(hum), unknowns), clean.x)
+
+
+# Result at a minimum
+
+
+def summary(objective: Objective, x: NDArray[np.float64], noise: Noise) -> RecordFit:
+    """Parameters, uncertainty, modes and residual at a minimum.
+
+    Parameters
+    ----------
+    objective : Objective
+    x : ndarray, shape (k,)
+        The minimum.
+    noise : Noise
+        What was taken for noise when it was found.
+    """
+    unknowns, comparison = objective.unknowns, objective.comparison
+    at = objective.linearise(x)
+    projected = objective.project(at, noise.weight)
+    # Where a torque is unknown the residual is nought and adds nothing to the sum.
+    compared = round(2 * np.sum(noise.counts) * comparison.measurement.torque_share)
+    freedom = compared - x.size - projected.amplitudes.size
+    scatter = projected.cost / freedom
+    lower, upper = unknowns.bounds
+    held = (x <= lower) | (x >= upper)
+    jacobian = _compared_jacobian(objective, x, projected, noise)
+    of_unknowns, known = covariance_of_unknowns(jacobian, scatter, held)
+    names, plant = unknowns.names, unknowns.plant(x)
+    values = unknowns.parameters(x)
+    of = parameter_uncertainty(unknowns, x, held, of_unknowns, known)
+    std, intervals = dict(of.std), dict(of.interval)
+    tool = "tool_inertia_kg_m2"
+    if tool in names and held[names.index(tool)]:
+        place = names.index(tool)
+        free = held & (np.arange(held.size) != place)
+        every, _ = covariance_of_unknowns(jacobian, scatter, free)
+        chain = unknowns.estimates_by_unknowns(x)
+        std[tool] = float(chain[place, place] * every[place, place] ** 0.5)
+    spread = std.get(tool)
+    if tool in names and spread:
+        intervals[tool] = interval_from_zero(values[tool], spread)
+    hum = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
+    return RecordFit(
+        structure=unknowns.structure,
+        plant=plant,
+        parameters=values,
+        std=std,
+        interval=intervals,
+        determined=of.determined,
+        covariance=of.covariance,
+        at_bounds=of.at_bounds,
+        internal=of.internal,
+        external=of.external,
+        modes=mode_table(at.poles, of_unknowns),
+        ringing=ringing(at.poles, projected, scatter, at.columns * noise.weight, hum),
+        cost=projected.cost,
+        degrees_of_freedom=freedom,
+        residual=projected.residual,
+    )
+
+
+def _compared_jacobian(
+    objective: Objective,
+    x: NDArray[np.float64],
+    projected: Projected,
+    noise: Noise,
+) -> NDArray[np.complex128]:
+    """Jacobian of the torques that are known, shape (k, K)."""
+    comparison, unknowns = objective.comparison, objective.unknowns
+    if comparison.measurement.torque_known.all():
+        return projected.jacobian
+    lost = comparison.lost_gradient(unknowns.plant(x), unknowns.gradient_names)
+    weighted = noise.weight * (unknowns.gradient_by_unknowns(x).T @ lost)
+    return projected.jacobian - weighted

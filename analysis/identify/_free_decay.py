@@ -1,4 +1,4 @@
-"""Free decay of the beam's modes, as its spectrum over a record, and how the poles move.
+"""Free decay of the beam's modes: its poles, how they move, and its spectrum over a record.
 
 A beam that already rings when the record begins adds to the torque a sum of decays whose amplitudes
 nobody knows but whose poles are the model's own. Their spectra over the samples compared are
@@ -190,8 +190,8 @@ class DecaySpectra:
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
         """Spectra of oscillations all through the record, shape (4 n, K).
 
-        Of either phase, and growing from nought: together any amplitude and phase at the beginning
-        and any other at the end, and that is what leaks into distant bins.
+        Columns of either phase, constant and growing from nought: together any amplitude and phase
+        at the beginning and any other at the end, and that is what leaks into distant bins.
         """
         none = np.zeros(0, dtype=np.complex128)
         # All but steady: on a bin's own frequency the sums would be 0 / 0.

@@ -1,4 +1,4 @@
-"""The numbers that a record stands for: from the freest structure that it supports, with flags.
+"""Headline numbers of a record: from the freest structure that it supports, with flags.
 
 A structure that fixes an order gives narrow intervals which hold only if that order is right, and
 the criterion that selected it forgives an error of 2.7 standard deviations. So what is told first
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from analysis.identify._verdict import BESIDE_DRAG, EXCLUDED, STRONG
 from analysis.models import COEFFICIENT_OF
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._verdict import OrderVerdict
 
-_NORMAL_95: Final = 1.959963984540054
 UNEXPLAINED: Final = "part of the record is unexplained"
 MISREAD: Final = "the record and its file do not fit each other"
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
@@ -180,7 +180,7 @@ class Headline(Numbers):
     Attributes
     ----------
     fit : RecordFit
-        Of the freest structure that the record supports.
+        Fit of the freest structure that the record supports.
     explained : bool
         Whether it leaves nothing but noise; else every number carries a flag.
     """
@@ -422,7 +422,7 @@ def _parameter(
 
 def _size(damping: Damping, size: DampingSize, reason: str | None) -> Size:
     # Positive, and uncertain by a factor.
-    spread = _NORMAL_95 * size.std / size.value
+    spread = NORMAL_95 * size.std / size.value
     ends = (size.value * math.exp(-spread), size.value * math.exp(min(spread, 300.0)))
     return Size(damping, size.omega_rad_s, Quantity(size.value, size.std, ends, reason))
 
@@ -486,7 +486,7 @@ def _mode(mode: ModeEstimate, visible: Collection[int], reason: str | None) -> M
 
 
 def _symmetric(value: float, std: float, reason: str | None) -> Quantity:
-    half = _NORMAL_95 * std
+    half = NORMAL_95 * std
     return Quantity(value, std, (value - half, value + half), reason)
 
 

@@ -166,7 +166,7 @@ class _Blocks:
         near_hz : tuple of float
             Between which frequencies.
         variance : float
-            Of one sample of noise as strong as that at these frequencies, in N²·m².
+            Variance of one sample of noise as strong as that at these frequencies, in N²·m².
         """
         if not len(self.parts):
             return None

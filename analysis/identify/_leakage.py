@@ -1,4 +1,4 @@
-"""Hum next to the band, which leaks into it: the mains lie at the very end of a band to 50 Hz.
+"""Leakage of a hum next to the band: the mains lie at the very end of a band to 50 Hz.
 
 Within the band the estimator finds lines itself (`RecordAnalysis.lines`).
 """

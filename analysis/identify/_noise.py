@@ -1,4 +1,9 @@
-"""The noise in the torque, from the residual of a fit: a smooth spectrum, and lines (hum)."""
+"""Noise spectrum of the torque, from the residual of a fit: a smooth spectrum, and lines (hum).
+
+The spectrum is smoothed by medians over blocks of bins, which what a wrong model leaves at a mode,
+or a hum at one frequency, does not raise; a line is a group of bins far above it that lasts all
+through the record.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +41,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What is taken for noise.
+    """Noise in the torque, as found from a residual.
 
     Attributes
     ----------
@@ -78,7 +83,7 @@ def noise_of(
     near_mode : ndarray of bool, shape (K,), optional
         Bins that are compared whatever stands out there, skirts of a line beside them included;
         without it no line is looked for. A resonance that is left out is not fitted, and what is
-        not fitted there stands out for ever.
+        not fitted there always stands out.
     """
     power = smooth_power(residual) / share
     counts = np.ones(power.size, dtype=bool)

@@ -1,6 +1,4 @@
-"""Stiffness and damping that depend on the deflection: their torque, and a search for them.
-
-What a mode adds to the torque when its stiffness or its damping depends on the deflection.
+"""Nonlinear stiffness and damping (dependent on the deflection): torque, and a search for them.
 
 Mode i, relative to its root, is driven by the angle; a further restoring force n acts on it::
 
@@ -42,6 +40,9 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import Field
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
+
+
+# Torque by a force
 
 Kind = Literal["cubic stiffness", "quadratic stiffness", "quadratic drag"]
 KINDS: Final[tuple[Kind, ...]] = ("cubic stiffness", "quadratic stiffness", "quadratic drag")
@@ -157,6 +158,8 @@ class ModalForces:
         values: NDArray[np.float64] = fine[: self._growth.size] * self._growth
         return values
 
+
+# Search
 
 _MOST_TERMS: Final = 2
 _ROUNDS: Final = 6

@@ -1,14 +1,4 @@
-"""The vector in which a fit searches, the way from it to a plant, and steps that suit it.
-
-Steps through the unknowns that follow what a record shows.
-
-Where damping is larger than the stiffness or inertia it adds to, loss and order make up for each
-other: what shows is the phase theta of ``1 ± size exp(j order pi/2)``, and at constant theta they
-trade over many powers of ten. A straight step leaves that valley at once, and a descent with
-straight steps takes a hundred of them. So a step is taken along ``ln tan(theta/2)`` and the order
-in place of ``ln loss`` and the order; where the damping is small the two are the same.
-
-The vector in which a whole-record fit searches, and the way from it to a plant.
+"""Parametrization of a fit: its vector of unknowns, the way from it to a plant, and suitable steps.
 
 Damping of a low order acts as stiffness, damping of an order near 2 as inertia. With density and
 stiffness free, such damping and the beam can make up for each other over a long and curved
@@ -29,6 +19,12 @@ directly; orders then change alone:
   units of 1e-5. To first order a tip mass does what density and stiffness do, and a filter what a
   delay does. So where they are free, the other unknowns are those of a bare beam whose first mode
   and torque are the same, and of the delay with the filter's own.
+
+Where damping is larger than the stiffness or inertia it adds to, loss and order make up for each
+other: what shows is the phase theta of ``1 ± size exp(j order pi/2)``, and at constant theta they
+trade over many powers of ten. A straight step leaves that valley at once, and a descent with
+straight steps takes a hundred of them. So a step is taken along ``ln tan(theta/2)`` and the order
+in place of ``ln loss`` and the order (`Steps`); where the damping is small the two are the same.
 """
 
 from __future__ import annotations
@@ -53,111 +49,8 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Setting
     from analysis.models import Structure
 
-_SHARE: Final = 0.5
-"""Of the way to order 0 or 2, in one step."""
 
-_NEXT_TO_NOTHING: Final = 1e-4
-"""Loss that may vanish in one step."""
-
-_LARGEST_GROWTH: Final = 50.0
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Where steps from a vector of unknowns lead, and how far they may go.
-
-    Attributes
-    ----------
-    lower, upper : ndarray, shape (k,)
-        Bounds of the unknowns.
-    dampings : tuple of (int, int, bool)
-        Places of the loss and of the order of each damping whose order is free, and whether it adds
-        to the stiffness; otherwise it takes from the inertia.
-    """
-
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    dampings: tuple[tuple[int, int, bool], ...]
-    straight: ClassVar[bool] = False
-
-    @classmethod
-    def of(cls, unknowns: Unknowns) -> Steps:
-        """Find the dampings in a vector of unknowns."""
-        names = unknowns.names
-        dampings = tuple(
-            (names.index(coefficient), names.index(order), coefficient == "zeta")
-            for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
-            if order in names
-        )
-        return cls(*unknowns.bounds, dampings)
-
-    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and largest step in each unknown, shape (k,).
-
-        Orders approach 0 and 2 by a share of the way at a time: what damping does goes with the
-        logarithm of that distance. Damping that has vanished keeps its order.
-        """
-        least, most = self.lower - x, self.upper - x
-        for loss, order, _ in self.dampings:
-            share = _SHARE if x[loss] > self.lower[loss] else 0.0
-            least[order] = max(least[order], -share * x[order])
-            most[order] = min(most[order], share * (2 - x[order]))
-        return least, most
-
-    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Point within the bounds that a step leads to, shape (k,).
-
-        Parameters
-        ----------
-        x : ndarray, shape (k,)
-        step : ndarray, shape (k,)
-            Within the `limits`; tangent to the way at `x`.
-        """
-        end = np.clip(x + step, self.lower, self.upper)
-        for i, j, elastic in self.dampings:
-            if step[i] != 0:
-                before, after = _turn(x[j], elastic), _turn(end[j], elastic)
-                most = math.exp(self.upper[i])
-                loss, turn = _along(math.exp(x[i]), float(step[i]), before, after, most)
-                end[i] = math.log(loss) if loss > 0 else self.lower[i]
-                if turn != after:
-                    end[j] = _order(turn, elastic)
-        clipped: NDArray[np.float64] = np.clip(end, self.lower, self.upper)
-        return clipped
-
-
-def _along(
-    loss: float, step: float, before: float, after: float, most: float
-) -> tuple[float, float]:
-    """Loss and turn to which a step of ``ln loss`` leads while the turn goes from before to after.
-
-    The turn comes out otherwise where no loss up to `most` shows at `after` what is to show: then
-    that largest loss is combined with the turn at which it does.
-    """
-    size = loss / math.sin(before)
-    real = 1 + size * math.cos(before)
-    # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
-    along = (step + size / math.sin(before) * (after - before)) / math.hypot(real, loss)
-    if along <= -1 and loss < _NEXT_TO_NOTHING:
-        return 0.0, after  # in proportion to its effect it would change sign
-    theta = math.atan2(loss, real)
-    theta = 2 * math.atan(math.tan(theta / 2) * math.exp(min(along, _LARGEST_GROWTH)))
-    if theta < after:
-        loss = math.sin(theta) / math.sin(after - theta) * math.sin(after)
-        if loss <= most:
-            return loss, after
-    return most, theta + math.asin(min(math.sin(theta) ** 2 / most, 1.0))
-
-
-def _turn(order: float, elastic: bool) -> float:
-    """Phase of the damping against the stiffness or the inertia, 0 to pi."""
-    turn = math.pi / 2 * float(order)
-    return turn if elastic else math.pi - turn
-
-
-def _order(turn: float, elastic: bool) -> float:
-    return (turn if elastic else math.pi - turn) / (math.pi / 2)
-
+# Unknowns
 
 _BEAM_RANGE: Final = math.log(3.0)
 _DELAY_UNIT_S: Final = 1e-3
@@ -181,7 +74,6 @@ FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
 )
 """Delay of a filter at low frequency over its time constant."""
 
-_NEWTON_STEPS: Final = 30
 _GRADIENT_NAMES: Final[Mapping[str, str]] = {
     "density_over_stiffness": "ln_density_over_stiffness",
     "bending_stiffness_n_m2": "ln_stiffness",
@@ -231,7 +123,7 @@ class Unknowns:
         modes : int
             How many modes count; with 1 the beam is uniform.
         extras : collection of str
-            Of `EXTRAS`, those that are free.
+            Those of the `EXTRAS` that are free.
         """
         first, second = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
         ordered = tuple(name for name in SETTINGS if name in free)
@@ -420,15 +312,20 @@ def _size(ln_loss: float, order: float) -> tuple[float, float]:
     return ln_loss - math.log(math.sin(angle)), -_QUARTER_TURN / math.tan(angle)
 
 
+# Beam with a tip mass, in terms of a bare one
+
+_NEWTON_STEPS: Final = 30
+
+
 def bare_beam(share: float) -> tuple[float, float]:
     """Logarithms of rho/EI and EI of a beam with a tip mass, over those of one without.
 
-    Of one whose first mode is at the same frequency, and whose torque is the same to first order.
+    The bare beam has its first mode at the same frequency, and to first order the same torque.
 
     Parameters
     ----------
     share : float
-        Of the tip's mass, relative to the nominal beam's.
+        Mass of the tip, relative to the nominal beam's.
     """
     (ln_ratio, _), (ln_stiffness, _) = _bare_beam(share)
     return ln_ratio, ln_stiffness
@@ -442,7 +339,7 @@ def ln_stiffness_with_tip(mode: int, share: float) -> float:
     mode : int
         From 1.
     share : float
-        Of the tip's mass, relative to the beam's.
+        Mass of the tip, relative to the beam's.
     """
     return _with_tip(float(eigenvalues(mode)[-1]), share)[0]
 
@@ -473,3 +370,111 @@ def _tip_equation(z: float, share: float) -> tuple[float, float, float]:
         -pinned - share * (pinned + 2 * z * sine * sinh),
         -z * pinned,
     )
+
+
+# Steps
+
+_SHARE: Final = 0.5
+"""Longest step of an order, as a share of the way to 0 or 2."""
+
+_NEXT_TO_NOTHING: Final = 1e-4
+"""Loss that may vanish in one step."""
+
+_LARGEST_GROWTH: Final = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Where steps from a vector of unknowns lead, and how far they may go.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (k,)
+        Bounds of the unknowns.
+    dampings : tuple of (int, int, bool)
+        Places of the loss and of the order of each damping whose order is free, and whether it adds
+        to the stiffness; otherwise it takes from the inertia.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    dampings: tuple[tuple[int, int, bool], ...]
+    straight: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, unknowns: Unknowns) -> Steps:
+        """Find the dampings in a vector of unknowns."""
+        names = unknowns.names
+        dampings = tuple(
+            (names.index(coefficient), names.index(order), coefficient == "zeta")
+            for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
+            if order in names
+        )
+        return cls(*unknowns.bounds, dampings)
+
+    def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest step in each unknown, shape (k,).
+
+        Orders approach 0 and 2 by a share of the way at a time: what damping does goes with the
+        logarithm of that distance. Damping that has vanished keeps its order.
+        """
+        least, most = self.lower - x, self.upper - x
+        for loss, order, _ in self.dampings:
+            share = _SHARE if x[loss] > self.lower[loss] else 0.0
+            least[order] = max(least[order], -share * x[order])
+            most[order] = min(most[order], share * (2 - x[order]))
+        return least, most
+
+    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Point within the bounds that a step leads to, shape (k,).
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+        step : ndarray, shape (k,)
+            Within the `limits`; tangent to the way at `x`.
+        """
+        end = np.clip(x + step, self.lower, self.upper)
+        for i, j, elastic in self.dampings:
+            if step[i] != 0:
+                before, after = _turn(x[j], elastic), _turn(end[j], elastic)
+                most = math.exp(self.upper[i])
+                loss, turn = _along(math.exp(x[i]), float(step[i]), before, after, most)
+                end[i] = math.log(loss) if loss > 0 else self.lower[i]
+                if turn != after:
+                    end[j] = _order(turn, elastic)
+        clipped: NDArray[np.float64] = np.clip(end, self.lower, self.upper)
+        return clipped
+
+
+def _along(
+    loss: float, step: float, before: float, after: float, most: float
+) -> tuple[float, float]:
+    """Loss and turn to which a step of ``ln loss`` leads while the turn goes from before to after.
+
+    The turn comes out otherwise where no loss up to `most` shows at `after` what is to show: then
+    that largest loss is combined with the turn at which it does.
+    """
+    size = loss / math.sin(before)
+    real = 1 + size * math.cos(before)
+    # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
+    along = (step + size / math.sin(before) * (after - before)) / math.hypot(real, loss)
+    if along <= -1 and loss < _NEXT_TO_NOTHING:
+        return 0.0, after  # in proportion to its effect it would change sign
+    theta = math.atan2(loss, real)
+    theta = 2 * math.atan(math.tan(theta / 2) * math.exp(min(along, _LARGEST_GROWTH)))
+    if theta < after:
+        loss = math.sin(theta) / math.sin(after - theta) * math.sin(after)
+        if loss <= most:
+            return loss, after
+    return most, theta + math.asin(min(math.sin(theta) ** 2 / most, 1.0))
+
+
+def _turn(order: float, elastic: bool) -> float:
+    """Phase of the damping against the stiffness or the inertia, 0 to pi."""
+    turn = math.pi / 2 * float(order)
+    return turn if elastic else math.pi - turn
+
+
+def _order(turn: float, elastic: bool) -> float:
+    return (turn if elastic else math.pi - turn) / (math.pi / 2)

@@ -1,4 +1,4 @@
-"""What the predicted torque depends on: beam, damping and instruments."""
+"""Parameters that the predicted torque depends on: beam, damping, settings and extras."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Plant:
     tip_mass_kg : float
         Point mass at the beam's tip.
     filter_time_constant_s : float
-        Of a low-pass filter of first order in the torque's channel.
+        Time constant of a low-pass filter of first order in the torque's channel.
     second_order_filter_time_constant_s : float
         Reciprocal corner frequency (rad/s) of a Butterworth low-pass filter of second order there.
     clock_rate_difference : float
@@ -91,7 +91,7 @@ class Plant:
     def parameters(self) -> dict[str, float]:
         """Values by name: zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, ….
 
-        Of the `EXTRAS` those that are not neutral.
+        Those of the `EXTRAS` that are not neutral.
         """
         return {
             "zeta": self.damping.zeta,

@@ -1,21 +1,23 @@
-"""Torque predicted from the measured angle, by the beam of Eq. 25, its clamp and the instruments.
+"""Torque predicted from the measured angle: response of beam, clamp and instruments.
 
-Response from measured angle to measured torque: the beam, its clamp and the instruments' delay.
-
-::
+The response from measured angle to measured torque is::
 
     H(s) = (R(s) + J_tool s²) Q(s) exp(-s tau),    R = G' / (1 + kappa G'),    G' = G + sum_i G_i
 
-G is Eq. 25. A real link is not quite uniform, which moves its modes one by one: G_i replaces mode i
-of the sum that G is (`rigd.beam._modes`) by one of another stiffness. With p the inertial and c the
-elastic factor, ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, k⁴ the mode's
-stiffness and d its offset::
+G is Eq. 25 of the paper. A real link is not quite uniform, which moves its modes one by one: G_i
+replaces mode i of the sum that G is (`rigd.beam._modes`) by one of another stiffness. With p the
+inertial and c the elastic factor, ``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``,
+k⁴ the mode's stiffness and d its offset::
 
     G_i = a² EI p² c k⁴ d / ((c k⁴ (1 + d) + p) (c k⁴ + p))
 
 kappa is the clamp's compliance, between tool and beam; with a tip mass G is that of
 `rigd.beam._tip_mass`. Q holds the low-pass filters of the torque's channel,
-``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)``.
+``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the
+delay of the torque's channel relative to the angle's.
+
+The angle is convolved with H causally, over the whole record, on ``s = sigma + j omega``: see
+`Prediction`.
 """
 
 from __future__ import annotations
@@ -36,8 +38,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 
-_FILTERS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")
-_BUTTERWORTH: Final = 2**0.5
+# Response
 
 FIRST_OFFSET: Final = 2
 """Mode whose offset comes first: that of mode 1 is 0, its frequency is what rho/EI says."""
@@ -57,6 +58,10 @@ def eigenvalues(count: int) -> NDArray[np.float64]:
     z = clamped_free_eigenvalues(count)
     z.flags.writeable = False
     return z
+
+
+_FILTERS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")
+_BUTTERWORTH: Final = 2**0.5
 
 
 def torque_channel(
@@ -234,14 +239,15 @@ class ResponseGrid:
         return total
 
 
+# Prediction
+
+CLOCK: Final = "clock_rate_difference"
+
 _PADDED: Final = 1.1
 _DECAY: Final = 6.6
 """sigma times the padded duration. What wraps round shrinks by exp(-6.6), to 1e-3 of what a beam
 still does after a whole record, and is a free decay, of which no fit takes notice; rounding and
 what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
-
-
-CLOCK: Final = "clock_rate_difference"
 
 
 class Prediction:

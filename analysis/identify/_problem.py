@@ -1,16 +1,19 @@
-"""The least-squares problem of a record: what of it can be compared, and the whitened residual.
-
-What of the motor's angle follows its reference, and what the rig's controller made of noise.
+"""Least-squares problem of a record: what of it is compared, and the whitened residual.
 
 The controller feeds the measured torque forward and the measured angle back, so the motor moves
 with the noise of the sensor. A fit of the torque to all of the angle takes part of that noise for
 response: in a closed loop noise and input are correlated, and a fit that leaves out all beyond its
-band is biased by it (U. Forssell and L. Ljung, Automatica 35 (1999) 1215-1241): a chirp's tool
-inertia by 1.4 and its stiffness by 0.24 standard deviations at 1e-2 N·m. The reference was known
-beforehand and owes nothing to the noise, so only what follows it is taken for input. The torque
+band is biased by it [1]_: a chirp's tool inertia by 1.4 and its stiffness by 0.24 standard
+deviations at 1e-2 N·m. The reference was known beforehand and does not depend on the noise, so the
+part of the angle that is coherent with the reference is used as input (`following`). The torque
 that the rest makes is computed with the beam found so far, and taken out. Fitting what remains is
 the instrumental-variable estimate with the reference as instrument, which is unbiased whatever that
 beam was.
+
+References
+----------
+.. [1] U. Forssell and L. Ljung, Closed-loop identification revisited, Automatica 35 (1999)
+   1215-1241.
 """
 
 from __future__ import annotations
@@ -35,10 +38,12 @@ if TYPE_CHECKING:
 
     from analysis.identify._data import Measurement
     from analysis.identify._drag_torque import DragLaw
-    from analysis.identify._free_decay import Pole
     from analysis.identify._hum import Hum
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
+
+
+# Instrument: the part of the angle that is coherent with the reference
 
 _MEMORY_S: Final = 0.4
 """Standard deviation of the window over the lags of the correlations, that is how long the loop may
@@ -50,7 +55,7 @@ _RETURN_S: Final = 4.0
 fell to 0 at once would do so without the lag of the loop."""
 
 _FLOOR: Final = 1e-12
-"""Of the reference's largest power: with less there is none at a frequency."""
+"""Least power of the reference at a frequency, relative to its largest."""
 
 
 def following(
@@ -85,6 +90,8 @@ def following(
     followed: NDArray[np.float64] = np.fft.irfft(response * reference, length)[: angle_rad.size]
     return followed
 
+
+# Comparison of a record with a plant
 
 _FEWEST_BINS: Final = 50
 _LARGEST_REST: Final = 0.3
@@ -237,7 +244,7 @@ class Comparison:
         return followed if apart < _LARGEST_REST * own else self.angle_rad
 
     def following_reference(self, plant: Plant) -> Comparison:
-        """Take for input only what follows the reference, and take out what the rest does.
+        """Use the part of the angle coherent with the reference as input, and take out the rest.
 
         Parameters
         ----------
@@ -405,6 +412,9 @@ class Comparison:
         return np.flatnonzero(ticks) + self.decimation.reach * self.decimation.factor
 
 
+# Whitened residual and its sum of squares
+
+
 @dataclass(frozen=True, slots=True)
 class Linearisation:
     """Residual, prediction minus measurement, and its derivatives at one point.
@@ -437,7 +447,7 @@ class Projected:
         Real and imaginary parts of variance 1 where the noise is as assumed.
     jacobian : ndarray of complex, shape (k, K)
     amplitudes : ndarray, shape (m,)
-        Of the free decays, in N·m, at the first sample compared.
+        Amplitudes of the free decays, in N·m, at the first sample compared.
     amplitude_gram : ndarray, shape (m, m)
         Inverse covariance of the amplitudes.
     """

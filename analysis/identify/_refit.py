@@ -1,9 +1,7 @@
-"""Fitting again from where a fit ended: other structure, other noise, an order held, more columns.
+"""Refit from where a fit ended: another structure, other noise, an order held, or further columns.
 
-Fitting again from where a fit ended: other noise, an order held, or more columns.
-
-What the linear beam cannot do (a stiffness that depends on the deflection) adds to the torque a
-column of known shape and unknown size, which is projected out like the free decay.
+What the linear beam cannot do (a stiffness that depends on the deflection, say) adds to the torque
+a column of known shape and unknown size, which is projected out as the free decay is.
 """
 
 from __future__ import annotations
@@ -33,6 +31,9 @@ if TYPE_CHECKING:
     from analysis.identify._result import ModeEstimate, RecordFit
     from analysis.models import Structure
     from analysis.optimizer import NormalEquations
+
+
+# Start of one structure at the plant that another found
 
 _SMALL: Final = 1e-5
 """Loss, relative to stiffness or inertia, at which a damping is brought in."""
@@ -99,7 +100,7 @@ def adapted(unknowns: Unknowns, plant: Plant, of: Structure) -> NDArray[np.float
     Parameters
     ----------
     unknowns : Unknowns
-        Of the one.
+        Unknowns of the one.
     plant : Plant
     of : Structure
         The other.
@@ -123,7 +124,7 @@ def resonances_kept(
     Parameters
     ----------
     unknowns : Unknowns
-        Of the beam that is not uniform.
+        Unknowns of the beam that is not uniform.
     damped_as : RecordFit
         Its damping is where that of the start comes from.
     modes : sequence of ModeEstimate
@@ -153,54 +154,12 @@ def resonances_kept(
     return x
 
 
+# Refit
+
 _TOLERANCE: Final = 1e-8
-"""Of the sum of squares, which is some 1e4: a ten-thousandth of what BIC tells apart."""
+"""Relative tolerance of the sum of squares (some 1e4): 1e-4 of what BIC tells apart."""
 
 _FILLINGS: Final = 3
-
-
-class WithColumns(Objective):
-    """Sum of squares with further columns, whose amplitudes are free as those of the decay are.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    unknowns : Unknowns
-    columns : ndarray of complex, shape (c, K)
-        Spectra, in N·m a unit of amplitude.
-    """
-
-    __slots__ = ("_further",)
-
-    def __init__(
-        self, comparison: Comparison, unknowns: Unknowns, columns: NDArray[np.complex128]
-    ) -> None:
-        super().__init__(comparison, unknowns)
-        self._further = columns
-
-    def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Residual, derivatives and all columns at `x`."""
-        at = super().linearise(x)
-        return replace(at, columns=np.concatenate([at.columns, self._further]))
-
-
-def unexplained_part(
-    columns: NDArray[np.complex128], known: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Part of whitened columns that nothing that is free already could explain, shape (c, K).
-
-    Parameters
-    ----------
-    columns : ndarray of complex, shape (c, K)
-    known : ndarray of complex, shape (k, K)
-        What the free parameters and amplitudes do to the torque, whitened.
-    """
-    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
-    basis = known[scale > 0] / scale[scale > 0, None]
-    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
-    shares = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
-    part: NDArray[np.complex128] = columns - shares.T @ basis
-    return part
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +206,7 @@ class Refit:
         columns : ndarray of complex, shape (c, K), or None
             Spectra to be projected out beside the free decay.
         max_evaluations : int
-            Of the sum of squares; with 1 nothing moves.
+            Most evaluations of the sum of squares; with 1 nothing moves.
         relative_tolerance : float
             As `descend` takes it.
         hold : str, optional
@@ -348,3 +307,50 @@ class Refit:
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         share = self.objective.comparison.measurement.torque_share
         return replace(self.noise, power=smooth_power(residual) / share)
+
+
+# Columns of known shape and unknown size
+
+
+class WithColumns(Objective):
+    """Sum of squares with further columns, whose amplitudes are free as those of the decay are.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    unknowns : Unknowns
+    columns : ndarray of complex, shape (c, K)
+        Spectra, in N·m a unit of amplitude.
+    """
+
+    __slots__ = ("_further",)
+
+    def __init__(
+        self, comparison: Comparison, unknowns: Unknowns, columns: NDArray[np.complex128]
+    ) -> None:
+        super().__init__(comparison, unknowns)
+        self._further = columns
+
+    def linearise(self, x: NDArray[np.float64]) -> Linearisation:
+        """Residual, derivatives and all columns at `x`."""
+        at = super().linearise(x)
+        return replace(at, columns=np.concatenate([at.columns, self._further]))
+
+
+def unexplained_part(
+    columns: NDArray[np.complex128], known: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Part of whitened columns that nothing that is free already could explain, shape (c, K).
+
+    Parameters
+    ----------
+    columns : ndarray of complex, shape (c, K)
+    known : ndarray of complex, shape (k, K)
+        What the free parameters and amplitudes do to the torque, whitened.
+    """
+    scale = np.sqrt(np.sum(np.abs(known) ** 2, axis=1))
+    basis = known[scale > 0] / scale[scale > 0, None]
+    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
+    shares = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
+    part: NDArray[np.complex128] = columns - shares.T @ basis
+    return part

@@ -1,10 +1,18 @@
-"""Is what remains only noise? Tests of the residual: periodogram, loudness, harmonics, its input.
+"""Residual tests: whiteness, coherence with the input, harmonics of the sweep.
 
-Residual at multiples of the frequency that the sweep has at that moment.
+Chance is ruled out at one level throughout (`SURE`). The cumulative periodogram of a white residual
+is a straight line but for a Kolmogorov statistic (Bartlett's test). A residual that is coherent
+with the angle is linear dynamics that the model lacks.
 
 A linear beam answers at the frequency it is driven at, and rings at frequencies that the sweep has
 passed. Twice or three times the drive's frequency is another matter: something is not linear. No
 model of it is needed.
+
+References
+----------
+M. S. Bartlett, An Introduction to Stochastic Processes (1955): the cumulative periodogram.
+E. B. Wilson and M. M. Hilferty, The distribution of chi-square, Proc. Natl. Acad. Sci. 17 (1931)
+684-688: `of_chi_square`.
 """
 
 from __future__ import annotations
@@ -15,21 +23,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.statistics import chi_square_deviate, kolmogorov_p_value
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+
+# Chance
+
 SURE: Final = 5.0
 """Standard deviations from which chance is ruled out: 3 in 10 million, whatever was looked at."""
-
-
-def of_chi_square(value: float, degrees_of_freedom: float) -> float:
-    """Turn a chi-square into a normal deviate, by the cube root of Wilson and Hilferty.
-
-    PNAS 17 (1931) 684-688.
-    """
-    spread = 2 / (9 * degrees_of_freedom)
-    cube_root = (max(value, 0.0) / degrees_of_freedom) ** (1 / 3)
-    return float((cube_root - 1 + spread) / math.sqrt(spread))
 
 
 def largest_of(count: int) -> float:
@@ -37,19 +40,13 @@ def largest_of(count: int) -> float:
     return SURE**2 / 2 + math.log(max(count, 1))
 
 
-def kolmogorov(statistic: float) -> float:
-    """Probability that the Kolmogorov statistic, times the root of the count, exceeds a value."""
-    if statistic < 0.3:
-        return 1.0
-    total: float = sum((-1) ** (k - 1) * math.exp(-2 * (k * statistic) ** 2) for k in range(1, 20))
-    return min(max(2 * total, 0.0), 1.0)
-
+# Whiteness, and coherence with the input
 
 BAND_95: Final = 1.3581
 """95 % point of the Kolmogorov statistic times the root of the number of bins."""
 
 _LEVEL: Final = 1e-6
-"""Of probability: what `SURE` means for the other tests."""
+"""Probability of chance: what `SURE` means for the other tests."""
 
 _WINDOWS: Final = (8, 32)
 _LOUD: Final = 1.4
@@ -79,7 +76,7 @@ class Whiteness:
     band : float
         Within which it stays in 95 % of the records that hold nothing but noise.
     probability : float
-        Of such a distance by chance.
+        Probability of such a distance by chance.
     loudest_hz : tuple of float
         Edges of the window that is loudest for its width.
     loudest_ratio : float
@@ -115,7 +112,7 @@ class InputRelation:
     local : bool
         Whether chance is ruled out there.
     deviate : float
-        Of the coherence over the whole band, in standard deviations beyond chance.
+        Deviate of the coherence over the whole band, in standard deviations beyond chance.
     correlation : float
         Largest correlation of residual and angle, both whitened, in standard deviations.
     lag_s : float
@@ -160,7 +157,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
             continue
         total = sums[width:] - sums[:-width]
         i = int(np.argmax(total))
-        deviate = of_chi_square(float(total[i]), 2 * width)
+        deviate = chi_square_deviate(float(total[i]), 2 * width)
         if deviate > loudest:
             loudest = deviate
             edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
@@ -169,7 +166,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
     return Whiteness(
         distance=distance,
         band=BAND_95 / math.sqrt(count),
-        probability=kolmogorov(distance * math.sqrt(count)),
+        probability=kolmogorov_p_value(distance * math.sqrt(count)),
         loudest_hz=edges,
         loudest_ratio=ratio,
         loud=loud,
@@ -214,7 +211,7 @@ def input_relation(
     surprise = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
     worst = int(np.argmax(surprise))
     local = bool(surprise[worst] > largest_of(used.size))
-    deviate = of_chi_square(2 * float(surprise.sum()), 2 * used.size)
+    deviate = chi_square_deviate(2 * float(surprise.sum()), 2 * used.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
     length = 4 * residual.size
@@ -236,6 +233,16 @@ def input_relation(
     )
 
 
+def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
+    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
+    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
+    spectrum[bins] = residual
+    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
+    return values
+
+
+# Harmonics of the sweep
+
 MULTIPLES: Final = (2, 3)
 _BLOCK_S: Final = 1.0
 _LOWEST_HZ: Final = 2.0
@@ -254,7 +261,7 @@ class Harmonic:
     multiple : int
         2 or 3.
     deviate : float
-        Of its power along the whole sweep, in standard deviations beyond chance.
+        Deviate of its power along the whole sweep, in standard deviations beyond chance.
     drive_hz : float
         Frequency of the drive at which it is largest.
     present : bool
@@ -305,7 +312,7 @@ def harmonics(
             continue
         turned = np.sum(parts[inside] * np.exp(-1j * multiple * phase[inside]), axis=1)
         chi_square = 2 * np.abs(turned) ** 2 / np.sum(window**2)
-        deviate = of_chi_square(float(chi_square.sum()), 2 * chi_square.size)
+        deviate = chi_square_deviate(float(chi_square.sum()), 2 * chi_square.size)
         largest = int(np.argmax(chi_square))
         found.append(
             Harmonic(
@@ -318,14 +325,6 @@ def harmonics(
             )
         )
     return tuple(found)
-
-
-def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
-    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
-    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
-    spectrum[bins] = residual
-    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
-    return values
 
 
 def _analytic(values: NDArray[np.float64]) -> NDArray[np.complex128]:

@@ -1,11 +1,13 @@
-"""What a whole-record fit finds, and how sure it is of it."""
+"""Result of a fit of the whole record: parameters, their uncertainty, modes and residual."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
+
+from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.models import Structure
+
+_RARE: Final = 1e-4
+"""p-value below which a beam is said to have rung when the record began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +48,7 @@ class ModeEstimate:
 
     number: int
     frequency_hz: float
-    """Of the free decay, 0 if over-damped."""
+    """Frequency of the free decay, 0 if over-damped."""
     frequency_std_hz: float
     damping_ratio: float
     damping_ratio_std: float
@@ -58,7 +63,7 @@ class Ringing:
     amplitude_nm : tuple of float
         By mode, at the first sample compared.
     chi_square : float
-        Of all its amplitudes together, beside the hum if there is some.
+        Chi-square of all its amplitudes together, beside the hum if there is some.
     degrees_of_freedom : int
     """
 
@@ -68,15 +73,9 @@ class Ringing:
 
     @property
     def significant(self) -> bool:
-        """Whether chance would give as much in fewer than one record of ten thousand.
-
-        By the cube-root approximation of Wilson and Hilferty (PNAS 17 (1931) 684-688).
-        """
-        if not self.degrees_of_freedom:
-            return False
-        spread = 2 / (9 * self.degrees_of_freedom)
-        z = ((self.chi_square / self.degrees_of_freedom) ** (1 / 3) - 1 + spread) / spread**0.5
-        return bool(z > 3.72)
+        """Whether chance would give as much in fewer than one record of ten thousand."""
+        freedom = self.degrees_of_freedom
+        return bool(freedom and chi_square_p_value(self.chi_square, freedom) < _RARE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +102,8 @@ class RecordFit:
     determined : tuple of str
         Free parameters in the order of `covariance`.
     covariance : ndarray, shape (k, k)
-        Of the determined parameters, zeta, gamma, density over stiffness and stiffness counted as
-        logarithms.
+        Covariance of the determined parameters; zeta, gamma, density over stiffness and stiffness
+        counted as logarithms.
     at_bounds : tuple of str
         Free parameters that rest on the edge of their range.
     internal, external : DampingSize or None

@@ -1,4 +1,4 @@
-"""What a rig has beside a uniform beam, a rigid clamp and ideal channels, in words."""
+"""Findings on the rig beside a uniform beam, a rigid clamp and ideal channels, in words."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING, Final
 from analysis.identify._candidate import Candidate
 from analysis.identify._finding import Finding
 from analysis.identify._verdict import STRONG
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import Field
-
-
-_NORMAL_95: Final = 1.959963984540054
 
 
 _MODES_FREE: Final = "modes free"
@@ -108,7 +105,7 @@ def _not_uniform(candidate: Candidate) -> Finding:
     fit = candidate.fit
     offsets = [
         f"mode {name.rsplit('_', 1)[1]} {100 * fit.parameters[name]:+.2f} %"
-        f" (± {100 * _NORMAL_95 * (fit.std[name] or 0.0):.1g} %)"
+        f" (± {100 * NORMAL_95 * (fit.std[name] or 0.0):.1g} %)"
         for name in fit.interval
         if name.startswith("stiffness_offset")
     ]

@@ -1,6 +1,4 @@
-"""Rigs with one thing more than a uniform beam: elastic clamp, tip mass, filter or clock.
-
-Candidates on a uniform beam with one thing more: elastic clamp, tip mass, filter or clock.
+"""Rival explanations on a uniform beam: elastic clamp, tip mass, torque filter, clock difference.
 
 Each shifts modes a little, as freeing the modes' stiffness does with more parameters, or a
 fractional order. It is fitted only where a Gauss-Newton step from the beam without it promises
@@ -24,7 +22,6 @@ from analysis.models import STRUCTURES
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import Field
     from analysis.identify._refit import Refit
 

@@ -1,10 +1,8 @@
-"""The way to the lowest minimum of one structure: rough response first, then the whole record.
+"""Search for the lowest minimum of one structure: coarse response first, then the whole record.
 
-Where the descents on the whole record start: fits of a coarse frequency response.
-
-The ratio of the whole record's two transforms is exact but for what rings before and after it. A
-few hundred of its points, densest at the resonances, tell the minima apart in a hundredth of the
-time.
+The ratio of the whole record's two transforms (the empirical transfer function estimate) is exact
+but for what rings before and after it. A few hundred of its points, densest at the resonances, tell
+the minima apart in a hundredth of the time; the descents on the whole record start at its minima.
 """
 
 from __future__ import annotations
@@ -30,11 +28,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._hum import Hum
-    from analysis.identify._noise import Noise
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.optimizer import Minimum
+
+
+# Resonances
 
 _SCANS: Final = {"density_over_stiffness": np.linspace(-0.3, 0.3, 61)}
 _OFFSET_SCAN: Final = np.linspace(-0.1, 0.1, 41)
@@ -51,7 +51,7 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
     Parameters
     ----------
     cost : callable
-        Of a plant, on few points of a frequency response.
+        Cost of a plant, on few points of a frequency response.
     unknowns : Unknowns
     """
     moderate = unknowns.start(np.array([_MODERATE[name] for name in unknowns.structure.free]))
@@ -66,6 +66,8 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
             shift[place] = steps[int(np.argmin(costs))]
     return shift
 
+
+# Coarse response
 
 _POINTS: Final = 400
 _TOLERANCE: Final = 1e-2
@@ -187,6 +189,8 @@ def rough_minima(
     return kept
 
 
+# Descents on the whole record
+
 _BETWEEN_RIVALS: Final = 1e-2
 """Relative tolerance that tells which of several minima is lower."""
 
@@ -297,7 +301,7 @@ class Search:
     first : ndarray, shape (k,)
         Where the orders are 1.
     minima : list of Minimum
-        Of the rough response, noise taken for white; the lowest first.
+        Minima of the coarse response, noise taken as white; the lowest first.
     """
 
     objective: Objective

@@ -1,23 +1,21 @@
-"""Changes along the record, and the motor's play.
-
-How a mode remembers the damping that it had: a correction to what is read off at each moment.
-
-A damping that changes as ``1 + e w(t)`` puts, to first order in e, another force on mode i. With
-``p = rho/EI s² + gamma s^lambda``, ``c = 1 + zeta s^alpha``, ``S = c k⁴ / (c k⁴ + p)`` and
-``R = p / (c k⁴ + p)``, the torque gains e times::
-
-    a² EI (S w gamma s^lambda S + k⁴ R w zeta s^alpha R) angle
-
-where w multiplies in time what stands to its right. To read the derivative of the response off at
-each moment is to put w in front of all; a mode that rings for seconds does not follow so soon.
-
-Changes along the record, and the motor's play.
+"""Changes along the record (damping, stiffness, gain), and the motor's play.
 
 Columns of known shape and unknown size, as `analysis.identify._refit` takes them: what the torque
 would gain if damping, stiffness or gain rose in proportion to the time, and what a hub does that
 follows the shaft only once a gap is closed. In one sweep time and frequency go together, so a
 damping that drifts competes with an order of the damping, and a gain that drifts with a filter. A
 delay that rises so is what clocks of different rates make: see `analysis.identify._rivals`.
+
+A mode remembers the damping that it had. A damping that changes as ``1 + e w(t)`` puts, to first
+order in e, another force on mode i. With ``p = rho/EI s² + gamma s^lambda``,
+``c = 1 + zeta s^alpha``, ``S = c k⁴ / (c k⁴ + p)`` and ``R = p / (c k⁴ + p)``, the torque gains e
+times::
+
+    a² EI (S w gamma s^lambda S + k⁴ R w zeta s^alpha R) angle
+
+where w multiplies in time what stands to its right. To read the derivative of the response off at
+each moment is to put w in front of all; a mode that rings for seconds does not follow so soon, and
+`late_damping` is the correction.
 """
 
 from __future__ import annotations
@@ -35,6 +33,7 @@ from analysis.identify._refit import Refit, unexplained_part
 from analysis.identify._residual_tests import SURE
 from analysis.identify._verdict import STRONG
 from analysis.models import STRUCTURES
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,57 +46,8 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
 
-_PADDED: Final = 1.5
-_DECAY: Final = 9.0
-"""As in `analysis.identify._nonlinear`: on s = sigma + j omega what wraps round has decayed."""
 
-
-def late_damping(
-    comparison: Comparison, plant: Plant, change: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Torque by damping that changes, less what is read off at each moment, shape (samples,).
-
-    Parameters
-    ----------
-    comparison : Comparison
-    plant : Plant
-    change : ndarray, shape (samples,)
-        w at the samples kept; before and after as at its ends.
-    """
-    n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-    length = fast_length(int(np.ceil(_PADDED * n)))
-    sigma = _DECAY * rate_hz / length
-    s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
-    growth = np.exp(sigma * np.arange(n) / rate_hz)
-    kept = comparison.kept
-    w = np.interp(np.arange(n), np.arange(kept.start, kept.stop), change)
-    damping, beam = plant.damping, plant.beam
-    internal = damping.zeta * s**damping.alpha
-    external = damping.gamma * s**damping.lambda_
-    inertial = beam.density_over_stiffness * s * s + external
-    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
-    total = np.zeros(n)
-
-    def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
-        return values
-
-    uniform = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
-    offsets = np.zeros(uniform.size)
-    offsets[1 : 1 + len(plant.stiffness_offsets)] = plant.stiffness_offsets
-    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * uniform)
-    for share, k in zip(shares.tolist(), (uniform * (1 + offsets)).tolist(), strict=True):
-        resists = (1 + internal) * k + inertial
-        ways = (
-            ((1 + internal) * k / resists, external),
-            (inertial / resists, k * internal),
-        )
-        for through, damper in ways:
-            moved = damper * through * angle
-            later = through * np.fft.rfft(w * in_time(moved) / growth, length)
-            total += share * (in_time(later) - w * in_time(through * moved))
-    return total[kept]
-
+# Search for changes
 
 What = Literal["damping", "stiffness", "gain", "play"]
 
@@ -110,7 +60,6 @@ _UNIT_PLAY_RAD: Final = 1e-4
 _ROUNDS: Final = 4
 _SETTLED: Final = 0.01
 _MANY: Final = 40
-_NORMAL_95: Final = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,6 +249,76 @@ def _lag_of_play(comparison: Comparison) -> NDArray[np.float64]:
     return lag
 
 
+# Damping that a mode remembers
+
+_PADDED: Final = 1.5
+_DECAY: Final = 9.0
+"""As in `analysis.identify._nonlinear`: on s = sigma + j omega what wraps round has decayed."""
+
+
+def late_damping(
+    comparison: Comparison, plant: Plant, change: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Torque by damping that changes, less what is read off at each moment, shape (samples,).
+
+    Parameters
+    ----------
+    comparison : Comparison
+    plant : Plant
+    change : ndarray, shape (samples,)
+        w at the samples kept; before and after as at its ends.
+    """
+    n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
+    length = fast_length(int(np.ceil(_PADDED * n)))
+    sigma = _DECAY * rate_hz / length
+    s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
+    growth = np.exp(sigma * np.arange(n) / rate_hz)
+    kept = comparison.kept
+    w = np.interp(np.arange(n), np.arange(kept.start, kept.stop), change)
+    damping, beam = plant.damping, plant.beam
+    internal = damping.zeta * s**damping.alpha
+    external = damping.gamma * s**damping.lambda_
+    inertial = beam.density_over_stiffness * s * s + external
+    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
+    total = np.zeros(n)
+
+    def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+        values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
+        return values
+
+    uniform = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
+    offsets = np.zeros(uniform.size)
+    offsets[1 : 1 + len(plant.stiffness_offsets)] = plant.stiffness_offsets
+    shares = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * uniform)
+    for share, k in zip(shares.tolist(), (uniform * (1 + offsets)).tolist(), strict=True):
+        resists = (1 + internal) * k + inertial
+        ways = (
+            ((1 + internal) * k / resists, external),
+            (inertial / resists, k * internal),
+        )
+        for through, damper in ways:
+            moved = damper * through * angle
+            later = through * np.fft.rfft(w * in_time(moved) / growth, length)
+            total += share * (in_time(later) - w * in_time(through * moved))
+    return total[kept]
+
+
+# Words
+
+_NAMES: Final[dict[What, str]] = {
+    "damping": "Damping that changes along the record",
+    "stiffness": "Stiffness that changes along the record",
+    "gain": "A torque gain that changes along the record",
+    "play": "Play between encoder and beam",
+}
+_KINDS: Final[dict[What, Kind]] = {
+    "damping": "drifting damping",
+    "stiffness": "drifting stiffness",
+    "gain": "drifting gain",
+    "play": "play",
+}
+
+
 def changing(changes: tuple[Change, ...]) -> Iterator[Finding]:
     """Put in words what changes along the record."""
     alone = len(changes) == 1
@@ -320,20 +339,6 @@ def changing(changes: tuple[Change, ...]) -> Iterator[Finding]:
             )
 
 
-_NAMES: Final[dict[What, str]] = {
-    "damping": "Damping that changes along the record",
-    "stiffness": "Stiffness that changes along the record",
-    "gain": "A torque gain that changes along the record",
-    "play": "Play between encoder and beam",
-}
-_KINDS: Final[dict[What, Kind]] = {
-    "damping": "drifting damping",
-    "stiffness": "drifting stiffness",
-    "gain": "drifting gain",
-    "play": "play",
-}
-
-
 def _size(change: Change) -> str:
     if change.what == "play":
         return f"{1e3 * change.size:.2g} mrad"
@@ -341,7 +346,7 @@ def _size(change: Change) -> str:
 
 
 def _finding(change: Change) -> Finding:
-    half = _NORMAL_95 * change.std
+    half = NORMAL_95 * change.std
     of_play = change.what == "play"
     scale = 1e3 if of_play else 100.0
     return Finding(

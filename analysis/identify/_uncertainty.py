@@ -1,4 +1,9 @@
-"""Covariance of what was estimated, and of what follows from it."""
+"""Uncertainty of what was estimated, and of what follows from it (delta method).
+
+The covariance of the unknowns is that of a weighted least-squares estimate under the noise spectrum
+found, from the curvature of the sum of squares; parameters, modes, loss factors and the free decay
+take theirs from it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,7 @@ import numpy as np
 
 from analysis.identify._plant import LOGARITHMIC
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,11 +25,16 @@ if TYPE_CHECKING:
     from analysis.identify._free_decay import Pole
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._problem import Projected
-    from analysis.identify._result import DampingSize
 
-_NORMAL_95: Final = 1.959963984540054
 _WORST_CONDITION: Final = 1e13
+
+_UNDETERMINED: Final = 20.0
+"""Standard deviation of a logarithm that says nothing: a factor of 1e9 either way."""
+
 _LARGEST_LN_OMEGA: Final = 50.0
+
+
+# Unknowns and parameters
 
 
 def covariance_of_unknowns(
@@ -34,7 +45,7 @@ def covariance_of_unknowns(
     Parameters
     ----------
     jacobian : ndarray of complex, shape (k, K)
-        Of the whitened residual.
+        Derivatives of the whitened residual.
     scatter : float
         Variance of the whitened residual's parts.
     held : ndarray of bool, shape (k,)
@@ -59,181 +70,6 @@ def covariance_of_unknowns(
         return covariance, np.zeros_like(determined)
     covariance[block] = scatter * np.linalg.inv(scaled) / unit
     return covariance, determined
-
-
-def interval(name: str, value: float, std: float) -> tuple[float, float]:
-    """95 % confidence interval; `std` is of the logarithm where that is what was estimated."""
-    half = _NORMAL_95 * std
-    if name in LOGARITHMIC:
-        return value * math.exp(-half), value * math.exp(half)
-    return value - half, value + half
-
-
-def interval_from_zero(value: float, std: float) -> tuple[float, float]:
-    """95 % confidence interval of what cannot be negative: of the symmetric one, what is possible.
-
-    It begins at 0, one-sided, for an estimate within 1.96 standard deviations of it, also for one
-    that rests there. It covers a true value of 0 in 97.5 % of all records, others in 95 to 97.5 %.
-
-    Parameters
-    ----------
-    value : float
-        The estimate, 0 or more.
-    std : float
-        Standard deviation that it would have if it could be negative.
-    """
-    half = _NORMAL_95 * std
-    return max(value - half, 0.0), value + half
-
-
-def damping_size(
-    coefficient: str,
-    order: str,
-    values: dict[str, float],
-    names: Sequence[str],
-    covariance: NDArray[np.float64],
-    least_omega_rad_s: float,
-) -> DampingSize | None:
-    """Loss factor that a damping causes, at the frequency where it depends least on its order.
-
-    A record shows the loss. ``zeta omega^alpha`` alone is its size only to the first degree in the
-    order: where that is uncertain by 0.15, it is off by 4 % more than the loss is.
-
-    Parameters
-    ----------
-    coefficient, order : str
-        "zeta" and "alpha", or "gamma" and "lambda".
-    values : dict
-    names : sequence of str
-        Determined parameters.
-    covariance : ndarray, shape (k, k)
-        Theirs, coefficients as logarithms.
-    least_omega_rad_s : float
-        That of the first mode: below it nothing rings, and what is lost there is of no use.
-    """
-    if coefficient not in names:
-        return None
-    i = list(names).index(coefficient)
-    if order not in names:
-        return DampingSize(None, values[coefficient], values[coefficient] * covariance[i, i] ** 0.5)
-    j = list(names).index(order)
-    angle = math.pi / 2 * values[order]
-    slope = np.zeros(len(names))
-    slope[i] = 1.0
-    # External damping is lost against the inertia rho/EI omega².
-    ratio, power = "density_over_stiffness", 2 if coefficient == "gamma" else 0
-    if power and ratio in names:
-        slope[list(names).index(ratio)] = -1.0
-    # ln loss has no covariance with the order where its slope by the order is:
-    uncorrelated = -float(slope @ covariance[:, j]) / covariance[j, j]
-    turning = math.pi / 2 / math.tan(angle)
-    ln_omega = max(uncorrelated - turning, math.log(least_omega_rad_s))
-    if abs(ln_omega) > _LARGEST_LN_OMEGA:
-        return None  # an order all but unknown is uncorrelated nowhere
-    slope[j] = ln_omega + turning
-    scale = values[ratio] if power else 1.0
-    size = values[coefficient] / scale * math.sin(angle)
-    size *= math.exp((values[order] - power) * ln_omega)
-    variance = max(float(slope @ covariance @ slope), 0.0)
-    return DampingSize(math.exp(ln_omega), size, size * math.sqrt(variance))
-
-
-def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[ModeEstimate, ...]:
-    """Frequencies and damping ratios with standard deviations, by the delta method.
-
-    Parameters
-    ----------
-    poles : sequence of Pole
-        Differentiated by the unknowns; of over-damped modes both.
-    covariance : ndarray, shape (k, k)
-        Of the unknowns.
-    """
-    table = []
-    for number in dict.fromkeys(pole.mode for pole in poles):
-        first, *rest = (pole for pole in poles if pole.mode == number)
-        p, dp = first.at_rad_s, first.derivative
-        q, dq = (rest[0].at_rad_s, rest[0].derivative) if rest else (p.conjugate(), dp.conj())
-        natural = math.sqrt((p * q).real)
-        ratio = -(p + q).real / (2 * natural)
-        natural_slope = (q * dp + p * dq).real / (2 * natural)
-        ratio_slope = -(dp + dq).real / (2 * natural) - ratio * natural_slope / natural
-        frequency_slope = np.zeros(dp.size) if rest else dp.imag / (2 * np.pi)
-        table.append(
-            ModeEstimate(
-                number=number,
-                frequency_hz=abs(p.imag) / (2 * np.pi),
-                frequency_std_hz=_std(frequency_slope, covariance),
-                damping_ratio=ratio,
-                damping_ratio_std=_std(ratio_slope, covariance),
-            )
-        )
-    return tuple(table)
-
-
-def ringing(
-    poles: Sequence[Pole],
-    projected: Projected,
-    scatter: float,
-    columns: NDArray[np.complex128],
-    hum: NDArray[np.complex128],
-) -> Ringing:
-    """Amplitudes of the free decay by mode, and how far beyond chance they are.
-
-    A hum is left out bin by bin, but starts and ends with the record and so leaks into all other
-    bins, which free decay would explain in part: what counts is what it explains beside the hum.
-
-    Parameters
-    ----------
-    poles : sequence of Pole
-    projected : Projected
-    scatter : float
-        Variance of the whitened residual's parts.
-    columns : ndarray of complex, shape (m, K)
-        Whitened spectra of the free decays, and of what was projected out beside them.
-    hum : ndarray of complex, shape (h, K)
-        Those of the lines.
-    """
-    count = sum(1 + pole.oscillates for pole in poles)
-    columns, decays = columns[:count], projected.amplitudes[:count]
-    explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
-    if len(hum) and decays.size:
-        without = projected.residual - decays @ columns
-        beside, left = _combination(without, np.concatenate([columns, hum]))
-        explained = _combination(without, hum)[1] - left
-        decays = beside[: decays.size]
-    amplitudes: dict[int, float] = {}
-    place = 0
-    for pole in poles:
-        width = 2 if pole.oscillates else 1
-        size = float(np.linalg.norm(decays[place : place + width]))
-        amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), size)
-        place += width
-    return Ringing(
-        amplitude_nm=tuple(amplitudes.values()),
-        chi_square=explained / scatter,
-        degrees_of_freedom=decays.size,
-    )
-
-
-def _combination(
-    values: NDArray[np.complex128], columns: NDArray[np.complex128]
-) -> tuple[NDArray[np.float64], float]:
-    """Best real combination of columns, shape (m,), and the sum of squares that it leaves."""
-    parts = np.ascontiguousarray(columns).view(np.float64)
-    size = np.sqrt(np.einsum("ij,ij->i", parts, parts))
-    size[size == 0] = 1.0
-    scaled, right = (parts / size[:, None]).T, values.view(np.float64)
-    factors = np.linalg.lstsq(scaled, right)[0]
-    rest = right - scaled @ factors
-    return factors / size, float(rest @ rest)
-
-
-def _std(slope: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    return math.sqrt(max(float(slope @ covariance @ slope), 0.0))
-
-
-_UNDETERMINED: Final = 20.0
-"""Standard deviation of a logarithm that says nothing: a factor of 1e9 either way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,3 +128,186 @@ def parameter_uncertainty(
         internal=damping_size("zeta", "alpha", values, determined, covariance, first),
         external=damping_size("gamma", "lambda", values, determined, covariance, first),
     )
+
+
+# Intervals
+
+
+def interval(name: str, value: float, std: float) -> tuple[float, float]:
+    """95 % confidence interval; `std` is of the logarithm where that is what was estimated."""
+    half = NORMAL_95 * std
+    if name in LOGARITHMIC:
+        return value * math.exp(-half), value * math.exp(half)
+    return value - half, value + half
+
+
+def interval_from_zero(value: float, std: float) -> tuple[float, float]:
+    """95 % confidence interval of what cannot be negative: of the symmetric one, what is possible.
+
+    It begins at 0, one-sided, for an estimate within 1.96 standard deviations of it, also for one
+    that rests there. It covers a true value of 0 in 97.5 % of all records, others in 95 to 97.5 %.
+
+    Parameters
+    ----------
+    value : float
+        The estimate, 0 or more.
+    std : float
+        Standard deviation that it would have if it could be negative.
+    """
+    half = NORMAL_95 * std
+    return max(value - half, 0.0), value + half
+
+
+# Damping at its pivot frequency
+
+
+def damping_size(
+    coefficient: str,
+    order: str,
+    values: dict[str, float],
+    names: Sequence[str],
+    covariance: NDArray[np.float64],
+    least_omega_rad_s: float,
+) -> DampingSize | None:
+    """Loss factor that a damping causes, at the frequency where it depends least on its order.
+
+    A record shows the loss. ``zeta omega^alpha`` alone is its size only to the first degree in the
+    order: where that is uncertain by 0.15, it is off by 4 % more than the loss is.
+
+    Parameters
+    ----------
+    coefficient, order : str
+        "zeta" and "alpha", or "gamma" and "lambda".
+    values : dict
+    names : sequence of str
+        Determined parameters.
+    covariance : ndarray, shape (k, k)
+        Theirs, coefficients as logarithms.
+    least_omega_rad_s : float
+        That of the first mode: below it nothing rings, and what is lost there is of no use.
+    """
+    if coefficient not in names:
+        return None
+    i = list(names).index(coefficient)
+    if order not in names:
+        return DampingSize(None, values[coefficient], values[coefficient] * covariance[i, i] ** 0.5)
+    j = list(names).index(order)
+    angle = math.pi / 2 * values[order]
+    slope = np.zeros(len(names))
+    slope[i] = 1.0
+    # External damping is lost against the inertia rho/EI omega².
+    ratio, power = "density_over_stiffness", 2 if coefficient == "gamma" else 0
+    if power and ratio in names:
+        slope[list(names).index(ratio)] = -1.0
+    # ln loss has no covariance with the order where its slope by the order is:
+    uncorrelated = -float(slope @ covariance[:, j]) / covariance[j, j]
+    turning = math.pi / 2 / math.tan(angle)
+    ln_omega = max(uncorrelated - turning, math.log(least_omega_rad_s))
+    if abs(ln_omega) > _LARGEST_LN_OMEGA:
+        return None  # an order all but unknown is uncorrelated nowhere
+    slope[j] = ln_omega + turning
+    scale = values[ratio] if power else 1.0
+    size = values[coefficient] / scale * math.sin(angle)
+    size *= math.exp((values[order] - power) * ln_omega)
+    variance = max(float(slope @ covariance @ slope), 0.0)
+    return DampingSize(math.exp(ln_omega), size, size * math.sqrt(variance))
+
+
+# Modes
+
+
+def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[ModeEstimate, ...]:
+    """Frequencies and damping ratios with standard deviations, by the delta method.
+
+    Parameters
+    ----------
+    poles : sequence of Pole
+        Differentiated by the unknowns; of over-damped modes both.
+    covariance : ndarray, shape (k, k)
+        Covariance of the unknowns.
+    """
+    table = []
+    for number in dict.fromkeys(pole.mode for pole in poles):
+        first, *rest = (pole for pole in poles if pole.mode == number)
+        p, dp = first.at_rad_s, first.derivative
+        q, dq = (rest[0].at_rad_s, rest[0].derivative) if rest else (p.conjugate(), dp.conj())
+        natural = math.sqrt((p * q).real)
+        ratio = -(p + q).real / (2 * natural)
+        natural_slope = (q * dp + p * dq).real / (2 * natural)
+        ratio_slope = -(dp + dq).real / (2 * natural) - ratio * natural_slope / natural
+        frequency_slope = np.zeros(dp.size) if rest else dp.imag / (2 * np.pi)
+        table.append(
+            ModeEstimate(
+                number=number,
+                frequency_hz=abs(p.imag) / (2 * np.pi),
+                frequency_std_hz=_std(frequency_slope, covariance),
+                damping_ratio=ratio,
+                damping_ratio_std=_std(ratio_slope, covariance),
+            )
+        )
+    return tuple(table)
+
+
+def _std(slope: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    return math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+
+
+# Free decay at the start
+
+
+def ringing(
+    poles: Sequence[Pole],
+    projected: Projected,
+    scatter: float,
+    columns: NDArray[np.complex128],
+    hum: NDArray[np.complex128],
+) -> Ringing:
+    """Amplitudes of the free decay by mode, and how far beyond chance they are.
+
+    A hum is left out bin by bin, but starts and ends with the record and so leaks into all other
+    bins, which free decay would explain in part: what counts is what it explains beside the hum.
+
+    Parameters
+    ----------
+    poles : sequence of Pole
+    projected : Projected
+    scatter : float
+        Variance of the whitened residual's parts.
+    columns : ndarray of complex, shape (m, K)
+        Whitened spectra of the free decays, and of what was projected out beside them.
+    hum : ndarray of complex, shape (h, K)
+        Those of the lines.
+    """
+    count = sum(1 + pole.oscillates for pole in poles)
+    columns, decays = columns[:count], projected.amplitudes[:count]
+    explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
+    if len(hum) and decays.size:
+        without = projected.residual - decays @ columns
+        beside, left = _combination(without, np.concatenate([columns, hum]))
+        explained = _combination(without, hum)[1] - left
+        decays = beside[: decays.size]
+    amplitudes: dict[int, float] = {}
+    place = 0
+    for pole in poles:
+        width = 2 if pole.oscillates else 1
+        size = float(np.linalg.norm(decays[place : place + width]))
+        amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), size)
+        place += width
+    return Ringing(
+        amplitude_nm=tuple(amplitudes.values()),
+        chi_square=explained / scatter,
+        degrees_of_freedom=decays.size,
+    )
+
+
+def _combination(
+    values: NDArray[np.complex128], columns: NDArray[np.complex128]
+) -> tuple[NDArray[np.float64], float]:
+    """Best real combination of columns, shape (m,), and the sum of squares that it leaves."""
+    parts = np.ascontiguousarray(columns).view(np.float64)
+    size = np.sqrt(np.einsum("ij,ij->i", parts, parts))
+    size[size == 0] = 1.0
+    scaled, right = (parts / size[:, None]).T, values.view(np.float64)
+    factors = np.linalg.lstsq(scaled, right)[0]
+    rest = right - scaled @ factors
+    return factors / size, float(rest @ rest)

@@ -37,6 +37,9 @@ BESIDE_DRAG: Final = (
 """Why external damping beside drag must not be taken for a property of the beam: of two records
 of one rig, one had lambda four standard deviations off, with a drag that fell with the speed."""
 
+
+# One order of the damping
+
 _MODES_FOR_AN_ORDER: Final = 2
 
 
@@ -78,7 +81,7 @@ def order_verdict(
     ----------
     field : Field
     profile : Profile
-        Of the order, in the freest structure on the beam selected.
+        Profile of the order, in the freest structure on the beam selected.
     visible : tuple of int
         Modes that the record shows.
     doubt : str or None
@@ -94,31 +97,6 @@ def order_verdict(
         reason=reason,
         profile=profile,
     )
-
-
-def _judged(
-    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
-) -> tuple[Status, str | None]:
-    freest, order = field.freest, profile.order
-    untold = untold_reason(field, visible)
-    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
-        return "absent", "no such damping shows"
-    if untold is not None:
-        return "not identifiable", untold
-    if not profile.identifiable:
-        return "not identifiable", "the record does not tell the order"
-    if doubt is not None:
-        return "open", doubt
-    if order == "lambda" and field.drag is not None:
-        return "open", BESIDE_DRAG
-    for rival in field.of_other_kinds(STRONG):
-        if _integer(rival, order):
-            return "open", "order 1 on another kind of rig explains the record about as well"
-        if _elsewhere(rival, profile):
-            return "open", "another order on another kind of rig explains the record about as well"
-    if profile.admits_one:
-        return "compatible", None
-    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
 
 
 def untold_reason(field: Field, visible: tuple[int, ...]) -> str | None:
@@ -151,6 +129,31 @@ def deviance_of_one(profile: Profile) -> float:
     return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
 
 
+def _judged(
+    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+) -> tuple[Status, str | None]:
+    freest, order = field.freest, profile.order
+    untold = untold_reason(field, visible)
+    if not freest.structure.has(order) and len(visible) >= _MODES_FOR_AN_ORDER:
+        return "absent", "no such damping shows"
+    if untold is not None:
+        return "not identifiable", untold
+    if not profile.identifiable:
+        return "not identifiable", "the record does not tell the order"
+    if doubt is not None:
+        return "open", doubt
+    if order == "lambda" and field.drag is not None:
+        return "open", BESIDE_DRAG
+    for rival in field.of_other_kinds(STRONG):
+        if _integer(rival, order):
+            return "open", "order 1 on another kind of rig explains the record about as well"
+        if _elsewhere(rival, profile):
+            return "open", "another order on another kind of rig explains the record about as well"
+    if profile.admits_one:
+        return "compatible", None
+    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
+
+
 def _integer(candidate: Candidate, order: Order) -> bool:
     """Whether a structure has this damping with an order of 1."""
     return candidate.structure.fixed.get(order) == 1.0
@@ -163,10 +166,7 @@ def _elsewhere(candidate: Candidate, profile: Profile) -> bool:
     return candidate.structure.has(profile.order) and not here
 
 
-def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
-    """Candidates whose BIC is less than so much above that of the first, without the first."""
-    limit = field.best.bic + within
-    return tuple(c for c in field.candidates[1:] if c.bic < limit)
+# Verdict on a record
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,14 +203,14 @@ class Verdict:
     name : str
         The file.
     structure : str
-        Of the lowest BIC: "I" to "VII".
+        Structure of the lowest BIC: "I" to "VII".
     uniform : bool
         Whether its beam is uniform.
     rivals : tuple of str
         Structures that the data cannot tell from it.
     parameters : mapping of str to float
-        Of the freest structure on that beam, as `RecordFit` names them; those that carry a flag
-        are left out.
+        Those of the freest structure on that beam, as `RecordFit` names them, but for those that
+        carry a flag.
     adequate : bool
         Whether what remains of that is noise.
     alpha, lambda_ : OrderVerdict
@@ -228,7 +228,7 @@ class Verdict:
     experiments : tuple of str
         What would tell more.
     damping_with_amplitude : tuple of DampingAt
-        Of free vibration, where the air brakes the beam; else empty.
+        Damping in free vibration, where the air brakes the beam; else empty.
     """
 
     name: str
@@ -254,6 +254,12 @@ class Verdict:
         plain = _plain(dataclasses.asdict(self))
         assert isinstance(plain, dict)
         return plain
+
+
+def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
+    """Candidates whose BIC is less than so much above that of the first, without the first."""
+    limit = field.best.bic + within
+    return tuple(c for c in field.candidates[1:] if c.bic < limit)
 
 
 def _plain(value: object) -> object:

@@ -1,4 +1,4 @@
-"""Which modes a record shows, and whether the motor was driven where the others are."""
+"""Visible modes: which a record shows, and whether the motor was driven where the others are."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _FEWEST_BINS: Final = 8
 """To either side."""
 
 _DEGREE: Final = 2
-"""Of the polynomial in frequency that a response without a resonance is near the mode."""
+"""Degree of the polynomial in frequency that a response without a resonance is near the mode."""
 
 _DRIVEN: Final = 0.2
 """Amplitude of what the motor was asked for, relative to that at mode 1, from which a mode counts

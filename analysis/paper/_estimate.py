@@ -1,4 +1,4 @@
-"""From a record to its frequency response, as the paper estimates it or by another estimator."""
+"""Frequency response of a record, by Welch's method (as in the paper) or by another estimator."""
 
 from __future__ import annotations
 

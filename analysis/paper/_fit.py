@@ -1,15 +1,17 @@
 """Fit of the damping structures to a measured frequency response: the paper's cost, Eq. (26).
 
-Where a search for the best damping starts: the low points of a coarse sweep of all unknowns.
+``J = sum_p W_p |G_exp(j omega_p) - Ĝ(j omega_p)|²`` with complex deviations and the weights of
+`analysis.models`. Its minimum is sought over the whole range of physical damping, without a guess
+from the user: a coarse sweep of all unknowns, descents from each of its hollows on a few hundred
+points that stand for all, and the best few of these polished on every point.
 
-The cost of types III, V and VI has several minima, and from a random start type VI falls into the
-best one in fewer than half of the cases. So the whole range of physical interest is swept
-coarsely first, as the paper sweeps it finely, and a descent starts from each hollow of the sweep.
+The sweep is needed: the cost of types III, V and VI has several minima, and from a random start
+type VI falls into the best one in fewer than half of the cases. The paper sweeps the whole range of
+physical interest finely; here it is swept coarsely (`starts`).
 
-Covariance of the unknowns of a weighted least-squares fit of a frequency response.
-
-It reads every deviation of the model from the measurement as chance. What that is worth, measured
-on simulated sessions with type VI:
+Standard deviations are from the covariance of a weighted least-squares fit, which reads every
+deviation of the model from the measurement as chance. What that is worth, measured on simulated
+sessions with type VI:
 
 * errors that are independent from bin to bin: within 20 % of the scatter of repeated fits;
 * errors shared by the nine neighbours that zero padding makes alike: half of that scatter, since
@@ -19,13 +21,6 @@ on simulated sessions with type VI:
   they are, and 4 to 20 times if the structure is wrong.
 
 So they rank parameters by how well the response determines them and are no confidence intervals.
-
-Fit of the damping structures to a measured frequency response: the paper's cost, Eq. (26).
-
-``J = sum_p W_p |G_exp(j omega_p) - Ĝ(j omega_p)|²`` with complex deviations and the weights of
-`analysis.models`. Its minimum is sought over the whole range of physical damping, without a guess
-from the user: a coarse sweep of all unknowns, descents from each of its hollows on a few hundred
-points that stand for all, and the best few of these polished on every point.
 """
 
 import itertools
@@ -51,137 +46,7 @@ from analysis.models import (
 from analysis.optimizer import Box, Minimum, NormalEquations, Recent, descend
 from rigd.beam import Beam, Damping
 
-
-def thinned(
-    measured: NDArray[np.complex128], weights: NDArray[np.float64], count: int
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Choose points, densest where they count: on the flanks of peaks, and under large weights.
-
-    Parameters
-    ----------
-    measured : ndarray of complex, shape (n,)
-    weights : ndarray, shape (n,)
-        Of sum 1.
-    count : int
-        How many points to choose at most.
-
-    Returns
-    -------
-    index : ndarray of int, shape (m,), m <= count
-        Increasing.
-    weights : ndarray, shape (m,)
-        Each point's share: its own weight and that of the points left out round it. Of sum 1.
-    """
-    n = measured.size
-    if n <= count:
-        return np.arange(n), weights
-    # Where the response is large, where it varies from bin to bin, and a third everywhere: with
-    # 800 of 7907 points the cost at a minimum then differs by less than 1 % from the whole one.
-    root = np.sqrt(weights)
-    size, variation = root * np.abs(measured), root * np.abs(np.gradient(measured))
-    density = np.full(n, 1 / n)
-    for part in (size, variation):
-        density += part / max(float(part.sum()), np.finfo(float).tiny)
-    reached = np.cumsum(density)
-    marks = (np.arange(count) + 0.5) * (reached[-1] / count)
-    index = np.unique(np.searchsorted(reached, marks))
-    borders = (index[:-1] + index[1:] + 1) // 2
-    return index, np.add.reduceat(weights, np.concatenate(([0], borders)))
-
-
-# Sizes are relative to stiffness and to inertia at a mode: about twice a damping ratio.
-_SWEEP: Final[dict[Parameter, tuple[float, ...]]] = {
-    "zeta": tuple(math.log(size) for size in (1e-4, 1e-3, 1e-2, 1e-1)),
-    "alpha": (0.3, 0.8, 1.3, 1.8),
-    "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),
-    "lambda": (0.3, 0.8, 1.3, 1.8),
-}
-_MOST_STARTS: Final = 8
-
-
-def starts(
-    structure: Structure, cost: Callable[[NDArray[np.float64]], float]
-) -> list[NDArray[np.float64]]:
-    """Choose starts for the unknowns of `structure`, the most promising first.
-
-    Parameters
-    ----------
-    structure : Structure
-    cost : callable
-        Cost at a vector of unknowns, shape (k,).
-
-    Returns
-    -------
-    list of ndarray, each of shape (k,)
-        At most eight: points of the sweep whose cost no neighbour along any axis undercuts.
-    """
-    axes = [_SWEEP[name] for name in structure.free]
-    points = np.array(list(itertools.product(*axes)))
-    costs = np.array([cost(x) for x in points]).reshape([len(axis) for axis in axes])
-    hollow = np.ones(costs.shape, dtype=bool)
-    for axis in range(costs.ndim):
-        rise = np.diff(costs, axis=axis)
-        # A point is no hollow if the cost falls towards the next one, or rose from the last.
-        pad_end = [(0, 1) if k == axis else (0, 0) for k in range(costs.ndim)]
-        pad_start = [(1, 0) if k == axis else (0, 0) for k in range(costs.ndim)]
-        hollow &= np.pad(rise, pad_end) >= 0
-        hollow &= np.pad(rise, pad_start) <= 0
-    hollows = np.flatnonzero(hollow)
-    best_first = hollows[np.argsort(costs.ravel()[hollows])]
-    return [points[i] for i in best_first[:_MOST_STARTS]]
-
-
-def sandwich_covariance(
-    deviation: NDArray[np.complex128],
-    jacobian: NDArray[np.complex128],
-    weights: NDArray[np.float64],
-) -> NDArray[np.float64] | None:
-    """Covariance of the unknowns, ``A⁻¹ B A⁻¹``, from the deviations that remain.
-
-    A is the Gauss-Newton Hessian and B the covariance of the gradient, summed over neighbouring
-    bins as well as each bin alone (Newey and West, "A simple, positive semi-definite,
-    heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 55 (1987)
-    703-708): zero padding and the window make neighbours much alike.
-
-    Parameters
-    ----------
-    deviation : ndarray of complex, shape (n,)
-        Model minus measurement at the minimum.
-    jacobian : ndarray of complex, shape (k, n)
-    weights : ndarray, shape (n,)
-
-    Returns
-    -------
-    ndarray, shape (k, k), or None
-        None if the data do not determine the unknowns.
-    """
-    hessian = ((jacobian.conj() * weights) @ jacobian.T).real
-    scale = np.sqrt(np.diag(hessian))
-    if not (np.isfinite(hessian).all() and (scale > 0).all()):
-        return None
-    scaled = hessian / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > 1e12:
-        return None
-    scores = (jacobian.conj() * (weights * deviation)).real
-    span = _alike(np.sqrt(weights) * deviation)
-    # Bartlett's kernel over `span` bins is the mean square of sums over as many neighbours.
-    reached = np.cumsum(np.pad(scores, ((0, 0), (span, span - 1))), axis=1)
-    sums = reached[:, span:] - reached[:, :-span]
-    middle = sums @ sums.T / span
-    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
-    covariance: NDArray[np.float64] = inverse @ middle @ inverse
-    return covariance
-
-
-def _alike(deviation: NDArray[np.complex128]) -> int:
-    """Count the neighbouring bins that deviate alike: twice the lag of half the correlation."""
-    half = 0.5 * np.vdot(deviation, deviation).real
-    # A few lags, so not by transforms: those would cost as much as the model on every point.
-    for lag in range(1, deviation.size):
-        if np.vdot(deviation[:-lag], deviation[lag:]).real < half:
-            return 1 + 2 * lag
-    return 1
-
+# Fits
 
 _THINNED_POINTS: Final = 800
 _POLISHED: Final = 3
@@ -424,3 +289,142 @@ def _check(
             "The frequency response must be finite and start above 0 Hz to be fitted; "
             "choose a band in which the input was excited."
         )
+
+
+# Points that stand for all
+
+
+def thinned(
+    measured: NDArray[np.complex128], weights: NDArray[np.float64], count: int
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Choose points, densest where they count: on the flanks of peaks, and under large weights.
+
+    Parameters
+    ----------
+    measured : ndarray of complex, shape (n,)
+    weights : ndarray, shape (n,)
+        Weights, of sum 1.
+    count : int
+        How many points to choose at most.
+
+    Returns
+    -------
+    index : ndarray of int, shape (m,), m <= count
+        Increasing.
+    weights : ndarray, shape (m,)
+        Each point's share: its own weight and that of the points left out round it. Of sum 1.
+    """
+    n = measured.size
+    if n <= count:
+        return np.arange(n), weights
+    # Where the response is large, where it varies from bin to bin, and a third everywhere: with
+    # 800 of 7907 points the cost at a minimum then differs by less than 1 % from the whole one.
+    root = np.sqrt(weights)
+    size, variation = root * np.abs(measured), root * np.abs(np.gradient(measured))
+    density = np.full(n, 1 / n)
+    for part in (size, variation):
+        density += part / max(float(part.sum()), np.finfo(float).tiny)
+    reached = np.cumsum(density)
+    marks = (np.arange(count) + 0.5) * (reached[-1] / count)
+    index = np.unique(np.searchsorted(reached, marks))
+    borders = (index[:-1] + index[1:] + 1) // 2
+    return index, np.add.reduceat(weights, np.concatenate(([0], borders)))
+
+
+# Starts
+
+# Sizes are relative to stiffness and to inertia at a mode: about twice a damping ratio.
+_SWEEP: Final[dict[Parameter, tuple[float, ...]]] = {
+    "zeta": tuple(math.log(size) for size in (1e-4, 1e-3, 1e-2, 1e-1)),
+    "alpha": (0.3, 0.8, 1.3, 1.8),
+    "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),
+    "lambda": (0.3, 0.8, 1.3, 1.8),
+}
+_MOST_STARTS: Final = 8
+
+
+def starts(
+    structure: Structure, cost: Callable[[NDArray[np.float64]], float]
+) -> list[NDArray[np.float64]]:
+    """Choose starts for the unknowns of `structure`, the most promising first.
+
+    Parameters
+    ----------
+    structure : Structure
+    cost : callable
+        Cost at a vector of unknowns, shape (k,).
+
+    Returns
+    -------
+    list of ndarray, each of shape (k,)
+        At most eight: points of the sweep whose cost no neighbour along any axis undercuts.
+    """
+    axes = [_SWEEP[name] for name in structure.free]
+    points = np.array(list(itertools.product(*axes)))
+    costs = np.array([cost(x) for x in points]).reshape([len(axis) for axis in axes])
+    hollow = np.ones(costs.shape, dtype=bool)
+    for axis in range(costs.ndim):
+        rise = np.diff(costs, axis=axis)
+        # A point is no hollow if the cost falls towards the next one, or rose from the last.
+        pad_end = [(0, 1) if k == axis else (0, 0) for k in range(costs.ndim)]
+        pad_start = [(1, 0) if k == axis else (0, 0) for k in range(costs.ndim)]
+        hollow &= np.pad(rise, pad_end) >= 0
+        hollow &= np.pad(rise, pad_start) <= 0
+    hollows = np.flatnonzero(hollow)
+    best_first = hollows[np.argsort(costs.ravel()[hollows])]
+    return [points[i] for i in best_first[:_MOST_STARTS]]
+
+
+# Covariance
+
+
+def sandwich_covariance(
+    deviation: NDArray[np.complex128],
+    jacobian: NDArray[np.complex128],
+    weights: NDArray[np.float64],
+) -> NDArray[np.float64] | None:
+    """Covariance of the unknowns, ``A⁻¹ B A⁻¹``, from the deviations that remain.
+
+    A is the Gauss-Newton Hessian and B the covariance of the gradient, summed over neighbouring
+    bins as well as each bin alone (Newey and West, "A simple, positive semi-definite,
+    heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 55 (1987)
+    703-708): zero padding and the window make neighbours much alike.
+
+    Parameters
+    ----------
+    deviation : ndarray of complex, shape (n,)
+        Model minus measurement at the minimum.
+    jacobian : ndarray of complex, shape (k, n)
+    weights : ndarray, shape (n,)
+
+    Returns
+    -------
+    ndarray, shape (k, k), or None
+        None if the data do not determine the unknowns.
+    """
+    hessian = ((jacobian.conj() * weights) @ jacobian.T).real
+    scale = np.sqrt(np.diag(hessian))
+    if not (np.isfinite(hessian).all() and (scale > 0).all()):
+        return None
+    scaled = hessian / np.outer(scale, scale)
+    if np.linalg.cond(scaled) > 1e12:
+        return None
+    scores = (jacobian.conj() * (weights * deviation)).real
+    span = _alike(np.sqrt(weights) * deviation)
+    # Bartlett's kernel over `span` bins is the mean square of sums over as many neighbours.
+    reached = np.cumsum(np.pad(scores, ((0, 0), (span, span - 1))), axis=1)
+    sums = reached[:, span:] - reached[:, :-span]
+    middle = sums @ sums.T / span
+    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
+    covariance: NDArray[np.float64] = inverse @ middle @ inverse
+    return covariance
+
+
+def _alike(deviation: NDArray[np.complex128]) -> int:
+    """Count the neighbouring bins that deviate alike: twice the lag of half the correlation."""
+    half = 0.5 * np.vdot(deviation, deviation).real
+    # A few lags, so not by transforms: those would cost as much as the model on every point.
+    for lag in range(1, deviation.size):
+        if np.vdot(deviation[:-lag], deviation[lag:]).real < half:
+            return 1 + 2 * lag
+    return 1

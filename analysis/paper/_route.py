@@ -1,4 +1,9 @@
-"""The paper's route from a record to models: Welch estimate, twelve fits, indices, modes, peaks."""
+"""Welch method, as in the paper: Welch's estimate of a record, twelve fits, and their indices.
+
+Each of six structures is fitted with two weightings. The indices are the distances between measured
+and fitted response, Eqs. (28) to (30), and the deviations of their resonant peaks, Eqs. (31) and
+(32); the torque that a model predicts in time is compared beside them.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +21,13 @@ from rigd.beam import modes, transfer, undamped_frequencies_rad_s
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
     from analysis.models import WelchSettings
     from analysis.record import Record
     from rigd.beam import Beam, Damping, Mode
     from rigd.spectral import FrequencyResponse, Segmentation
+
+
+# Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +62,9 @@ def fit_indices(
         wmse=float(weights(omega_rad_s, "omega") @ square),
         md=float(deviation.max()),
     )
+
+
+# Resonant peaks
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +134,8 @@ def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
         magnitude_db=abs(measured.magnitude_db - model.magnitude_db),
     )
 
+
+# Torque in time
 
 _DECAY_OVER_RECORD = 2.7
 """sigma T: what wraps around shrinks by exp(-2 sigma T), rounding errors grow by exp(sigma T)."""
@@ -210,9 +221,11 @@ def loudest_moment_s(
     return float(np.argmax(envelope)) / rate_hz
 
 
+# Analysis of a record
+
 MODES: Final = 3
 LARGEST_SHIFT: Final = 0.1
-"""Of a mode's frequency against the undamped beam's: as much as a damping ratio of 0.4 makes."""
+"""Shift of a mode's frequency from the undamped beam's: a damping ratio of 0.4 makes as much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +239,7 @@ class FittedModel:
         The model with the tool's inertia on the bins that were fitted, in N·m/rad.
     indices : Indices
     modes : tuple of Mode
-        Of the beam alone, from its poles; empty where damping is so strong that one has none.
+        Modes of the beam alone, from its poles; empty where damping is so strong that one has none.
     followed : tuple of bool
         Mode by mode, whether it vibrates, and within `LARGEST_SHIFT` of the undamped beam's
         frequency. If not, the fit has let go of that resonance: the mode is not the antenna's.

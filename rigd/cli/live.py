@@ -177,11 +177,7 @@ def _show(view: "LiveAddress") -> None:
         finally:
             viewer.close()
     if code:
-        fail(
-            f"The window was closed by a fault ({viewer.last_words}). rigd live --web shows the "
-            "same in a browser.",
-            EXIT_FAILED,
-        )
+        fail(f"{viewer.fault} rigd live --web shows the same in a browser.", EXIT_FAILED)
 
 
 def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
@@ -328,8 +324,7 @@ def _open_window(recording: Path, scratch: Path, path: Path) -> None:
         typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
         if window.wait():
             fail(
-                f"The window was closed by a fault ({window.program.last_words}). "
-                f"rigd replay {path} --web shows the same in a browser.",
+                f"{window.fault} rigd replay {path} --web shows the same in a browser.",
                 EXIT_FAILED,
             )
 

@@ -1,4 +1,4 @@
-"""``rigd profiles``: the profiles there are, and a new one from a drive's EDS."""
+"""``rigd profiles``: the profiles there are, copies of them, and a new one from a drive's EDS."""
 
 import sys
 from pathlib import Path
@@ -14,39 +14,104 @@ from rigd.cli.options import (
     fail,
     profile_named,
 )
+from rigd.printable import printable
 
 if TYPE_CHECKING:
     from rigd.profile import Draft
 
+NameOrFile = Annotated[str, typer.Argument(metavar="NAME", help="Name of a profile, or its file.")]
+
 profiles_app = typer.Typer(
-    help="List the hardware profiles, or write a new one from a drive's EDS file.",
-    no_args_is_help=True,
+    invoke_without_command=True,
     rich_markup_mode=None,
 )
 
 
 @profiles_app.callback()
-def profiles() -> None:
-    """List the hardware profiles, or write a new one from a drive's EDS file.
+def profiles(context: typer.Context) -> None:
+    """List, show and copy the hardware profiles, or write a new one from a drive's EDS file.
 
-    Example: rigd profiles list
+    A name is looked for in hw_profiles of the working folder, then in the per-user folder
+    ($XDG_CONFIG_HOME/rigd/profiles, by default ~/.config/rigd/profiles), then among those that
+    came with the program. Without a command, the profiles are listed.
+
+    Example: rigd profiles, then rigd profiles copy sim my_rig
     """
+    if context.invoked_subcommand is None:
+        list_profiles()
 
 
 @profiles_app.command("list")
 def list_profiles() -> None:
-    """List the profiles that --profile takes by name.
+    """List the profiles that --profile takes by name: where each is, and which others it hides.
 
     Example: rigd profiles list
     """
-    from rigd.profile import ProfileError, known_profiles, load_profile
+    from rigd.profile import ProfileError, load_profile, profile_files
 
-    for name in known_profiles():
+    for name, (used, *hidden) in profile_files().items():
         try:
-            profile = load_profile(name)
-            typer.echo(f"{name}: {profile.description} ({profile.path})")
+            told = load_profile(used.path).description
         except ProfileError as error:
-            typer.echo(f"{name}: cannot be used: {str(error).splitlines()[0]}")
+            told = f"cannot be used: {str(error).splitlines()[0]}"
+        typer.echo(printable(f"{name}: {told} ({used.path}, {used.origin})"))
+        for other in hidden:
+            typer.echo(printable(f"  hides {other.path} ({other.origin})"))
+
+
+@profiles_app.command()
+def show(name: NameOrFile) -> None:
+    """Write a profile to standard output, as it stands in its file.
+
+    Example: rigd profiles show sim
+    """
+    profile = profile_named(name)
+    typer.echo(f"{profile.path}:", err=True)
+    typer.echo(profile.text, nl=False)
+
+
+@profiles_app.command()
+def copy(
+    name: NameOrFile,
+    new_name: Annotated[
+        str | None,
+        typer.Argument(metavar="[NEW_NAME]", help="Name of the copy (default: the same name)."),
+    ] = None,
+    here: Annotated[
+        bool, typer.Option("--here", help="Copy into ./hw_profiles, for this folder only.")
+    ] = False,
+) -> None:
+    """Copy a profile into the per-user folder, to be edited there. No file is ever overwritten.
+
+    Under the same name the copy takes the place of the shipped profile, which stays as it is.
+
+    Example: rigd profiles copy sim my_rig
+    """
+    from rigd.profile import WORKING_FOLDER, ProfileError, copy_profile, profile_files, user_folder
+
+    profile = profile_named(name)
+    folder = WORKING_FOLDER if here else user_folder()
+    if folder is None:
+        fail(
+            "There is no per-user folder, for this user has no home; set XDG_CONFIG_HOME, or copy "
+            "into this folder by --here.",
+            EXIT_FAILED,
+        )
+    stem = new_name or profile.path.stem
+    if Path(stem).name != stem or stem.endswith(".toml"):
+        fail(f"{stem}: is a path; a copy has a name only, without .toml.", EXIT_WRONG_USE)
+    path = folder / f"{stem}.toml"
+    try:
+        copy_profile(profile, path, new_name)
+    except ProfileError as error:
+        fail(str(error), EXIT_WRONG_USE)
+    files = profile_files()[stem]
+    place = [file.path.resolve() for file in files].index(path.resolve())
+    if place:
+        typer.echo(f"Note: {files[0].path} ({files[0].origin}) hides it here.", err=True)
+    for other in files[place + 1 :]:
+        typer.echo(f"Note: it hides {other.path} ({other.origin}).", err=True)
+    typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {stem}")
 
 
 @profiles_app.command()

@@ -63,6 +63,10 @@ _QUIET: Mapping[str, str] = {
 }
 _LISTENING = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
 _SERVING_PAGE = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
+_NO_GRAPHICS = re.compile(
+    # Neither Vulkan nor OpenGL; OpenGL alone, of which Mesa offers too little in software.
+    "[Nn]o (suitable )?(graphics|wgpu) adapter|Failed to get render context"
+)
 _MOMENT_S: Final = 0.5
 _MOST_READING_S: Final = 10.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -107,6 +111,7 @@ class RerunProgram:
             raise RerunError(f"{command[0]}: cannot be run: {error.strerror}.") from None
         self._ports: dict[re.Pattern[str], int] = {}
         self._last_lines: collections.deque[str] = collections.deque(maxlen=3)
+        self._without_graphics = False
         # Read to the end: a program whose output nobody reads would block once the pipe is full.
         self._reader = threading.Thread(target=self._read_log, daemon=True)
         self._reader.start()
@@ -139,20 +144,31 @@ class RerunProgram:
     @property
     def last_words(self) -> str:
         """The last lines of its log."""
-        # To its end, if it has one: what a program says last is read when it has long ended.
-        self._reader.join(timeout=_MOMENT_S if self.running else _MOST_READING_S)
+        self._read_on()
         return " ".join(self._last_lines) or "it said nothing"
+
+    @property
+    def without_graphics(self) -> bool:
+        """Whether it said that it cannot draw: that the computer has no graphics it can use."""
+        self._read_on()
+        return self._without_graphics
 
     def kill(self) -> None:
         """End it at once; there is nothing in it to be saved."""
         self._process.kill()
         self._process.wait()
 
+    def _read_on(self) -> None:
+        # To its end, if it has one: what a program says last is read when it has long ended.
+        self._reader.join(timeout=_MOMENT_S if self.running else _MOST_READING_S)
+
     def _read_log(self) -> None:
         assert self._process.stdout is not None
         with self._process.stdout as log:
             for line in log:
                 self._last_lines.append(line.strip()[:200])
+                # A backtrace follows it, so that it is not among the last words.
+                self._without_graphics |= _NO_GRAPHICS.search(line) is not None
                 for pattern in (_LISTENING, _SERVING_PAGE):
                     if found := pattern.search(line):
                         self._ports[pattern] = int(found[1])

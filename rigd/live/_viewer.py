@@ -92,6 +92,11 @@ class Window(_Playback):
             {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
         )
 
+    @property
+    def fault(self) -> str:
+        """Why it was closed, if not by the user: a sentence."""
+        return _fault_of(self._program)
+
 
 class PageOfFile(_Playback):
     """The viewer's page on a file, on loopback.
@@ -217,6 +222,16 @@ class Viewer:
         return self._program.last_words
 
     @property
+    def without_graphics(self) -> bool:
+        """Whether it said that it cannot draw: that the computer has no graphics it can use."""
+        return self._program.without_graphics
+
+    @property
+    def fault(self) -> str:
+        """Why it was closed, if not by the user: a sentence."""
+        return _fault_of(self._program)
+
+    @property
     def control_url(self) -> str:
         """Address at which the viewer accepts commands; empty: none yet."""
         port = self._program.grpc_port
@@ -266,3 +281,14 @@ def _have_it_connect(control_url: str, url: str, done: list[bool]) -> None:
     except (OSError, RuntimeError):  # it is busy, or about to end
         return
     done.append(True)
+
+
+def _fault_of(program: RerunProgram) -> str:
+    """Say in a sentence why a window was closed by a fault."""
+    if program.without_graphics:
+        return (
+            "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's viewer "
+            "needs. Install one; on Debian and Ubuntu the package mesa-vulkan-drivers has those "
+            "for most graphics cards, and one that needs none."
+        )
+    return f"The window was closed by a fault ({program.last_words})."

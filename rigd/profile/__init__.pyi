@@ -3,8 +3,13 @@ from ._from_eds import UnusableDriveError as UnusableDriveError
 from ._load import ProfileError as ProfileError
 from ._load import known_profiles as known_profiles
 from ._load import load_profile as load_profile
+from ._places import WORKING_FOLDER as WORKING_FOLDER
+from ._places import ProfileFile as ProfileFile
+from ._places import profile_files as profile_files
+from ._places import user_folder as user_folder
 from ._schema import Profile as Profile
 from ._schema import RealtimeSettings as RealtimeSettings
 from ._schema import SessionSettings as SessionSettings
 from ._write import check_new as check_new
+from ._write import copy_profile as copy_profile
 from ._write import write_new as write_new

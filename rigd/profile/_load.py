@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd.devices import RigParameters
 from rigd.profile import _diagnostics as diagnostics
+from rigd.profile._places import profile_files
 from rigd.profile._schema import (
     OPTIONAL_SECTIONS,
     SECTIONS,
@@ -38,8 +39,9 @@ def load_profile(name_or_path: str | Path) -> Profile:
     Parameters
     ----------
     name_or_path
-        The name of a file in ``hw_profiles`` without its ``.toml`` (of the project's checkout, or
-        of the working directory), or the path of a file.
+        The path of a file, or the name of one without its ``.toml``, looked for in ``hw_profiles``
+        of the working folder, then in the user's own folder (``$XDG_CONFIG_HOME/rigd/profiles``),
+        then among the shipped ones.
 
     Returns
     -------
@@ -124,22 +126,18 @@ def _find(name_or_path: str | Path) -> Path:
         if given.is_file():
             return given
         raise ProfileError(f"{given}: there is no such file; {_known_profiles()}.")
-    for folder in _profile_folders():
-        path = folder / f"{given}.toml"
-        if path.is_file():
-            return path
+    files = profile_files()
+    if str(given) in files:
+        return files[str(given)][0].path
     raise ProfileError(
-        f"There is no profile '{given}'; {_known_profiles()}, or give the path of a .toml file."
+        f"There is no profile '{given}'; {_known_profiles()}. Make one of that name by "
+        f"'rigd profiles copy sim {given}', or give the path of a .toml file."
     )
 
 
-def _profile_folders() -> tuple[Path, ...]:
-    return Path(__file__).resolve().parents[2] / "hw_profiles", Path("hw_profiles")
-
-
 def known_profiles() -> list[str]:
-    """Return the names of the profiles in ``hw_profiles``, of the project and of this folder."""
-    return sorted({path.stem for folder in _profile_folders() for path in folder.glob("*.toml")})
+    """Return the names of the profiles of this folder, of the user, and of those shipped."""
+    return list(profile_files())
 
 
 def _known_profiles() -> str:

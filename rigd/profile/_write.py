@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.profile._load import ProfileError
-from rigd.profile._schema import is_number, keys
+from rigd.profile._load import ProfileError, profile_of
+from rigd.profile._schema import Profile, is_number, keys
 
 SettingValue = bool | int | float | str | tuple[str, ...]
 
@@ -104,6 +104,46 @@ def write_new(path: Path, text: str) -> None:
         raise _taken(path) from error
     except OSError as error:
         raise ProfileError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
+    """Write a profile to a file that does not exist yet, in a folder that is made if need be.
+
+    Parameters
+    ----------
+    profile
+        What is copied, with all its comments. Where it names the drive's EDS file, that is named
+        by its whole path in the copy, whose folder is another one.
+    path
+        Of the copy.
+    name
+        What the profile calls itself in the copy; None: as before.
+
+    Raises
+    ------
+    ProfileError
+        If there is such a file, it cannot be written, or the name is no profile's.
+    """
+    settings = [] if name is None else [Setting("name", name)]
+    drive = profile.rig.cia402
+    if drive is not None and drive.eds:
+        settings.append(Setting("cia402.eds", drive.eds))
+    text = profile.text
+    if settings:
+        try:
+            text = with_settings(text, settings)
+        except KeyError:
+            raise ProfileError(
+                f"{profile.path}: is not laid out as the shipped profiles are, one key a line "
+                "under its [section], so that no changed copy can be made; copy the file, edit it."
+            ) from None
+        profile_of(text, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ProfileError(f"{path.parent}: cannot be made ({error.strerror}).") from error
+    check_new(path)
+    write_new(path, text)
 
 
 def _taken(path: Path) -> ProfileError:

@@ -153,7 +153,7 @@ def test_warnings_of_libraries_stay_off_the_terminal(tmp_path, asked):
     inner = "import numpy; numpy.float64(1e308) * 10"
     program = f"""
 import logging, subprocess, sys
-from analysis import cli
+from analysis.cli import app as cli
 def work():
     import numpy
     numpy.float64(1e308) * 10

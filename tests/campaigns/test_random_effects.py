@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from scipy import stats
 
-from analysis.campaigns._pooling import chance_of, random_effects, t_quantile
+from analysis.campaigns._pooling import random_effects
 
 
 def one_dimension(values, variances):
@@ -76,15 +75,3 @@ def test_scatter_between_sessions_is_recovered_from_correlated_estimates():
     assert np.mean(found, axis=0) == pytest.approx(np.diag(between), rel=0.12)
     # Chi-square of two degrees of freedom: the covariance says how wrong the mean is.
     assert np.mean(squares) == pytest.approx(2.0, abs=1.0)
-
-
-@pytest.mark.parametrize("sessions", [2, 5, 20])
-def test_chance_is_that_of_chi_square(sessions):
-    q = stats.chi2.ppf([0.05, 0.5, 0.99, 0.999], sessions - 1)
-    assert chance_of(q, sessions) == pytest.approx([0.95, 0.5, 0.01, 0.001], rel=0.2)
-
-
-@pytest.mark.parametrize("freedom", [1, 2, 4, 19, 200])
-def test_student_s_t(freedom):
-    assert t_quantile(0.95, freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-5)
-    assert t_quantile(0.999, freedom) == pytest.approx(stats.t.ppf(0.9995, freedom), rel=1e-2)

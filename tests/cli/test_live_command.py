@@ -12,7 +12,7 @@ from rigd.live._server import LiveAddress, announce
 VIEWER = """#!/bin/sh
 echo "$@" > "$SEEN.arguments"
 env > "$SEEN.environment"
-echo "it is dark here" >&2
+echo "${SAID:-it is dark here}" >&2
 exit $CODE
 """
 
@@ -118,6 +118,23 @@ def test_a_window_that_cannot_be_opened_is_told_in_a_sentence(rigd, view, fake_v
     assert done.returncode == 1
     assert "(it is dark here). rigd live --web shows the same in a browser." in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_computer_that_cannot_draw_is_told_which_package_it_lacks(
+    rigd, view, fake_viewer, monkeypatch
+):
+    # As Rerun says it, with the backtrace that follows: longer than what is kept of its log.
+    frames = "".join(f"{frame:4}: rerun::main\n" for frame in range(6, 25))
+    monkeypatch.setenv(
+        "SAID", f"thread 'main' panicked at 'Failed to get render context'\n{frames}"
+    )
+    monkeypatch.setenv("CODE", "101")
+    done = rigd("live")
+    assert done.returncode == 1
+    assert "no Vulkan driver" in done.stderr
+    assert "the package mesa-vulkan-drivers" in done.stderr
+    assert done.stderr.endswith("rigd live --web shows the same in a browser.\n")
+    assert "rerun::main" not in done.stderr
 
 
 class Window:

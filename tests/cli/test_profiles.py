@@ -1,6 +1,7 @@
 """``rigd profiles``: a new profile from a drive's EDS, that loads and says what is to be done."""
 
 import re
+import shutil
 
 import pytest
 from eds_files import WITH_TORQUE, WITHOUT_TORQUE, eds_path, eds_text, without
@@ -254,6 +255,118 @@ def test_the_profiles_there_are(rigd_here, tmp_path):
     lines = done.stdout.splitlines()
     for name in ("antenna_can: ", "antenna_serial: ", "sim: ", "broken: cannot be used: "):
         assert any(line.startswith(name) for line in lines), name
+
+
+@pytest.fixture
+def user_folder(tmp_path, monkeypatch):
+    """The folder for the user's own profiles, which is not there yet."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return tmp_path / "config" / "rigd" / "profiles"
+
+
+def test_without_a_command_the_profiles_are_listed(rigd_here):
+    assert rigd_here("profiles") == rigd_here("profiles", "list")
+    assert rigd_here("profiles").stdout.startswith("antenna_can: ")
+
+
+def test_a_copy_says_what_it_hides_and_by_what_it_is_hidden(
+    rigd_here, user_folder, tmp_path, sim_toml
+):
+    shipped = load_profile("sim").path
+    done = rigd_here("profiles", "copy", "sim")
+    assert done.returncode == 0, done.stderr
+    own = user_folder / "sim.toml"
+    assert own.read_text("utf-8") == sim_toml
+    assert done.stdout == f"{own}: written. Next: edit it, then rigd check --profile sim\n"
+    assert done.stderr == f"Note: it hides {shipped} (shipped).\n"
+    done = rigd_here("profiles", "copy", "sim", "--here")
+    assert done.stderr.splitlines() == [
+        f"Note: it hides {own} (per-user folder).",
+        f"Note: it hides {shipped} (shipped).",
+    ]
+    own.unlink()
+    done = rigd_here("profiles", "copy", "sim")
+    assert done.stderr.splitlines() == [
+        "Note: hw_profiles/sim.toml (working folder) hides it here.",
+        f"Note: it hides {shipped} (shipped).",
+    ]
+    lines = rigd_here("profiles").stdout.splitlines()
+    place = next(i for i, line in enumerate(lines) if line.startswith("sim: "))
+    assert lines[place].endswith("(hw_profiles/sim.toml, working folder)")
+    assert lines[place + 1 :] == [
+        f"  hides {own} (per-user folder)",
+        f"  hides {shipped} (shipped)",
+    ]
+
+
+def test_a_copy_under_another_name_calls_itself_so_and_is_found(rigd_here, user_folder, sim_toml):
+    done = rigd_here("profiles", "copy", "sim", "my_rig")
+    assert (done.returncode, done.stderr) == (0, "")
+    mine = load_profile("my_rig")
+    assert mine.path == user_folder / "my_rig.toml"
+    assert mine.name == "my_rig"
+    assert mine.text == sim_toml.replace('name = "sim"', 'name = "my_rig"')
+
+
+@pytest.mark.parametrize("options", [(), ("--here",)])
+def test_no_copy_takes_the_place_of_a_file(rigd_here, user_folder, tmp_path, options):
+    folder = tmp_path / "hw_profiles" if options else user_folder
+    folder.mkdir(parents=True)
+    (folder / "mine.toml").write_text("something else")
+    done = rigd_here("profiles", "copy", "sim", "mine", *options)
+    assert done.returncode == 2
+    assert "is there already and is left as it is" in done.stderr
+    assert (folder / "mine.toml").read_text() == "something else"
+
+
+@pytest.mark.parametrize("name", ["../mine", "a/b", "/mine", "mine.toml", ".mine", "..", "ö" * 65])
+def test_the_name_of_a_copy_is_a_name(rigd_here, user_folder, tmp_path, name):
+    done = rigd_here("profiles", "copy", "sim", name)
+    assert done.returncode == 2
+    assert done.stderr.startswith("Error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_copy_still_finds_the_eds_file_of_its_drive(rigd_here, user_folder, tmp_path):
+    (tmp_path / "rig").mkdir()
+    shutil.copy(eds_path("elmo_gold"), tmp_path / "rig" / "drive.eds")
+    text = load_profile("antenna_can").text.replace('# eds = "', 'eds = "')
+    (tmp_path / "rig" / "first.toml").write_text(text, "utf-8")
+    done = rigd_here("profiles", "copy", "rig/first.toml")
+    assert done.returncode == 0, done.stderr
+    copy = load_profile("first")
+    assert copy.path == user_folder / "first.toml"
+    assert copy.rig.cia402.eds == str(tmp_path / "rig" / "drive.eds")
+
+
+def test_what_cannot_be_changed_is_not_copied_under_another_name(
+    rigd_here, user_folder, tmp_path, sim_toml
+):
+    (tmp_path / "odd.toml").write_text(sim_toml.replace('name = "sim"', '"name" = "sim"'))
+    done = rigd_here("profiles", "copy", "odd.toml", "even")
+    assert done.returncode == 2
+    assert "copy the file, edit it" in done.stderr
+    assert not user_folder.exists()
+
+
+def test_a_user_without_a_home_copies_into_the_working_folder(rigd_here, monkeypatch):
+    def nobody():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CONFIG_HOME")
+    monkeypatch.setattr("pathlib.Path.home", nobody)
+    done = rigd_here("profiles", "copy", "sim", "mine")
+    assert done.returncode == 1
+    assert "XDG_CONFIG_HOME" in done.stderr
+    assert rigd_here("profiles", "copy", "sim", "mine", "--here").returncode == 0
+    assert load_profile("mine").name == "mine"
+
+
+def test_a_profile_is_shown_as_it_stands(rigd_here, sim_toml):
+    done = rigd_here("profiles", "show", "sim")
+    assert (done.returncode, done.stdout) == (0, sim_toml)
+    assert done.stderr == f"{load_profile('sim').path}:\n"
+    assert rigd_here("profiles", "show", "simm").returncode == 2
 
 
 def test_what_the_maker_of_another_drive_gave_it_is_not_taken_over(new, tmp_path):

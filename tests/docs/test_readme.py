@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -38,7 +37,8 @@ def of_one_session(shell):
 def start(tmp_path, runtime_folder):
     """Start a command in the folder of an operator."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = os.environ | {"PATH": path, "XDG_RUNTIME_DIR": str(runtime_folder)}
+    own = {"XDG_RUNTIME_DIR": str(runtime_folder), "XDG_CONFIG_HOME": str(tmp_path / "config")}
+    environment = os.environ | own | {"PATH": path}
 
     def start(*command, folder=tmp_path):
         return subprocess.Popen(
@@ -80,7 +80,6 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
 
 @pytest.mark.timeout(300)
 def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
-    shutil.copy(PROJECT / "hw_profiles" / "sim.toml", tmp_path / "my_rig.toml")
     shells = [shell for shell in blocks("sh") if not of_one_session(shell)]
     assert len(shells) >= 6
     # The one in real time waits most of its time: beside the others, as a rig of its own, and one

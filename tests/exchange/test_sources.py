@@ -338,9 +338,7 @@ def test_what_is_no_function_of_time_is_refused(tmp_path):
     assert "no channel 'a', and no other either" in refused(path, "a")
 
 
-@pytest.mark.parametrize(
-    ("suffix", "package"), [("mat", "scipy.io"), ("tdms", "nptdms"), ("uff", "pyuff")]
-)
+@pytest.mark.parametrize(("suffix", "package"), [("tdms", "nptdms"), ("uff", "pyuff")])
 def test_a_library_that_is_missing_is_named_with_the_extra(tmp_path, monkeypatch, suffix, package):
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(b"x")

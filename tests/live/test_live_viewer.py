@@ -1,16 +1,15 @@
 """The window of ``rigd live``: Rerun's own viewer, here without a screen."""
 
 import os
-import re
 import signal
 
 import numpy as np
 import pytest
+from graphics import viewer_ended
 from processes import eventually, sockets
 
+from rigd.live._server import LiveAddress
 from rigd.live._viewer import Viewer
-
-NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 
 
 @pytest.fixture
@@ -29,9 +28,7 @@ def shown_s(viewer):
 
     def ask() -> float:
         if viewer.exit_code is not None:
-            if re.search("graphics adapter|wgpu", viewer.last_words):
-                pytest.skip(NO_GRAPHICS)
-            pytest.fail(viewer.last_words)
+            viewer_ended(viewer)
         try:
             state = ViewerClient.connect(viewer.control_url).get_state()
         except (OSError, RuntimeError):  # it does not answer yet
@@ -72,6 +69,26 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
     assert eventually(lambda: shown_s() > then_s)
     assert eventually(current)
     assert publisher.producer.refused == 0
+
+
+@pytest.mark.parametrize(
+    "absent",
+    [("VK_DRIVER_FILES",), ("VK_DRIVER_FILES", "__EGL_VENDOR_LIBRARY_FILENAMES")],
+    ids=["OpenGL alone", "neither Vulkan nor OpenGL"],
+)
+def test_a_computer_without_vulkan_is_told_which_package_it_lacks(tmp_path, monkeypatch, absent):
+    for variable in absent:
+        monkeypatch.setenv(variable, "/nonexistent")
+    nobody = LiveAddress.of_this_process("sim", grpc_port=9, page_port=9, server=1)
+    window = Viewer(nobody, tmp_path, ("--headless", "--window-size", "320x200"))
+    try:
+        assert eventually(lambda: window.exit_code is not None)
+    finally:
+        window.close()
+    assert window.without_graphics
+    assert window.exit_code not in (0, None)
+    assert "no Vulkan driver" in window.fault
+    assert "mesa-vulkan-drivers" in window.fault
 
 
 def test_a_window_that_does_not_answer_is_waited_for_by_nobody(

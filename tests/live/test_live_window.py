@@ -17,14 +17,13 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+from graphics import viewer_said
 from processes import eventually
 
 from rigd.view import _plots as plots
 from rigd.view._antenna import TITLE as ANTENNA
 from rigd.view._layout import TABS
 from rigd.view._plots import GREEN, GREY, ORANGE, SKY_BLUE
-
-NO_GRAPHICS = "LIVE VIEW NOT TESTED: no graphics adapter for the viewer (mesa-vulkan-drivers?)"
 
 PICTURES = os.environ.get("RIGD_PICTURES")
 # A ring-down that is longer than a busy computer needs for looking at everything.
@@ -124,9 +123,7 @@ def viewer(rerun_program, session, tmp_path):
         assert eventually(lambda: process.poll() is not None or port.search(log.read_text()))
         assert eventually(lambda: process.poll() is not None or "running at" in log.read_text())
         if process.poll() is not None:
-            if re.search("graphics adapter|wgpu", log.read_text()):
-                pytest.skip(NO_GRAPHICS)
-            pytest.fail(log.read_text())
+            viewer_said(log.read_text())
         url = f"rerun+http://127.0.0.1:{port.search(log.read_text())[1]}/proxy"
         with ViewerClient.connect(url) as client:
             yield client

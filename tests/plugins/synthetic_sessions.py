@@ -170,8 +170,3 @@ def short_signals():
         torque_nm=0.02 * np.cos(2 * np.pi * t),
         segments={"rest": (0, 500), "sweep": (500, 4500), "ring_down": (4500, n)},
     )
-
-
-@pytest.fixture(scope="session")
-def plant():
-    return BEAM, TYPE_VI_OMEGA

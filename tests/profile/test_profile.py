@@ -102,7 +102,8 @@ def test_a_profile_of_the_working_directory_is_found(tmp_path, monkeypatch, sim_
 
 
 def test_an_unknown_name_lists_the_known_ones():
-    with pytest.raises(ProfileError, match=r"no profile 'simm'; known profiles are .*sim"):
+    how = r"no profile 'simm'; known profiles are .*sim.*by 'rigd profiles copy sim simm'"
+    with pytest.raises(ProfileError, match=how):
         load_profile("simm")
 
 

@@ -1,0 +1,33 @@
+"""Tests that look at what Rerun's viewer draws, on computers where it can draw nothing."""
+
+from typing import NoReturn, Protocol
+
+import pytest
+
+from rigd.live._server import _NO_GRAPHICS
+
+NO_GRAPHICS = "LIVE VIEW NOT TESTED: no Vulkan driver for the viewer (package mesa-vulkan-drivers)"
+
+
+class Ended(Protocol):
+    """A viewer that has ended."""
+
+    @property
+    def without_graphics(self) -> bool: ...
+
+    @property
+    def last_words(self) -> str: ...
+
+
+def viewer_ended(viewer: Ended) -> NoReturn:
+    """End a test whose viewer has: skipped if the computer lacks graphics, failed otherwise."""
+    if viewer.without_graphics:
+        pytest.skip(NO_GRAPHICS)
+    pytest.fail(viewer.last_words)
+
+
+def viewer_said(log: str) -> NoReturn:
+    """Likewise, of a viewer whose log somebody else has."""
+    if _NO_GRAPHICS.search(log):
+        pytest.skip(NO_GRAPHICS)
+    pytest.fail(log)

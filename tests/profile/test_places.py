@@ -1,0 +1,74 @@
+"""Where the profile of a name is looked for, and which of several is taken."""
+
+from pathlib import Path
+
+import pytest
+
+from rigd.profile import load_profile, profile_files, user_folder
+from rigd.profile._places import Origin
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The user's own folder, with a profile `sim` in it; the working folder has none."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return put(tmp_path / "config" / "rigd" / "profiles")
+
+
+def put(folder):
+    """Put a copy of the shipped profile `sim` into a folder."""
+    folder.mkdir(parents=True)
+    text = (CHECKOUT / "hw_profiles" / "sim.toml").read_text("utf-8")
+    (folder / "sim.toml").write_text(text, "utf-8")
+    return folder / "sim.toml"
+
+
+def test_the_working_folder_comes_before_the_users_and_that_before_the_shipped(own):
+    here = put(Path("hw_profiles"))
+    shipped = CHECKOUT / "hw_profiles" / "sim.toml"
+    assert [(file.path, file.origin) for file in profile_files()["sim"]] == [
+        (here, Origin.HERE),
+        (own, Origin.USER),
+        (shipped, Origin.SHIPPED),
+    ]
+    for path in (here, own, shipped):
+        assert load_profile("sim").path == path
+        if path != shipped:
+            path.unlink()
+
+
+def test_in_the_checkout_itself_its_profiles_are_the_shipped_ones(own, monkeypatch):
+    monkeypatch.chdir(CHECKOUT)
+    assert [file.origin for file in profile_files()["sim"]] == [Origin.USER, Origin.SHIPPED]
+    assert [file.origin for file in profile_files()["antenna_can"]] == [Origin.SHIPPED]
+
+
+def test_the_users_folder_is_below_his_home_unless_said_otherwise(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for said in (None, "", "relative/folder"):
+        if said is None:
+            monkeypatch.delenv("XDG_CONFIG_HOME")
+        else:
+            monkeypatch.setenv("XDG_CONFIG_HOME", said)
+        assert user_folder() == tmp_path / ".config" / "rigd" / "profiles"
+
+
+def test_a_user_without_a_home_has_the_shipped_profiles(monkeypatch):
+    def nobody():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CONFIG_HOME")
+    monkeypatch.setattr("pathlib.Path.home", nobody)
+    assert user_folder() is None
+    assert load_profile("sim").path.parent == CHECKOUT / "hw_profiles"
+
+
+def test_from_a_folder_that_is_gone_the_shipped_profiles_are_found(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert load_profile("sim").path.parent == CHECKOUT / "hw_profiles"
