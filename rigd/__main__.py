@@ -31,7 +31,7 @@ def _end(*_: object) -> None:
 
 
 def _fill_standard_descriptors() -> None:
-    """Open what whoever started this closed: other files would get the numbers 0 to 2."""
+    """Reopen closed standard descriptors: other files would get the numbers 0 to 2."""
     while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(fd, True)
     os.close(fd)

@@ -1,9 +1,9 @@
-"""Text from outside, fit for a terminal and for a line of a message."""
+"""Printable text: what comes from outside, made fit for a terminal and for a message."""
 
 from typing import Final
 
 UNPRINTABLE: Final = "?"
-"""What stands for a character that cannot be printed."""
+"""Replacement of a character that cannot be printed."""
 
 
 def printable(text: str, most: int | None = None) -> str:
@@ -15,7 +15,7 @@ def printable(text: str, most: int | None = None) -> str:
     Parameters
     ----------
     text
-        Of a file, a device, or a path.
+        Text from a file, a device, or a path.
     most
         Characters of it that are shown; an ellipsis stands for the rest. All if it is not given.
     """

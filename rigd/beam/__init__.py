@@ -1,4 +1,10 @@
-"""Exact model of the slewing beam with fractional damping (Section 4 of the paper)."""
+"""Exact model of the slewing beam with fractional damping (Section 4 of the paper).
+
+Offers the transfer function from motor angle to coupling torque (`transfer`, `TransferGrid`), the
+modes and their poles (`modes`, `poles`), a state-space realisation that runs in real time
+(`realise`, `couple`), the deflection and the tip's motion (`DeflectionFilter`, `tip_motion`), a
+beam with a tip mass (`LoadedBeam`) and the air's drag (`DragGrid`). It knows of no rig and no file.
+"""
 
 import lazy_loader as lazy
 

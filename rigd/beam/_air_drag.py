@@ -1,8 +1,8 @@
 """Drag of still air on a thin beam: where it acts, and how the modes feel it.
 
 Each length of a round beam of diameter d that moves across the air at the speed v is held back by
-the quasi-steady force per metre ``-rho_air/2 C_D d |v| v`` (Morison's drag term). Of the beam only
-the product `C_D d` enters, in m. For a constant coefficient it is one number.
+the quasi-steady force per metre ``-rho_air/2 C_D d |v| v`` (Morison's drag term). The
+beam enters by the product `C_D d` (in m) only; for a constant coefficient it is one number.
 
 The force is evaluated at the points of a Gauss-Legendre rule along the beam, whose weights turn it
 into what each mode and the root feel of it.
@@ -43,16 +43,16 @@ class DragGrid:
 
     @classmethod
     def of(cls, beam: Beam, modes: int, points: int) -> "DragGrid":
-        """Grid of a beam.
+        """Return the grid of a beam.
 
         Parameters
         ----------
         beam
         modes
-            How many are followed.
+            Number of modes that are followed.
         points
-            Of the Gauss-Legendre rule. The force is smooth but for kinks where the speed changes
-            its sign along the beam.
+            Number of points of the Gauss-Legendre rule. The force is smooth but for kinks where the
+            speed changes its sign along the beam.
         """
         node, weight = np.polynomial.legendre.leggauss(points)
         x = 0.5 * (node + 1)

@@ -1,4 +1,4 @@
-"""Shape of the beam from the measured motor angle, as it happens.
+"""Deflection of the beam from the measured motor angle, computed while it moves.
 
 What turns with the motor sees the beam bend by ``w(x) = y(x) - x theta``, clamped at the axis. The
 modes of the undamped clamped–free beam, which fractional damping does not couple, give it exactly::
@@ -50,7 +50,7 @@ class DeflectionFilter:
     Parameters
     ----------
     beam, damping
-        Of the exact model.
+        Parameters of the exact model.
     rate_hz
         Samples of the angle a second.
     modes
@@ -87,7 +87,7 @@ class DeflectionFilter:
 
         ladder = _ladder(damping, rate_hz)
         step: Complex = np.exp(np.concatenate([pairs.ravel(), ladder]) / rate_hz)
-        # Of each mode (row), how much of each pole it has.
+        # Row per mode, column per pole: share of the pole in the mode.
         weights = np.zeros((z.size, step.size), dtype=np.complex128)
         for i, residues in enumerate(_residues(z, pairs, beam, damping)):
             weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
@@ -128,7 +128,7 @@ class DeflectionFilter:
 
 
 def _followed(pairs: Complex, rate_hz: float) -> int:
-    """How many modes, from the first on, have poles and are slow enough for the sampling rate."""
+    """Return the number of modes, from the first on, with poles slow enough for the rate."""
     slow = np.abs(pairs[:, 0].imag) < 2 * np.pi * _HIGHEST * rate_hz
     told = slow & ~np.isnan(pairs[:, 0])
     return told.size if told.all() else int(np.argmin(told))

@@ -1,9 +1,7 @@
-"""Exact model of the beam: its parameters, and torque at the root per angle.
+"""Parameters of the beam, and its exact transfer function from motor angle to coupling torque.
 
-Exact transfer function from motor angle to coupling torque (Eq. 25), and its derivatives.
-
-With ``c = 1 + zeta s^alpha`` and ``q = (beta L)^4 = -L^4 (rho/EI s² + gamma s^lambda) / c``,
-Eq. 25 reads ``G = -(EI/L) c F(q)`` where, for ``z = q^(1/4)``::
+With ``c = 1 + zeta s^alpha`` and ``q = (beta L)^4 = -L^4 (rho/EI s² + gamma s^lambda) / c``, the
+transfer function (Eq. 25 of the paper) reads ``G = -(EI/L) c F(q)`` where, for ``z = q^(1/4)``::
 
     F = z (sin z cosh z - cos z sinh z) / (1 + cos z cosh z)
 
@@ -13,6 +11,8 @@ cancels at low frequency and overflows at high frequency; two other forms are us
 * ``|q| < 40``: ``F = q N(q) / D(q)`` with N and D entire, ten terms of their power series;
 * beyond: numerator and denominator divided by ``exp(z - j sg z) / 4``, ``sg = sign(Im z)``, which
   leaves only decaying exponentials.
+
+Derivatives with respect to the parameters are computed along with G.
 
 The in-line formula of the paper for ``beta^4`` reads as if ``rho/EI`` multiplied the external
 damping too; the equation printed before it, the definition of gamma and Table 4 say otherwise.
@@ -26,6 +26,9 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from numpy.typing import ArrayLike, NDArray
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +72,7 @@ class Damping:
     lambda_: Annotated[float, Ge(0), Lt(2)] = 1.0
 
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+# Transfer function
 
 PARAMETERS = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
 """What G may be differentiated with respect to; each derivative holds the other five constant."""
@@ -129,7 +131,7 @@ class TransferGrid:
         Parameters
         ----------
         beam, damping
-            Where to evaluate.
+            Parameters at which G is evaluated.
         wrt
             Names from `PARAMETERS`. ``ln_density_over_stiffness`` is ln(rho/EI) at constant EI,
             ``ln_stiffness`` is ln(EI) at constant rho/EI and gamma.

@@ -35,7 +35,7 @@ class Mode:
     poles_rad_s: tuple[complex, complex]
     """A conjugate pair (positive frequency first), or two real poles, slow one first."""
     frequency_hz: float
-    """Of the free decay, ``|Im p| / 2 pi``: 0 if over-damped."""
+    """Frequency of the free decay, ``|Im p| / 2 pi``: 0 if over-damped."""
     natural_frequency_rad_s: float
     """``sqrt(p_1 p_2)``."""
     damping_ratio: float

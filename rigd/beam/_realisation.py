@@ -1,24 +1,22 @@
 """State-space realisations of the exact model: beam alone, and beam on a motor.
 
-Finite-dimensional stand-in for Eq. 25 that can run in real time.
-
-``G(s) / s²``, coupling torque per angular acceleration, is approximated by poles and direct terms::
+A realisation is the finite-dimensional stand-in for Eq. 25 that can run in real time. The coupling
+torque per angular acceleration, ``G(s) / s²``, is approximated by poles and direct terms::
 
     G(s) ≈ s² [ sum_i r_i / (s - p_i) + D ] + V s + K
 
-with one complex pair a clamped–free mode, where the exact poles are, and a fixed ladder of real
-poles for the branch cut of the fractional orders. Only the residues and the direct terms are
-fitted: one linear least-squares problem with relative errors as residuals. V and K are needed: the
-branch point at s = 0 makes G fall slower than s² there. D, V and K are kept from going negative and
-the fit has a faint tail beyond its band, because an approximation can be accurate in the band and
-still not be passive, and then motor and beam together are unstable.
+The poles are one complex pair per clamped–free mode, where the exact poles are, and a fixed ladder
+of real poles for the branch cut of the fractional orders. Only the residues and the direct terms
+are fitted: one linear least-squares problem with relative errors as residuals. V and K are needed:
+the branch point at s = 0 makes G fall slower than s² there. D, V and K are kept from going negative
+and the fit has a faint tail beyond its band, because an approximation can be accurate in the band
+and still not be passive, and then motor and beam together are unstable.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,12 +25,34 @@ from rigd.beam._model import Beam, Damping, TransferGrid
 from rigd.beam._modes import clamped_free_eigenvalues
 from rigd.beam._tip_mass import LoadedBeam
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+ERROR_BAND_HZ = (0.05, 100.0)
+"""Band in which a realisation states its error: the paper's chirp and an octave above."""
+
+MAX_GROWTH_PER_S = 1e-2
+"""A frictionless motor with the beam attached may not grow faster than this. Zero would refuse the
+undamped beam, whose poles lie on the imaginary axis but for rounding and the fit's error."""
+
+_MODES_UP_TO_HZ = 1200.0
+_MOST_MODES = 300
+_HEAVY_DAMPING = 0.8
+"""Damping ratio from which a pair beyond the band is left out: with the real poles next to it, it
+would only offer huge residues that cancel in the band."""
+_CUT_POLES = -(10.0 ** (np.arange(-6, 14) / 3.0))
+_FIT_BAND_HZ = (0.02, 500.0)
+_TAIL_HZ = (1e-4, 1080.0)
+_TAIL_WEIGHT = 1e-3
+_CLOSEST = 3e-7
+_RCOND = 1e-10
+"""Cuts off the combinations of columns that would buy the last digit in the band with huge residues
+that cancel there and nowhere else."""
 
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
+
+
+class RealisationError(ValueError):
+    """The damping cannot be realised to the error asked for, or not stably."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,32 +105,6 @@ def basis(s: Complex, poles: Complex) -> Complex:
     return columns
 
 
-ERROR_BAND_HZ = (0.05, 100.0)
-"""Where a realisation answers for its error: the paper's chirp and an octave above."""
-
-MAX_GROWTH_PER_S = 1e-2
-"""A frictionless motor with the beam attached may not grow faster than this. Zero would refuse the
-undamped beam, whose poles lie on the imaginary axis but for rounding and the fit's error."""
-
-_MODES_UP_TO_HZ = 1200.0
-_MOST_MODES = 300
-_HEAVY_DAMPING = 0.8
-"""Damping ratio from which a pair beyond the band is left out: with the real poles next to it, it
-would only offer huge residues that cancel in the band."""
-_CUT_POLES = -(10.0 ** (np.arange(-6, 14) / 3.0))
-_FIT_BAND_HZ = (0.02, 500.0)
-_TAIL_HZ = (1e-4, 1080.0)
-_TAIL_WEIGHT = 1e-3
-_CLOSEST = 3e-7
-_RCOND = 1e-10
-"""Cuts off the combinations of columns that would buy the last digit in the band with huge residues
-that cancel there and nowhere else."""
-
-
-class RealisationError(ValueError):
-    """The damping cannot be realised to the error asked for, or not stably."""
-
-
 def realise(
     beam: Beam,
     damping: Damping,
@@ -124,7 +118,7 @@ def realise(
     Parameters
     ----------
     beam, damping
-        What to realise.
+        Parameters of the exact model.
     tip_mass_kg, root_compliance_rad_per_nm
         Point mass at its tip, and by how much its clamp turns for a torque.
     max_relative_error
@@ -305,6 +299,9 @@ def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float
     return float(np.linalg.eigvals(motor_and_beam.a).real.max())
 
 
+# Beam on a motor
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CoupledModel:
     """``x' = a x + b τ`` of a motor that rigidly turns a beam; τ is the torque on the shaft in N·m.
@@ -378,11 +375,11 @@ def couple(
     realisation
         The beam; None for the motor (and the clamp) alone.
     motor_inertia_kg_m2
-        Of motor and gear, seen from the output shaft.
+        Inertia of motor and gear at the output shaft.
     viscous_nm_s_per_rad
         Viscous friction at the output shaft.
     tool_inertia_kg_m2
-        Between sensor and beam.
+        Inertia between sensor and beam.
     """
     beam_states = 0 if realisation is None else realisation.b.size
     n = 2 + beam_states

@@ -1,8 +1,7 @@
 """Motion of the beam's free end, predicted from the motor's angle.
 
-Of the boundary value problem of the beam, clamped on the shaft and free at its tip, the tip's
-displacement and slope over the angle are, with ``z = beta L`` as in
-`rigd.beam._model`::
+The boundary value problem of the beam, clamped on the shaft and free at its tip, gives the tip's
+displacement and slope over the angle as, with ``z = beta L`` as in `rigd.beam._model`::
 
     Y(L)  = L (sin z + sinh z) / (z (1 + cos z cosh z))
     Y'(L) = (cos z + cosh z) / (1 + cos z cosh z)
@@ -51,9 +50,9 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
     Parameters
     ----------
     beam, damping
-        Of the exact model; no drag of the air.
+        Parameters of the exact model, without air drag.
     angle_rad
-        Of the motor, from rest, shape (n,).
+        Motor angle from rest, shape (n,).
     rate_hz
         Samples a second.
     """
@@ -84,28 +83,22 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
     )
 
 
-def _quick_length(least: int) -> int:
-    """Length of which a transform is quick: at most an eighth more than the least one."""
-    unit = 1 << max(0, least.bit_length() - 4)
-    return -(-least // unit) * unit
-
-
 def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
     """Motion of the tip over the angle.
 
     Parameters
     ----------
     beam, damping
-        Of the exact model.
+        Parameters of the exact model.
     s
-        In rad/s, not 0.
+        Laplace variable in rad/s, not 0.
 
     Returns
     -------
     displacement
         In m/rad, of the shape of `s`.
     slope
-        Dimensionless, likewise.
+        Slope at the tip over the angle, dimensionless, same shape.
     """
     external = damping.gamma * s**damping.lambda_
     internal = 1 + damping.zeta * s**damping.alpha
@@ -121,3 +114,9 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     displacement: Complex = beam.length_m * sines * reciprocal / z
     slope: Complex = cosines * reciprocal
     return displacement, slope
+
+
+def _quick_length(least: int) -> int:
+    """Length of which a transform is quick: at most an eighth more than the least one."""
+    unit = 1 << max(0, least.bit_length() - 4)
+    return -(-least // unit) * unit

@@ -52,11 +52,11 @@ class LoadedResponse:
 
     response: Complex
     by_elastic: Complex
-    """By c."""
+    """Derivative with respect to c."""
     by_inertial: Complex
-    """By p."""
+    """Derivative with respect to p."""
     by_mass: Complex
-    """By the tip's mass, in N·m/(rad kg)."""
+    """Derivative with respect to the tip's mass, in N·m/(rad kg)."""
 
 
 def loaded_response(
@@ -71,7 +71,7 @@ def loaded_response(
     elastic, inertial : ndarray of complex
         c and p there.
     beam : Beam
-        Its stiffness and length; its density is in p.
+        Stiffness and length of the beam; its density is in p.
     tip_mass_kg : float
     """
     stiffness, length = beam.bending_stiffness_n_m2, beam.length_m

@@ -1,4 +1,4 @@
-"""The peer: cyclictest of rt-tests, the least lateness a program can have on this computer."""
+"""Peer of the loop: cyclictest of rt-tests, the least latency of a program on this computer."""
 
 import os
 import re
@@ -24,7 +24,7 @@ class CyclictestError(Exception):
 
 
 def installed() -> bool:
-    """Whether it is there."""
+    """Whether cyclictest is installed."""
     return shutil.which(NAME) is not None
 
 
@@ -36,7 +36,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
     rate_hz
         Wake-ups a second.
     seconds
-        For how long.
+        Duration of the measurement.
     cpu
         The core.
     priority
@@ -69,7 +69,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
 
 
 def measured(output: str, rate_hz: float) -> Measurement:
-    """Return what its histogram tells.
+    """Return the measurement in its histogram.
 
     A wake-up that comes a period late or later stands for as many ticks that a loop would have
     missed: cyclictest, too, goes on with the next deadline that is still ahead.

@@ -1,4 +1,4 @@
-"""The loop itself, measured: real sessions of the real processes on a simulated rig."""
+"""Loops to measure: real sessions of the real processes on a simulated rig."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ from rigd.session import decode_samples, read_session
 
 LOOK_S = 0.1
 AROUND_S = 3.5
-"""What a measurement takes beyond its record."""
+"""Time that a measurement takes beyond its record."""
 _BLOCK = 10_000
 _TARE_S = 0.2
 _NO_LIMIT = 1_000_000_000
@@ -44,9 +44,9 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
     Parameters
     ----------
     profile
-        Whose settings count.
+        Profile whose settings count.
     rate_hz
-        Of the loop.
+        Rate of the loop.
     spin_us
         Last part of each wait that is spent polling the clock.
     """
@@ -109,7 +109,7 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
     Parameters
     ----------
     name
-        What the measurement is called.
+        Name of the measurement.
     profile
         From :func:`rig_for`.
     seconds
@@ -162,7 +162,7 @@ def run_session(
     name, profile, seconds, look
         As for :func:`run_alone`.
     live
-        With a live view.
+        Run it with a live view.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One measurement of the loop: its figures, and what it takes of the computer."""
+"""One measurement of the loop: its figures, and the processor time it takes."""
 
 import time
 from dataclasses import dataclass
@@ -9,10 +9,16 @@ import numpy.typing as npt
 
 from rigd.engine import Phase
 
+HELD = 0.999
+"""Share of its ticks that a computer has to run in their periods to hold a rate."""
+STALL_US = 2000.0
+"""A wake-up that is as late as this was held up by no loop and no rate: the host of a virtual
+machine took the processor away, or firmware did."""
+
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Since a process began."""
+    """Processor time and page faults since a process began."""
 
     cpu_s: float
     page_faults: int
@@ -41,7 +47,7 @@ class UsageMeter:
     Parameters
     ----------
     pid
-        Of the process.
+        Process identifier.
     """
 
     def __init__(self, pid: int) -> None:
@@ -73,13 +79,6 @@ class UsageMeter:
         return self._looks[1][1].page_faults - self._looks[0][1].page_faults
 
 
-HELD = 0.999
-"""Share of its ticks that a computer has to run in their periods to hold a rate."""
-STALL_US = 2000.0
-"""A wake-up that is as late as this was held up by no loop and no rate: the host of a virtual
-machine took the processor away, or firmware did."""
-
-
 @dataclass(frozen=True, slots=True)
 class Figures:
     """Percentiles, in µs."""
@@ -104,7 +103,7 @@ class Measurement:
     scheduled: int
     missed: int
     cpu_percent: float | None = None
-    """Of one core, that the process of the loop took."""
+    """Load of one core by the process of the loop."""
     page_faults: int | None = None
 
     @property
@@ -121,7 +120,7 @@ class Measurement:
 
     @property
     def stalls(self) -> int:
-        """How often it stood still."""
+        """Number of stalls."""
         return int(np.count_nonzero(self.lateness_us >= STALL_US))
 
 
@@ -158,20 +157,20 @@ def measurement(
     cpu_percent: float | None,
     page_faults: int | None,
 ) -> Measurement:
-    """Return what the samples of a record tell.
+    """Return the measurement from the samples of a record.
 
     Parameters
     ----------
     name
-        What was measured.
+        Name of the measurement.
     rate_hz
         Ticks a second.
     samples
-        Of the record; those that are not there were missed.
+        Samples of the record; ticks without a sample were missed.
     scheduled
         Ticks of the record.
     cpu_percent, page_faults
-        Of the control process.
+        Processor load and page faults of the control process.
     """
     return Measurement(
         name,

@@ -1,4 +1,4 @@
-"""What is measured, in which order, and how long it still takes."""
+"""Programme of the measurements: which, in which order, and the time left."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from rigd.engine import REFUSED
 from rigd.profile import Profile
 
 ROUNDS = 3
-"""Of loop and cyclictest in turn: the computer is not the same from one second to the next."""
+"""Rounds of loop and cyclictest in turn: the computer changes from one second to the next."""
 ALONE = "loop alone"
 RECORDED = "with recorder"
 SHOWN = "with recorder and live view"
@@ -36,11 +36,11 @@ class Results:
     spin_us: float
     granted: dict[str, str]
     load_average: tuple[float, float, float]
-    """Of this computer, before."""
+    """Load average of this computer before the measurements."""
     rounds: list[tuple[Measurement, Measurement | None]] = field(default_factory=list)
     """The loop alone, and cyclictest right after it."""
     sessions: list[Measurement] = field(default_factory=list)
-    """With recorder, and with what else there is."""
+    """Sessions with the recorder, and with each further load."""
     search: list[Measurement] = field(default_factory=list)
     """Sessions at other rates, and the best at this."""
     no_peer: str = ""
@@ -92,9 +92,9 @@ class Bench:
     profile
         Its real-time settings count; nothing of its hardware is touched.
     rate_hz
-        Of the loop.
+        Rate of the loop.
     seconds
-        Of each measurement.
+        Duration of each measurement.
     spin_us
         Last part of each wait that is spent polling the clock.
     tell
@@ -215,14 +215,6 @@ class Bench:
         self._tell(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
 
 
-def _merit(one: Measurement) -> tuple[bool, float]:
-    return one.held >= HELD, one.held_between_stalls
-
-
-def _holds(one: Measurement) -> bool:
-    return one.held_between_stalls >= HELD
-
-
 def core_of(granted: dict[str, str]) -> int:
     """Return the core that the loop runs on."""
     text = granted["cpu"]
@@ -233,6 +225,14 @@ def cores_beside(granted: dict[str, str]) -> set[int]:
     """Return the cores that the loop does not run on; all where there is only one."""
     allowed = os.sched_getaffinity(0)
     return allowed - {core_of(granted)} or allowed
+
+
+def _merit(one: Measurement) -> tuple[bool, float]:
+    return one.held >= HELD, one.held_between_stalls
+
+
+def _holds(one: Measurement) -> bool:
+    return one.held_between_stalls >= HELD
 
 
 def _median(values: list[float]) -> float:

@@ -1,9 +1,8 @@
-"""What the devices themselves say: connected, asked and polled, but never enabled.
+"""Checks of the connected devices: drive, sensor and their exchange, without a torque.
 
-The exchange of a tick, as a session does it before the drive is enabled: SYNC, poll, replies.
-
-It runs in an ordinary process, which oversleeps now and then; what a device cannot do shows in
-most ticks.
+The devices are connected, asked and polled, but the drive is never enabled. The exchange of a tick
+is as in a session before the drive is enabled: SYNC, poll, replies. It runs in an ordinary process,
+which oversleeps now and then; what a device cannot do shows in most ticks.
 """
 
 import time
@@ -29,6 +28,21 @@ from rigd.engine import RealClock
 from rigd.profile import Profile
 
 _IN_HEX = ("vendor_id", "product_code", "supported_modes")
+
+
+_WATCHDOG_DETAIL = {
+    Watchdog.OWN: (
+        "Watchdog: its time is what the profile says (cia402.own_watchdog_s), which nothing here "
+        "can read back. Try it at a low torque: kill rigd, and see when the torque goes."
+    ),
+    Watchdog.NONE: (
+        "Watchdog: should this computer fail with the torque on, nothing but the wired stop (STO) "
+        "takes it off."
+    ),
+}
+
+
+# Drive
 
 
 @runtime_checkable
@@ -69,7 +83,7 @@ def drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[Row]:
 
 
 def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
-    """Tell which watchdog stands, what stands in for what is missing, and what was accepted."""
+    """Show the watchdog, the replacements of missing objects, and what was accepted."""
     stands, after_s = outfit.watchdog, outfit.watchdog_s
     unproven = stands in (Watchdog.OWN, Watchdog.NONE)
     yield Row(
@@ -99,21 +113,11 @@ def _safeguard_rows(outfit: Outfit) -> Iterator[Row]:
         yield Row("drive", "object set", text, "read back", Verdict.OK)
 
 
-_WATCHDOG_DETAIL = {
-    Watchdog.OWN: (
-        "Watchdog: its time is what the profile says (cia402.own_watchdog_s), which nothing here "
-        "can read back. Try it at a low torque: kill rigd, and see when the torque goes."
-    ),
-    Watchdog.NONE: (
-        "Watchdog: should this computer fail with the torque on, nothing but the wired stop (STO) "
-        "takes it off."
-    ),
-}
-
+# Sensor
 
 MEASURED_S = 1.0
 _ROUNDING = 1.001
-# Of a stream's rate: beyond what clocks differ by, and beyond what the filter's weights stand for.
+# Relative error of a stream's rate: more than clocks differ by; too much for the filter's weights.
 _RATE_OFF, _RATE_WRONG = 0.01, 0.05
 
 _UNSTATED = "not stated by the sensor"
@@ -222,6 +226,8 @@ def _judge(key: str, value: float, rig: RigParameters) -> tuple[str, Verdict]:
     return "0", grade(fail=False, warn=value > 0)
 
 
+# Exchange of a tick
+
 TICKS = 500
 _FEW_MISSING = 0.02
 _MANY_MISSING = 0.2
@@ -234,11 +240,11 @@ def exchange_rows(profile: Profile, devices: Devices, moves: Reality) -> Iterato
     Parameters
     ----------
     profile
-        Whose limits count.
+        Profile whose limits count.
     devices
         Connected, not enabled.
     moves
-        In lock-step the simulated rig waits for this computer, and times mean nothing.
+        What moves. In lock-step the simulated rig waits for this computer: times mean nothing.
 
     Raises
     ------
@@ -306,6 +312,9 @@ def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: Reality) -> Row:
     limit_ms = acquisition.deadline_us * 1e-3
     verdict = grade(fail=median >= limit_ms, warn=late >= limit_ms)
     return Row(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
+
+
+# All devices
 
 
 def inspect_devices(profile: Profile) -> list[Row]:

@@ -1,8 +1,7 @@
-"""What the system would grant a session's loop, tried in a process that ends at once.
+"""Checks of this computer for a loop in real time: rights and settings. Advice, never a refusal.
 
-What this computer is like for a loop in real time: advice, never a refusal.
-
-``rigd bench`` measures what it comes to; ``docs/real_time.md`` says how to change it.
+What the system would grant a session's loop is tried in a process that ends at once. ``rigd bench``
+measures what the settings come to; ``docs/real_time.md`` says how to change them.
 """
 
 import ctypes
@@ -18,6 +17,8 @@ from pathlib import Path
 from rigd.checks._rows import Row, Verdict, grade
 from rigd.engine import LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
+
+# Rights
 
 _PATIENCE_S = 20.0
 _TRY = """
@@ -67,7 +68,7 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[Row]:
-    """Say what a session would be granted of what the profile asks for."""
+    """Show which of the profile's real-time settings a session would be granted."""
     try:
         obtained = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
@@ -119,6 +120,8 @@ def _user() -> str:
         return str(os.geteuid())
 
 
+# Computer
+
 _GROUP = "computer"
 _CPU = Path("sys/devices/system/cpu")
 _CLOCK_SOURCE = Path("sys/devices/system/clocksource/clocksource0/current_clocksource")
@@ -129,22 +132,22 @@ _TIMEX_SIZE = 512
 """More than the kernel's structure has on any architecture."""
 _NOT_SYNCHRONISED = 5
 _LEAST_RUNTIME = 0.95
-"""Of each period that the kernel leaves to real-time processes unless told otherwise."""
+"""Share of each period that the kernel leaves to real-time processes by default."""
 
 
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[Row]:
-    """Say what about this computer makes ticks late, and what is done about it.
+    """Show what on this computer makes ticks late, and the remedies.
 
     Parameters
     ----------
     settings
-        What the profile asks for.
+        Real-time settings of the profile.
     root
-        Of the file system.
+        Root of the file system.
     kernel
-        Its version as ``uname -v`` has it; empty: that of this computer.
+        Version of the kernel as in ``uname -v``; empty: that of this computer.
     """
     kernel = kernel or platform.version()
     yield _kernel_row(root, kernel)

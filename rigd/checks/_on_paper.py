@@ -1,22 +1,19 @@
-"""What profile and EDS alone show: the closed loop, worst travel, identifiers, assumed numbers.
+"""Checks of profile and EDS file alone: closed loop, stopping distance, identifiers, sources.
 
-The closed loop on paper: stability, and how far it is from losing it.
+Closed loop: stability, and the margins. What is asked for depends on what a margin stands for (see
+:mod:`rigd.control._margins`). At the angle it is the rule of thumb for the gain of a feedback loop,
+a factor of 2. At torque command and torque reading, where the beam is cancelled and a factor of 2
+cannot be had, it is the tolerance of a drive's torque constant and of a calibration, taken twice:
+20 %. The phase has to bear what such an error turns a signal by at most (an error of 20 % across
+it: 11.5°), together with one period of delay at the second mode (16 Hz: 5.8°): 20°, rounded up. The
+delay has to bear one period more than the profile states: a reading or a command that is a tick
+late. A loop that misses this is a warning, not a failure: it is stable as described, and whether
+the description is right is what such a session may be for.
 
-What is asked for depends on what a margin stands for (see :mod:`rigd.control._margins`). At the
-angle it is the rule of thumb for the gain of a feedback loop, a factor of 2. At torque command and
-torque reading, where the beam is cancelled and a factor of 2 cannot be had, it is the tolerance of
-a drive's torque constant and of a calibration, taken twice: 20 %. The phase has to bear what such
-an error turns a signal by at most (an error of 20 % across it: 11.5°), together with one period of
-delay at the second mode (16 Hz: 5.8°): 20°, rounded up. The delay has to bear one period more than
-the profile states: a reading or a command that is a tick late.
-
-A loop that misses this is a warning, not a failure: it is stable as described, and whether the
-description is right is what such a session may be for.
-
-How far the shaft still turns when nobody looks at it: the loop has failed, or runs blind.
-
-The worst that the limits allow: at the limit of the angle, moving outwards at the limit of the
-speed, with the peak torque pushing on. Three things end that, each after its own time:
+Stopping distance: how far the shaft still turns when nothing controls it, because the loop has
+failed or runs blind. It is the worst that the limits allow: at the limit of the angle, moving
+outwards at the limit of the speed, with the peak torque pushing on. Three things end that, each
+after its own time:
 
 * the drive watches over the loop's heartbeat, and misses it when the loop has stopped;
 * a loop whose angles do not come goes on with the last one, heartbeat included, and ends the
@@ -32,7 +29,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import degrees, inf, isinf, radians
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rigd.beam import RealisationError
 from rigd.checks._rows import Row, Verdict, grade
@@ -44,8 +40,7 @@ from rigd.devices.cia402 import Grade, judge
 from rigd.profile import Profile
 from rigd.safety import Limits
 
-if TYPE_CHECKING:
-    from rigd.devices import RigParameters
+# Closed loop
 
 TOLERANCE = 1.2
 """Factor that the gains of command and torque reading may be wrong by, up and down."""
@@ -124,6 +119,8 @@ def _at(value: str, frequency_hz: float) -> str:
     return value if frequency_hz != frequency_hz else f"{value} ({frequency_hz:.1f} Hz)"
 
 
+# Stopping distance
+
 _STEP_S = 5e-5
 _FOR_EVER_RAD = 100.0
 _GROUP = "travel"
@@ -137,7 +134,7 @@ class Travel:
     driven_rad: float
     """While the torque is still on; infinite beyond 100 rad."""
     coasting_rad: float
-    """After it; infinite likewise, and if no friction ends it."""
+    """While the shaft runs out; infinite beyond 100 rad, and where no friction stops it."""
 
     @property
     def total_rad(self) -> float:
@@ -148,16 +145,16 @@ class Travel:
 def worst_travel(
     rig: RigParameters, limits: Limits, blind_s: float, max_speed_rad_s: float = inf
 ) -> Travel:
-    """Return the worst travel while nobody looks.
+    """Return the worst travel while nothing controls the shaft.
 
     Parameters
     ----------
     rig, limits
-        Of the profile.
+        Parameters and limits of the profile.
     blind_s
-        For how long the torque stays on; infinite if nothing ends it.
+        Time for which the torque stays on; infinite if nothing ends it.
     max_speed_rad_s
-        Above which the drive by itself exerts no torque.
+        Speed above which the drive by itself exerts no torque.
 
     Notes
     -----
@@ -196,12 +193,12 @@ def worst_travel(
 
 @dataclass(frozen=True, slots=True)
 class _Blindness:
-    """One way in which nobody looks at the shaft while the torque stays on."""
+    """One way in which the torque stays on while nothing controls the shaft."""
 
     what: str
     duration_s: float
     ended_by: str
-    """What ends it, with its key."""
+    """Limit or watchdog that ends it, with its key."""
     key: str
 
 
@@ -299,6 +296,8 @@ def _friction_nm(rig: RigParameters, speed_rad_s: float) -> float:
     return rig.motor.viscous_nm_s_per_rad * speed_rad_s + rig.motor.coulomb_nm
 
 
+# EDS file
+
 _VERDICTS = {
     Grade.FITS: Verdict.OK,
     Grade.STANDS_IN: Verdict.OK,
@@ -309,15 +308,15 @@ _VERDICTS = {
 }
 
 
-def eds_rows(path: Path, rig: "RigParameters | None") -> Iterator[Row]:
+def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[Row]:
     """Hold an EDS file against what rigd asks of a drive.
 
     Parameters
     ----------
     path
-        Of the file.
+        Path of the EDS file.
     rig
-        Of the profile that the drive is to serve, or None.
+        Parameters of the profile that the drive is to serve, or None.
     """
     try:
         node_id = rig.cia402.node_id if rig is not None and rig.cia402 is not None else 1
@@ -337,8 +336,10 @@ def eds_rows(path: Path, rig: "RigParameters | None") -> Iterator[Row]:
         )
 
 
+# Profile and wiring
+
 HIGH_LOAD = 0.7
-"""Above, one more device does not fit, nor do repeated frames after a disturbance."""
+"""Load above which one more device, or repeated frames after a disturbance, do not fit."""
 
 
 def profile_rows(profile: Profile) -> Iterator[Row]:

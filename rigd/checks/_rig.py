@@ -1,4 +1,4 @@
-"""The whole check, in the order in which one thing rules out the next."""
+"""The whole check of a rig, in the order in which one thing rules out the next."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a check finds: rows of one table, as text, and the verdict over all of them."""
+"""Rows of a check: what was found, the verdict over all of them, and their table as text."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +9,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+
+# Values and their units
 
 _UNITS = {
     "_hz": (1.0, "Hz"),
@@ -56,8 +58,11 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+# Rows
+
+
 class Verdict(Enum):
-    """Of one row."""
+    """Result of one row."""
 
     OK = "ok"
     WARNING = "warning"
@@ -76,10 +81,10 @@ class Row:
     what: str
     found: str
     wanted: str
-    """What it is compared with; empty if with nothing."""
+    """Value it is compared with; empty if there is none."""
     verdict: Verdict
     detail: str = ""
-    """What is too long for a table."""
+    """Text that is too long for a table."""
 
     def as_dict(self) -> dict[str, str]:
         """Return the row for a JSON document."""
@@ -107,6 +112,8 @@ def grade(*, fail: bool, warn: bool = False) -> Verdict:
         return Verdict.FAIL
     return Verdict.WARNING if warn else Verdict.OK
 
+
+# Table
 
 _STYLES = {
     Verdict.OK: "green",

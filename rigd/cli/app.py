@@ -1,4 +1,4 @@
-"""The command line of the rig, put together: ``rigd``."""
+"""The command line ``rigd``, put together from its commands."""
 
 import contextlib
 import errno

@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from rigd.daemon import Client
 
 
+_LOOK_S = 0.5
+_END_PATIENCE_S = 10.0
+
+
 def serve(
     profile: ProfileName,
     output: Output = SESSIONS,
@@ -69,9 +73,6 @@ def serve(
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
 
-
-_LOOK_S = 0.5
-_END_PATIENCE_S = 10.0
 
 DaemonOf = Annotated[
     str | None,

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from rigd.live import LiveAddress, Viewer
 
 
+_LOOK_S = 0.5
+
+
 def has_screen() -> bool:
     """Whether there is a screen for a window."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -59,9 +62,6 @@ def ended_gently() -> Iterator[None]:
     finally:
         for number, handler in zip(asked, before, strict=True):
             signal.signal(number, handler)
-
-
-_LOOK_S = 0.5
 
 
 def live(

@@ -1,4 +1,4 @@
-"""What several commands share: options, exit codes, progress."""
+"""Options, exit codes and progress that several commands share."""
 
 import contextlib
 import time
@@ -21,6 +21,8 @@ def fail(message: str, code: int) -> NoReturn:
     typer.echo(f"Error: {message}", err=True)
     raise typer.Exit(code)
 
+
+# Progress
 
 _QUIET_S = 2.0
 """What takes no longer than this shows no progress."""
@@ -63,6 +65,8 @@ def _bar(name: str) -> Iterator[Callable[[float], None]]:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 
+
+# Options
 
 ProfileName = Annotated[
     str, typer.Option("--profile", help="Name of a hardware profile, or its file.")

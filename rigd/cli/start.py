@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from rigd.runtime import StopRequest
 
 
+_POLL_S = 0.2
+
+
 class CrewGroup(TyperGroup):
     """Commands that run sessions; Ctrl-C before they catch it themselves is told of.
 
@@ -74,9 +77,6 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
         )
     except ChildError as error:
         fail(str(error), EXIT_FAILED)
-
-
-_POLL_S = 0.2
 
 
 def start_sessions(

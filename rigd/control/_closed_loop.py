@@ -50,7 +50,7 @@ near that mode. With the coupling torque fed forward a mode loses 0.0001 to 0.00
 """
 
 _LIGHT_DAMPING_RATIO = 1e-4
-"""Of the beam for that check: undamped, its realisation may itself be unstable by rounding."""
+"""Damping of the beam in that check: undamped, rounding may make its realisation unstable."""
 
 MAX_DELAY_PERIODS = 50
 """Longest delay that is modelled: every period of delay is one more state."""
@@ -63,7 +63,7 @@ _ROWS = 5  # angle, velocity, torque without friction, reference speed, sensor t
 
 @dataclass(frozen=True, slots=True)
 class LoopModel:
-    """What the closed loop is made of."""
+    """Parameters of the closed loop."""
 
     rate_hz: float
     beam: Beam | None
@@ -83,7 +83,7 @@ class LoopModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopResponse:
-    """What the loop does, tick by tick; each of shape (n,)."""
+    """Response of the loop, tick by tick; each of shape (n,)."""
 
     angle_rad: Real
     velocity_rad_s: Real
@@ -97,7 +97,7 @@ class LoopResponse:
 class Cut:
     """A signal at which the loop can be opened: it is read from the state and acts on the next.
 
-    Of the closed loop's matrix, ``outer(action, reading)`` is the part that goes through it.
+    ``outer(action, reading)`` is the part of the closed loop's matrix that passes through the cut.
     """
 
     name: str
@@ -124,7 +124,7 @@ class ClosedLoop:
     d: Real
     """(5,)."""
     model: LoopModel
-    """What it was made of."""
+    """Model it was computed from."""
     cuts: tuple[Cut, ...]
     """The torque command, the angle and the coupling torque as the controller reads them."""
     poles_rad_s: Complex

@@ -49,7 +49,7 @@ _ZOOMS = 3
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """How much one signal of a stable loop may be wrong; each with the frequency where it counts.
+    """Stability margins at one signal of a stable loop, each with its frequency.
 
     A frequency is NaN where there is no limit.
     """

@@ -1,15 +1,12 @@
-"""2DOF PID with filters, and its design.
-
-Pole-placement design of the motor's 2DOF PID with low-pass filters.
+"""2DOF PID with low-pass filters: its design by pole placement, and its discrete step.
 
 The motor seen from its output shaft is ``G_m = K/(s (s + g))`` with ``K = 1/J`` and ``g = B/J``.
-The beam does not appear in it: its measured coupling torque is fed forward.
+The beam does not appear in the design: its measured coupling torque is fed forward.
 
-The discrete 2DOF PID, one step a tick, in plain floats.
-
-Everything is discretised by Tustin's rule. The two low-pass filters of the reference (for the
-friction compensation) are the nominal closed loop ``1/(1 + s/p)²``, so that the compensated speed
-is the one the motor is expected to have, not the one that is asked of it.
+The discrete controller takes one step a tick, in plain floats. Everything is discretised by
+Tustin's rule. The two low-pass filters of the reference (for the friction compensation) are the
+nominal closed loop ``1/(1 + s/p)²``, so that the compensated speed is the one the motor is expected
+to have, not the one that is asked of it.
 """
 
 from dataclasses import dataclass
@@ -25,7 +22,7 @@ class ControlDesignError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ControlSettings:
-    """What a profile chooses about the controller."""
+    """Controller settings of a profile."""
 
     pole_rad_s: Annotated[float, Gt(0)]
     """All four poles of the nominal closed loop lie at minus this."""
@@ -108,6 +105,9 @@ def design_pid(
         # At p = g/3 there is no derivative part, neither of the angle nor of the reference.
         setpoint_weight_d=(b2 - b * kp) / (kd * a3) if kd else 0.0,
     )
+
+
+# Discrete controller
 
 
 class PidController:

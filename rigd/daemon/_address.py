@@ -1,4 +1,4 @@
-"""Where the daemon of a rig listens, and how its socket is made and found."""
+"""Address of a rig's daemon: its socket, how it is made and found."""
 
 import errno
 import grp
@@ -13,7 +13,7 @@ from pathlib import Path
 from rigd.runtime import runtime_folder
 
 COMMON = Path("/run/rigd")
-"""For a daemon that a group may use: a user's own runtime folder is closed to others."""
+"""Folder of daemons that a group may use: a user's own runtime folder is closed to others."""
 _SUFFIX = ".daemon"
 _PROBE_S = 1.0
 _CREDENTIALS = struct.Struct("3i")
@@ -47,16 +47,16 @@ def peer_of(link: socket.socket) -> tuple[int, int]:
 
 
 def bind(path: Path, group: str | None) -> socket.socket:
-    """Make the socket; nobody can connect before it listens, and nobody else than told after.
+    """Make the socket; nobody can connect before it listens, and only its users after.
 
     Call it only while holding the rig: what a dead daemon left is replaced.
 
     Parameters
     ----------
     path
-        Of the socket. The user's own folder is made if it can be, one for a group has to be there.
+        Path of the socket. The user's own folder is created; a group's folder has to exist.
     group
-        Whose members may use it too.
+        Group whose members may use it too.
 
     Raises
     ------

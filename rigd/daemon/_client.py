@@ -1,4 +1,4 @@
-"""The daemon as its clients see it: one blocking connection, and a stop that does not give up."""
+"""Client of the daemon: one blocking connection, and a stop that does not give up."""
 
 import json
 import os
@@ -27,12 +27,12 @@ _ANSWER_PATIENCE_S = 60.0
 """Connecting the devices anew takes up to half of it."""
 _CONNECT_PATIENCE_S = 5.0
 _CROWD_PATIENCE_S = 10.0
-"""For a daemon that turns clients away, or takes nobody."""
+"""Time to go on trying a daemon that turns clients away, or accepts nobody."""
 _STOP_PATIENCE_S = 10.0
 _STOP_ANSWER_S = 0.5
 _SIGNAL_AFTER_S = 0.3
 _END_PATIENCE_S = 3.0
-"""In which what a dead daemon has left ends by itself."""
+"""Time in which what a dead daemon has left ends by itself."""
 _PAUSE_S = 0.02
 _TIME = struct.Struct("@ll")
 _UNKNOWN = (
@@ -41,13 +41,16 @@ _UNKNOWN = (
 )
 
 
+# Connection
+
+
 class DaemonGoneError(Exception):
     """The daemon cannot be reached, or is gone; the message is for the operator.
 
     Parameters
     ----------
     message
-        What is known without looking.
+        Message as far as it is known without looking.
     lost
         Process and user of a daemon whose connection was lost.
     """
@@ -75,7 +78,7 @@ class Client:
     Parameters
     ----------
     path
-        Of the socket.
+        Path of the socket.
     connect_s
         Time for a daemon that takes no connections, being suspended or beset by others.
     answer_s
@@ -84,7 +87,7 @@ class Client:
     Attributes
     ----------
     pid, uid
-        Of the process that listens there, as the kernel knows it.
+        Process and user that listen there, as the kernel reports them.
 
     Raises
     ------
@@ -254,13 +257,16 @@ def _refusal(message: Document) -> RefusedByDaemonError:
     return kind(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
 
 
+# Stop
+
+
 def stop_session(path: Path) -> Document:
     """Have a daemon stop what it runs; asks again and again, then sends its process a signal.
 
     Parameters
     ----------
     path
-        Of its socket.
+        Path of its socket.
 
     Returns
     -------
@@ -341,7 +347,7 @@ def what_is_left(pid: int, uid: int) -> str:
     Parameters
     ----------
     pid, uid
-        Of its process and user.
+        Process and user of the daemon.
     """
     deadline_s = time.monotonic() + _END_PATIENCE_S
     while True:
@@ -411,6 +417,9 @@ def _signal_stop(pid: int) -> bool:
             os.kill(pid, STOP_SIGNAL)
             return True
     return False
+
+
+# Running daemons
 
 
 def find_views(rig: str | None) -> list[LiveAddress]:

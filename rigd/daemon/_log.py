@@ -27,7 +27,7 @@ class _Dropping(logging.handlers.QueueHandler):
         self._dropped = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Never wait."""
+        """Queue a record without waiting."""
         if self._dropped and not self._waiting.full():
             text = f"{self._dropped} lines before this one were dropped: nobody took them"
             self._waiting.put_nowait(

@@ -1,4 +1,4 @@
-"""``rigd serve`` from its first to its last moment: lock, socket, rig, signals."""
+"""Main program of ``rigd serve``: lock, socket, rig and signals, from start to end."""
 
 import asyncio
 import logging
@@ -33,11 +33,11 @@ def run_daemon(
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     folder
-        Where session files go.
+        Folder for session files.
     group
-        Whose members may command it, beside this user.
+        Group whose members may command it, as well as this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
 

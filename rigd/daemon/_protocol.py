@@ -1,4 +1,4 @@
-"""Requests to the daemon: from a line of bytes to something that may be obeyed, or a refusal.
+"""Requests to the daemon: parsed from a line of bytes into a checked request, or refused.
 
 Whatever comes in is untrusted. A refusal names what is wrong; docs/control_socket.md has the rules.
 """
@@ -32,7 +32,7 @@ class RequestError(Exception):
 
 
 class Request(BaseModel):
-    """What every request may have."""
+    """Fields that every request may have."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -44,7 +44,7 @@ class Request(BaseModel):
 
 
 class Status(Request):
-    """Tell how everything is."""
+    """Report the status of daemon, rig and session."""
 
     command: Literal["status"]
 

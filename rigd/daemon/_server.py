@@ -1,4 +1,4 @@
-"""The daemon's socket: lines in, lines out, and clients that may be slow, rude, or a thousand.
+"""Server on the daemon's socket: lines in, lines out, for many clients, slow and rude ones too.
 
 Nothing that a client does may cost the supervisor of a running session more than a moment: lines
 are short, taken one at a time, and at a bounded pace; what a client does not read is kept up to a
@@ -40,9 +40,9 @@ MOST_SILENT = 64
 _BACKLOG = 128
 _ACCEPTS_AT_ONCE = 64
 _ACCEPT_PAUSE_S = 0.001
-"""After so many at once: a crowd that connects without pause leaves time for everything else."""
+"""Pause after that many at once: a crowd that keeps connecting leaves time for the rest."""
 _PACE_S = 0.005
-"""From one request of a client to its next."""
+"""Least time between two requests of a client."""
 _MOST_UNREAD = 262_144
 _MOST_WAITING_LINES = 64
 _FAREWELL_S = 1.0
@@ -65,7 +65,7 @@ class Server:
         self._clients: set[_Client] = set()
         self._leaving: set[_Client] = set()
         self._silent: dict[socket.socket, _Silent] = {}
-        """In the order in which they came."""
+        """Silent connections, in the order in which they came."""
         self._answering: set[asyncio.Task[None]] = set()
         self._looked_up: set[int] = set()
         self._count = 0
@@ -284,7 +284,7 @@ class _Client(asyncio.Protocol):
         self._service = service
         self._peer = peer
         self._said = said
-        """Before it became a client."""
+        """Bytes received before it became a client."""
         self._transport: asyncio.Transport | None = None
         self._pending = bytearray()
         self._lines: deque[bytes] = deque()
@@ -309,7 +309,7 @@ class _Client(asyncio.Protocol):
 
     @property
     def pid(self) -> int:
-        """Of its process."""
+        """Number of its process."""
         return self._peer.pid
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:

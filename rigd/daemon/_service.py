@@ -1,4 +1,4 @@
-"""What the daemon does: it owns a rig, obeys requests, and says what happens. No sockets here.
+"""Service of the daemon: it owns a rig, obeys requests, and publishes events. No sockets here.
 
 Everything runs in one thread but the calls of the rig that take their time, which run one after the
 other in a second one. A stop does not wait for that one.
@@ -59,11 +59,11 @@ from rigd.runner import (
 from rigd.runtime import StopRequest
 
 LOOK_S = 0.2
-"""From one look at the rig to the next."""
+"""Time from one look at the rig to the next."""
 _DEAF_S = 1.5
-"""Without a look for so long the event loop is stuck, and hears no stop."""
+"""Time without a look after which the event loop counts as stuck, and hears no stop."""
 _RATE_LOOKS = 10
-"""Over as many of them a rate is measured."""
+"""Number of looks over which a rate is measured."""
 _LOGGED = {
     "info": logging.INFO,
     "warning": logging.WARNING,
@@ -81,7 +81,7 @@ _log = logging.getLogger(NAME)
 
 
 class RigControl(Protocol):
-    """What the daemon needs of :class:`rigd.runner._rig.Rig`."""
+    """Part of :class:`rigd.runner.Rig` that the daemon uses."""
 
     connected: bool
     zero_lost: bool
@@ -111,7 +111,7 @@ class RigControl(Protocol):
         """See whether all is well between sessions."""
 
     def status(self) -> RigStatus | None:
-        """Look at the board, from any thread."""
+        """Read the status from shared memory, from any thread."""
 
     def disconnect(self) -> None:
         """Close everything."""
@@ -166,19 +166,19 @@ class Service:
     Parameters
     ----------
     rig
-        To own; not connected yet.
+        Rig to own; not connected yet.
     profile
-        Of the rig.
+        Profile of the rig.
     folder
-        Where session files go.
+        Folder for session files.
     worker
         Runs the calls of the rig, one at a time.
     publish
-        Takes the events that are for whoever watches.
+        Takes the events for clients that watch.
     moving
         Says what would move if the rig were connected now.
     fast, live
-        As the rig was made.
+        Options with which the rig was made.
 
     Attributes
     ----------
@@ -223,7 +223,7 @@ class Service:
 
     @property
     def state(self) -> State:
-        """Where the daemon is."""
+        """State of the daemon."""
         return self._states.state
 
     async def open(self) -> None:
@@ -293,7 +293,7 @@ class Service:
         return await self._reset()
 
     def status(self) -> Document:
-        """Tell everything there is to tell."""
+        """Return the status of daemon, rig and session."""
         series = self._series
         look = self._look if self._rig.connected else None
         return {
@@ -331,7 +331,7 @@ class Service:
         return {"stopping": True}
 
     def look(self) -> None:
-        """Take a look at the board, and tell of the progress."""
+        """Read the rig's status, and publish the progress."""
         self._look = look = self._rig.status()
         if look is None:
             self._written.clear()

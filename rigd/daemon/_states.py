@@ -1,4 +1,4 @@
-"""The states of the daemon, what leads from one to another, and what is told of them as JSON."""
+"""States of the daemon, their transitions, and the daemon's status as JSON documents."""
 
 import os
 import pwd
@@ -19,7 +19,7 @@ _REMEMBERED = 50
 
 
 class State(StrEnum):
-    """Where the daemon is."""
+    """States of the daemon."""
 
     IDLE = "idle"
     """The devices are closed."""
@@ -61,7 +61,7 @@ _COMES_FROM: Mapping[str, State] = {
 
 
 class IllegalTransitionError(Exception):
-    """A transition that there is not: a mistake in the program."""
+    """A transition that does not exist: an error in the program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +105,12 @@ class StateMachine:
 
     @property
     def since_utc_ns(self) -> int:
-        """When the present state began."""
+        """Time at which the present state began."""
         return self.history[-1].utc_ns if self.history else self._began_utc_ns
 
     @property
     def reason(self) -> str:
-        """Why it is the present one."""
+        """Reason of the present state."""
         return self.history[-1].reason if self.history else "the daemon was started"
 
     def move(self, after: State, reason: str) -> None:
@@ -140,6 +140,8 @@ class StateMachine:
         )
 
 
+# Documents
+
 Document = dict[str, Any]
 
 
@@ -159,7 +161,7 @@ class Peer:
     """A client, as the kernel knows it."""
 
     number: int
-    """Of its connection."""
+    """Number of its connection."""
     pid: int
     uid: int
 
@@ -203,7 +205,7 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
     Parameters
     ----------
     look
-        At the board.
+        Status of the rig.
     rates
         Measured records a second, by topic.
     """
@@ -262,7 +264,7 @@ def progress_document(look: RigStatus, total: int, rate_hz: float | None) -> Doc
     Parameters
     ----------
     look
-        At the board.
+        Status of the rig.
     total
         Ticks of the record.
     rate_hz

@@ -1,9 +1,9 @@
 """Electronic data sheets (EDS and DCF files, CiA 306): what a drive has, as its vendor's file says.
 
-What real files have and the canopen library refuses (byte order marks, keys in lower case, sections
-given twice or out of order, empty values, octal numbers, missing names) is put right in one place
-before: :func:`_put_right`. What it reads by itself is read alike here, without its import, which
-takes longer than a file.
+Real files have what the canopen library refuses: byte order marks, keys in lower case, sections
+given twice or out of order, empty values, octal numbers, missing names. :func:`_put_right` corrects
+all of it in one place. What the library accepts is read with the same result, but without importing
+it, which takes longer than reading a file.
 """
 
 import re
@@ -17,9 +17,9 @@ from typing import Final
 from rigd.printable import printable
 
 MAX_BYTES: Final = 4_000_000
-"""Of a file: the greatest that vendors publish have a quarter of it."""
+"""Largest file: the largest that vendors publish have a quarter of it."""
 MAX_ENTRIES: Final = 20_000
-"""Of its objects and sub-indices: five times what the greatest drives have."""
+"""Most objects and sub-indices: five times what the largest drives have."""
 
 _MOST_SHOWN: Final = 80
 """Characters of a text of the file."""
@@ -60,7 +60,7 @@ class EdsEntry:
     sub: int
     name: str
     data_type: int
-    """By CiA 301: 0x0006 is UNSIGNED16; 0: not told."""
+    """Data type by CiA 301: 0x0006 is UNSIGNED16; 0: not stated."""
     access: str
     """``ro``, ``rw``, ``wo``, ``const``, ``rwr`` or ``rww``."""
     mappable: bool
@@ -86,23 +86,23 @@ class EdsEntry:
 
 @dataclass(frozen=True, slots=True)
 class Eds:
-    """What a file tells of a drive."""
+    """Content of a drive's EDS or DCF file."""
 
     path: Path
     node_id: int
-    """For which it was read."""
+    """Node number for which the file was read."""
     vendor_name: str
     vendor_id: int
-    """What object 1018:1 shows; 0: not told."""
+    """Value of object 1018:1; 0: not stated."""
     product_name: str
     product_code: int
-    """What object 1018:2 shows; 0: not told."""
+    """Value of object 1018:2; 0: not stated."""
     revision: int
-    """What object 1018:3 shows; 0: not told."""
+    """Value of object 1018:3; 0: not stated."""
     bit_rates_bit_s: tuple[int, ...]
     """Empty: not told."""
     commissioned_node_id: int
-    """Of the one drive that a DCF configures; 0: not told."""
+    """Node number of the one drive that a DCF configures; 0: not stated."""
     entries: Mapping[tuple[int, int], EdsEntry]
     """By index and sub-index; a plain variable has the sub-index 0."""
 
@@ -121,9 +121,9 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
     Parameters
     ----------
     path
-        Of the file.
+        Path of the EDS or DCF file.
     node_id
-        Of the drive: what ``$NODEID`` stands for in the file.
+        Node number of the drive: what ``$NODEID`` stands for in the file.
 
     Returns
     -------
@@ -205,9 +205,9 @@ def _text(path: Path) -> str:
 
 
 def _sections(text: str, path: Path) -> Sections:
-    """Take a file apart; what is neither section nor key is passed over.
+    """Parse a file into sections; lines that are neither section nor key are ignored.
 
-    Of sections and keys that stand twice the first counts.
+    Where a section or key stands twice, the first one counts.
     """
     sections: Sections = {}
     keys: dict[str, str] = {}

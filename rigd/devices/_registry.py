@@ -1,4 +1,4 @@
-"""The drivers a profile can name, found without importing those it does not name."""
+"""Registry of drivers: those that a profile names, found without importing the others."""
 
 import importlib
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class Reality(Enum):
 
     HARDWARE = "the hardware"
     SIMULATED = "the simulated rig"
-    """In the process that opens it, under whatever clock."""
+    """Simulated in the process that opens it, under either clock."""
     SIMULATOR = "rigd simulate, by the clock"
     LOCK_STEP = "rigd simulate, in lock-step"
 
@@ -44,7 +44,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
     Parameters
     ----------
     selection
-        As a profile has it.
+        Drive and sensor that a profile names.
     source
         The profile's file, for the message.
 
@@ -63,7 +63,7 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
 
 
 def reality(rig: RigParameters) -> Reality:
-    """Tell what would move if the devices of a rig were opened now."""
+    """Return what would move if the devices of a rig were opened now."""
     if rig.devices.drive == "sim":
         return Reality.SIMULATED
     simulator = find_simulator(rig.name)
@@ -73,7 +73,7 @@ def reality(rig: RigParameters) -> Reality:
 
 
 def what_moves(rig: RigParameters, moving: Reality) -> str:
-    """Say what will move, hardware as loudly as what stands in for it."""
+    """Say what will move, the hardware or its simulation."""
     if moving is not Reality.HARDWARE:
         how = "in this process" if moving is Reality.SIMULATED else moving.value
         return f"No hardware: {rig.name} is simulated ({how})."
@@ -86,7 +86,7 @@ def what_moves(rig: RigParameters, moving: Reality) -> str:
 
 
 def simulated_differently(rig: RigParameters) -> list[str]:
-    """Say in what the running simulated rig, if any stands in, differs from the profile's."""
+    """List the differences of a running simulated rig, if any, from the profile's."""
     simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
     return [] if simulator is None else differences(rig, simulator)
 
@@ -119,7 +119,7 @@ def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:
     Parameters
     ----------
     rig
-        As a profile has it.
+        Parameters of a profile.
     moving
         What the operator was told would move, if that was told before.
 

@@ -1,4 +1,4 @@
-"""Where a running ``rigd simulate`` is found: one small file for each simulated rig.
+"""Address of a running ``rigd simulate``: one small file for each simulated rig.
 
 The simulated rig stands in for the hardware of one profile. Whoever opens that profile's devices
 looks here first, so that a motor never moves where a simulation was meant.
@@ -26,7 +26,7 @@ _LISTENS = 0x10000
 
 @dataclass(frozen=True, slots=True)
 class SimulatorAddress:
-    """How to reach a simulated rig."""
+    """Address of a simulated rig."""
 
     pid: int
     control_socket: str
@@ -47,7 +47,7 @@ def described(rig: "RigParameters") -> dict[str, object]:
 
 
 def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
-    """Say in what the rig that is simulated differs from a profile's: one phrase a key."""
+    """List the differences of the simulated rig from a profile's: one phrase per key."""
     ours, theirs = described(rig), simulator.rig
     return [
         f"{key} = {_shown(theirs[key])} instead of {_shown(value)}"

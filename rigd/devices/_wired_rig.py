@@ -1,4 +1,4 @@
-"""Drive and sensor on their wires: connected as one rig, and reset by the operator."""
+"""Drive and sensor on a CAN bus or serial line, opened as one rig, and the reset of a fault."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
 from rigd.devices.parameters import RigParameters
 
 _LOCK_STEP_PATIENCE_US = 0.5e6
-"""In lock-step the world waits for the replies, so a tick can wait for them too."""
+"""In lock-step the simulated rig waits for the replies, so a tick can wait for them too."""
 
 _INTERFACES = Path("/sys/class/net")
 

@@ -1,4 +1,4 @@
-"""What the 1 kHz cycle asks of a drive and of a force-torque sensor.
+"""Contracts between the 1 kHz cycle and its devices: a drive and a force-torque sensor.
 
 Real and simulated devices stand behind the same two contracts, and one conformance suite runs on
 every implementation. Constructors touch no hardware; ``connect`` does.
@@ -31,7 +31,7 @@ def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
     device
         Name of the drive.
     shown
-        How it shows it, as the rest of a sentence.
+        How the drive shows it, as the rest of a sentence.
     """
     return DeviceError(
         f"{device}: the wired stop (STO) was dropped{shown}. Find out who pressed it and why, see "
@@ -41,14 +41,14 @@ def wired_stop_dropped(device: str, shown: str = "") -> DeviceError:
 
 @dataclass(frozen=True, slots=True)
 class LineHealth:
-    """What happened on a device's line since it was connected; None is what is not known.
+    """Health of a device's line since it was connected; None: not known.
 
     Attributes
     ----------
     bits
-        Of all frames sent and received, without those that are stuffed in between.
+        Bits of all frames sent and received, without stuff bits.
     bit_rate_bit_s
-        Of the line.
+        Bit rate of the line.
     errors
         Disturbed, damaged and missing messages.
     status
@@ -116,7 +116,7 @@ class Drive(Protocol):
         """
 
     def health(self) -> LineHealth:
-        """Tell how its line is doing; quick enough for the loop, now and then."""
+        """Return the health of its line; quick enough for an occasional call in the loop."""
 
     def disable(self) -> None:
         """Zero the torque and disable the drive. Works in every state and never raises."""
@@ -139,7 +139,7 @@ class WrenchSensor(Protocol):
     wrench_stale: bool
     """The last wrench read is not the answer to the last request."""
     wrench_time_ns: int
-    """When the last wrench read was asked for, or arrived if it is streamed; likewise."""
+    """When the last wrench read was asked for, or arrived if it is streamed; as for the angle."""
     wrench_saturated: bool
     """An axis of the last wrench is at the end of its range."""
 
@@ -162,7 +162,7 @@ class WrenchSensor(Protocol):
         """Return the wrench that was asked for."""
 
     def health(self) -> LineHealth:
-        """Tell how its line and the sensor are doing; quick enough for the loop, now and then."""
+        """Return the health of line and sensor; quick enough for an occasional call in the loop."""
 
     def close(self) -> None:
         """Release the line."""

@@ -1,4 +1,4 @@
-"""What a profile says of the hardware: plain data, one class a device, units in the names.
+"""Hardware parameters of a profile: plain data, one class per device, units in the names.
 
 The ranges (``Gt``, ``Ge``, …) are enforced where a profile is loaded (:mod:`rigd.profile`).
 """
@@ -26,12 +26,12 @@ class Motor:
     viscous_nm_s_per_rad: NonNegative
     coulomb_nm: NonNegative
     rated_torque_nm: Positive
-    """What 1000 thousandths of torque are to the drive (its object 6076)."""
+    """Torque of 1000 thousandths in the drive (its object 6076)."""
     peak_torque_nm: Positive
     continuous_torque_nm: Positive = math.inf
-    """Root of the mean square that the motor bears for ever, without getting too hot."""
+    """Continuous (rms) torque rating; infinite: none is known."""
     thermal_time_constant_s: Positive = 10.0
-    """Over which that mean is taken."""
+    """Time constant of the motor's heating, over which the rms torque is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class WrenchSensor:
     """Corner of the sensor's own low-pass filter, which the analysis is told of; 0: none is known.
     Its delay is not part of `delay_s`."""
     filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
-    """Of that filter: 1, or 2 (Butterworth)."""
+    """Order of that filter: 1, or 2 (Butterworth)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +68,12 @@ class Actuation:
     """The way of a torque command to the motor's shaft."""
 
     delay_s: NonNegative
-    """From the tick that computes a command to the moment the motor exerts it."""
+    """Time from the tick that computes a command to the moment the motor exerts it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """What only a simulated rig has: noise, and how it is drawn."""
+    """Parameters of a simulated rig only: noise, and how it is drawn."""
 
     torque_noise_nm: NonNegative
     """Standard deviation of white noise on each torque axis, each sample."""
@@ -88,7 +88,7 @@ class Simulation:
     torque_filter_hz: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """Corner of a low-pass filter of the sensor; 0: it has none."""
     torque_filter_order: Annotated[int, Ge(1), Le(2)] = field(default=1, metadata=OPTIONAL)
-    """Of that filter: 1, or 2 (Butterworth)."""
+    """Order of that filter: 1, or 2 (Butterworth)."""
     clock_rate_difference: Annotated[float, Ge(-1e-3), Le(0)] = field(
         default=0.0, metadata=OPTIONAL
     )
@@ -118,7 +118,7 @@ class CanBus:
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
-    """Which replies a tick works with."""
+    """Acquisition: which replies a tick works with."""
 
     mode: Literal["same_tick", "previous_tick"]
     """A tick waits for the replies to its own requests, or takes those of the tick before."""
@@ -140,7 +140,7 @@ class ServoDrive:
     gear_ratio: Positive
     """Motor turns per turn of the output shaft; only to compare 6076 with the rated torque."""
     rated_torque_unit_nm: NonNegative
-    """What one count of 6076 is, at the motor's shaft; 0 does not compare it."""
+    """Torque of one count of 6076 at the motor's shaft; 0 disables the comparison."""
     torque_delivery: Literal["at_sync", "on_arrival"]
     """When a torque takes effect: RPDO of type 1, or of type 255."""
     heartbeat_period_s: Annotated[float, Gt(0), Le(1)]
@@ -152,7 +152,7 @@ class ServoDrive:
     drive_heartbeat_timeout_s: Annotated[float, Gt(0), Le(5)]
     """After how long without the drive's heartbeat the loop stops."""
     host_node_id: Annotated[int, Ge(1), Le(127)]
-    """Of this computer's own heartbeat."""
+    """Node number in this computer's own heartbeat."""
     abort_option: Annotated[int, Ge(1), Le(3)]
     """Object 6007, what the drive does on a lost connection: 1 fault, 2 disable, 3 quick stop."""
     communication_error_option: Annotated[int, Ge(0), Le(2)]
@@ -160,14 +160,14 @@ class ServoDrive:
     enable_timeout_s: Annotated[float, Gt(0), Le(10)]
     """How long each step up to operation enabled may take."""
     torque_tolerance_percent: Annotated[float, Ge(0), Le(100)] = 0.0
-    """Of the rated torque: by how much the drive's actual torque (6077) may differ from what it was
-    told for some ticks; 0 does not compare them."""
+    """Percent of the rated torque by which the drive's actual torque (6077) may differ from the
+    command for some ticks; 0 disables the comparison."""
     max_speed_rad_s: NonNegative = 0.0
     """At the output shaft: above it the drive by itself exerts no torque that makes it faster
     (object 6080, in motor turns a minute); 0 leaves what the drive has."""
     sto_error_code: Annotated[int, Ge(0), Le(0xFFFF)] = 0
-    """Of the emergency message by which this drive says that its STO was dropped; 0: it only shows
-    it in its statusword."""
+    """Error code of this drive's emergency message for a dropped STO; 0: only its statusword shows
+    it."""
     eds: str = field(default="", metadata=OPTIONAL)
     """The drive's EDS file; its types are used, and its identity has to be the drive's. Empty:
     none."""
@@ -208,7 +208,7 @@ class AtiCan:
     calibration: Annotated[int, Ge(0), Le(15)]
     """Index of the active calibration."""
     serial_number: str
-    """As the sensor has to answer; empty accepts any."""
+    """Serial number that the sensor has to answer; empty accepts any."""
     saturation_counts: Annotated[int, Gt(0), Le(32767)]
     """Magnitude of a raw gauge from which on the sensor is saturated."""
 
@@ -222,11 +222,11 @@ class AtiSerial:
     stream_hz: Positive
     """Records a second that the sensor streams."""
     filter: Literal["mean", "triangle"]
-    """Of the records down to one a tick: mean of one tick's, or triangle over two ticks'."""
+    """Filter from the records to one a tick: mean of one tick's, or triangle over two ticks'."""
     calibration: Annotated[int, Ge(1), Le(16)]
     """Number of the calibration block that is loaded."""
     serial_number: str
-    """As the sensor has to answer; empty accepts any."""
+    """Serial number that the sensor has to answer; empty accepts any."""
     saturation_counts: Annotated[int, Gt(0), Le(32767)]
     """Magnitude of a raw gauge from which on the sensor is saturated."""
 
@@ -260,7 +260,7 @@ class RigParameters:
     devices: Selection
     simulation: Simulation | None = field(default=None)
     name: str = "rig"
-    """Of the profile: by it a driver finds the simulated rig that stands in for this one."""
+    """Name of the profile: by it a driver finds the simulated rig that stands in for this one."""
     can: CanBus | None = field(default=None)
     acquisition: Acquisition | None = field(default=None)
     cia402: ServoDrive | None = field(default=None)

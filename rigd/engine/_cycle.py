@@ -1,9 +1,9 @@
 """One tick: read the devices, check the limits, control, command; and what is watched at rest.
 
-The encoder while the torque is off: a hand may turn the motor, but nothing makes it jump.
-
-The zero, and the limits with it, stand on the encoder's count. In a session the watch over the
-limits sees every reading; this sees those before, between and after.
+`Cycle` does the work of a tick. Readings without torque make the tare (`observe_rest`). The zero of
+the angle, and the limits with it, rest on the encoder's count: in a session `LimitWatch` checks
+every reading, before, between and after sessions `Standstill` does. While the torque is off a hand
+may turn the motor, but nothing makes it jump.
 """
 
 import json
@@ -26,73 +26,36 @@ from rigd.runtime import runtime_folder
 from rigd.safety import LimitWatch, Violation
 from rigd.session import Status
 
-
-def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
-    """Return the watch for the rig of a profile; it stays for as long as the rig is connected.
-
-    Parameters
-    ----------
-    profile
-        Of the rig.
-    heat_nm2
-        How warm the motor is: mean square of its torque over its thermal time constant, (N·m)².
-    """
-    rig = profile.rig
-    watch = LimitWatch(
-        profile.limits,
-        rig.sensor.range,
-        rig.rate_hz,
-        resolution_rad=rig.encoder.resolution_rad,
-        peak_torque_nm=rig.motor.peak_torque_nm,
-        continuous_torque_nm=rig.motor.continuous_torque_nm,
-        thermal_time_constant_s=rig.motor.thermal_time_constant_s,
-        tare_warning_nm=profile.session.tare_drift_nm,
-    )
-    watch.heat_nm2 = heat_nm2
-    return watch
-
-
-def remember_heat(profile: Profile, heat_nm2: float) -> None:
-    """Write down how warm the motor is now, for the next connection of this user.
-
-    Without a place for it, the next one takes the motor for cold.
-    """
-    path = _heat_file(profile)
-    document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
-    with suppress(OSError):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fresh = path.with_suffix(".new")
-        fresh.write_text(json.dumps(document), encoding="utf-8")
-        fresh.replace(path)
-
-
-def recalled_heat_nm2(profile: Profile) -> float:
-    """Return how warm the motor is still after the last connection, in (N·m)²; 0.0: not known.
-
-    It has cooled down since by its thermal time constant.
-    """
-    try:
-        document = json.loads(_heat_file(profile).read_text("utf-8"))
-        heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
-    except (OSError, ValueError, TypeError, KeyError):
-        return 0.0
-    passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
-    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # of before the computer was started anew
-        return 0.0
-    motor = profile.rig.motor
-    warmest_nm2 = motor.peak_torque_nm**2
-    return min(max(0.0, heat_nm2), warmest_nm2) * exp(-passed_s / motor.thermal_time_constant_s)
-
-
-def _heat_file(profile: Profile) -> Path:
-    plain = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
-    return runtime_folder() / f"heat-{plain}.json"
+AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
 
 
 REMEDY = (
     "The zero of the angle is void, and the limits with it: look at encoder, its cable and shield, "
     "then reset the rig and set the zero again."
 )
+
+
+_ANGLE_STALE = int(Status.ANGLE_STALE)
+_WRENCH_STALE = int(Status.WRENCH_STALE)
+_WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
+_UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
+_TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
+_LIMIT_WARNING = int(Status.LIMIT_WARNING)
+_TORQUE_OFF = int(Status.TORQUE_OFF)
+
+_RECENT_TICKS = 32
+_SPEED_TICKS = 4
+"""Ticks at either end of the recent ones over which the speed is taken."""
+_SURE_STEPS = 10
+"""Encoder steps within `_SPEED_TICKS` above which a speed is one, and not the encoder's noise."""
+_GAIN = 0.2
+"""Part of the speed that has to be of these ticks: less says nothing about the torque in them."""
+_AGAINST = 1 / 3, 3.0
+"""Acceleration against the torque, over the one that the torque should give: friction and a motor
+whose inertia is only assumed stay within."""
+
+
+# The encoder without torque
 
 
 class Standstill:
@@ -105,7 +68,7 @@ class Standstill:
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -134,9 +97,9 @@ class Standstill:
         Parameters
         ----------
         angle_rad
-            From any zero that stays where it is.
+            Angle from any zero that does not change.
         due_ns
-            When its tick was due.
+            Time at which its tick was due.
 
         Raises
         ------
@@ -153,7 +116,7 @@ class Standstill:
             possible_rad = self._per_tick_rad * ticks + self._steps_rad
             jump_rad, key = moved_rad, "limits.velocity_rad_s"
         else:
-            # Of the first movement nobody knows the one before it.
+            # The movement before the first one is not known.
             last_rad, before_that_rad = moved or (0.0, self._per_tick_rad)
             # A latch may be late by most of a period, and the next one is not.
             possible_rad = (
@@ -169,24 +132,7 @@ class Standstill:
             )
 
 
-_ANGLE_STALE = int(Status.ANGLE_STALE)
-_WRENCH_STALE = int(Status.WRENCH_STALE)
-_WRENCH_SATURATED = int(Status.WRENCH_SATURATED)
-_UNUSABLE = _ANGLE_STALE | _WRENCH_STALE | _WRENCH_SATURATED
-_TORQUE_SATURATED = int(Status.TORQUE_SATURATED)
-_LIMIT_WARNING = int(Status.LIMIT_WARNING)
-_TORQUE_OFF = int(Status.TORQUE_OFF)
-
-_RECENT_TICKS = 32
-_SPEED_TICKS = 4
-"""Of the recent ticks, at either end, over which the speed is taken."""
-_SURE_STEPS = 10
-"""Encoder steps within `_SPEED_TICKS` above which a speed is one, and not the encoder's noise."""
-_GAIN = 0.2
-"""Part of the speed that has to be of these ticks: less says nothing about the torque in them."""
-_AGAINST = 1 / 3, 3.0
-"""Acceleration against the torque, over the one that the torque should give: friction and a motor
-whose inertia is only assumed stay within."""
+# One tick
 
 
 class Cycle:
@@ -204,7 +150,7 @@ class Cycle:
     Attributes
     ----------
     devices
-        As given.
+        Devices, as given.
     zero_rad
         The drive's own angle at the rig's zero.
     angle_rad, raw_wrench, wrench, coupling_torque_nm
@@ -374,11 +320,11 @@ class Cycle:
         Parameters
         ----------
         due_ns
-            When the present tick was due.
+            Time at which the present tick was due.
         recorder_lag_s
-            By how much the recorder is behind the loop.
+            Time by which the recorder is behind the loop.
         disk_free_mb
-            Of the disk that the session goes to.
+            Free space on the disk that holds the session file.
 
         Returns
         -------
@@ -405,7 +351,7 @@ class Cycle:
         self.flags |= _ANGLE_STALE | _WRENCH_STALE
 
 
-AXES = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+# Readings at rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,11 +361,11 @@ class Rest:
     Attributes
     ----------
     duration_s
-        For how long.
+        Duration of the readings.
     wrenches
         Raw: not tared; N and N·m, shape (n, 6).
     angles_rad
-        From the rig's zero; shape (n,).
+        Angles from the rig's zero; shape (n,).
     torques_nm
         Coupling torque of the raw wrenches; shape (n,).
     """
@@ -474,9 +420,9 @@ def observe_rest(
     Parameters
     ----------
     cycle, metronome
-        Which devices, and when.
+        Cycle that reads the devices, and the schedule of its ticks.
     rate_hz, duration_s
-        How often and for how long.
+        Rate and duration of the readings.
     projection
         Coupling torque = projection · wrench.
     check
@@ -492,3 +438,68 @@ def observe_rest(
         angles.append(cycle.angle_rad)
     readings = np.array(wrenches)
     return Rest(duration_s, readings, np.array(angles), readings @ np.array(projection))
+
+
+# The limits' watch, and the motor's heat
+
+
+def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
+    """Return the limit monitor of a profile's rig; it is kept while the rig is connected.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    heat_nm2
+        Heat of the motor: mean square of its torque over its thermal time constant, (N·m)².
+    """
+    rig = profile.rig
+    watch = LimitWatch(
+        profile.limits,
+        rig.sensor.range,
+        rig.rate_hz,
+        resolution_rad=rig.encoder.resolution_rad,
+        peak_torque_nm=rig.motor.peak_torque_nm,
+        continuous_torque_nm=rig.motor.continuous_torque_nm,
+        thermal_time_constant_s=rig.motor.thermal_time_constant_s,
+        tare_warning_nm=profile.session.tare_drift_nm,
+    )
+    watch.heat_nm2 = heat_nm2
+    return watch
+
+
+def remember_heat(profile: Profile, heat_nm2: float) -> None:
+    """Store the heat of the motor for the next connection of this user.
+
+    Without a place for it, the next one takes the motor for cold.
+    """
+    path = _heat_file(profile)
+    document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
+    with suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        fresh = path.with_suffix(".new")
+        fresh.write_text(json.dumps(document), encoding="utf-8")
+        fresh.replace(path)
+
+
+def recalled_heat_nm2(profile: Profile) -> float:
+    """Return the motor's heat left from the last connection, in (N·m)²; 0.0: not known.
+
+    It has cooled down since by its thermal time constant.
+    """
+    try:
+        document = json.loads(_heat_file(profile).read_text("utf-8"))
+        heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return 0.0
+    passed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
+    if not isfinite(heat_nm2) or not passed_s >= 0.0:  # of before the computer was started anew
+        return 0.0
+    motor = profile.rig.motor
+    warmest_nm2 = motor.peak_torque_nm**2
+    return min(max(0.0, heat_nm2), warmest_nm2) * exp(-passed_s / motor.thermal_time_constant_s)
+
+
+def _heat_file(profile: Profile) -> Path:
+    plain = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
+    return runtime_folder() / f"heat-{plain}.json"

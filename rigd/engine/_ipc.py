@@ -1,16 +1,13 @@
 """The processes of a rig: their table, how they are started, and the messages to and from them.
 
-How a supervisor talks to the processes it starts: a few JSON lines each way.
+One table, `PROCESSES`, says how each process is started, watched, and ended. Every process counts
+up its word on the `Board` several times a second. A dead process is noticed at once, a hung one by
+its heartbeat; the table says what happens then.
 
 A child is ``python -m MODULE``. Its standard input brings its job and then messages, a JSON line
 each; a line that announces a pickled object is followed by its bytes. The end of standard input
 means that the supervisor is gone. Its standard output brings JSON lines, few and short, so that
 they fit into a pipe's buffer and no child ever waits for its supervisor.
-
-The processes of a rig: one table, by which they are started, watched, and ended.
-
-Every process beats: it counts up a word of the board several times a second. A dead process is
-noticed at once, a hung one by its beats; what then happens stands here.
 """
 
 import contextlib
@@ -38,14 +35,10 @@ _SILENT_GRACE_S = 1.0
 _KILLED_GRACE_S = 2.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
+
+# Messages
+
 Message = dict[str, Any]
-
-
-def _is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
-    waiting = select.poll()
-    waiting.register(fd, event)
-    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
 
 
 class ChildError(Exception):
@@ -58,13 +51,13 @@ class Child:
     Parameters
     ----------
     name
-        What messages to the operator call it.
+        Name in messages to the operator.
     module
         Run as ``python -m module``; it starts importing at once and waits for its job.
     fds
         Descriptors it inherits.
     cores
-        Those that it may use, where they are others than this process's own.
+        Cores that it may use, where they differ from this process's own.
 
     Raises
     ------
@@ -252,6 +245,13 @@ class LineReader:
         return b"".join(pieces)
 
 
+def _is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
+    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
+    waiting = select.poll()
+    waiting.register(fd, event)
+    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
+
+
 class Parent:
     """The supervisor, as a child sees it; its process id is the child's only argument.
 
@@ -306,20 +306,23 @@ def _go_on_when_orphaned() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
+# Table of processes
+
+
 @dataclass(frozen=True, slots=True)
 class Process:
     """One kind of process."""
 
     name: str
-    """What messages to the operator call it."""
+    """Name in messages to the operator."""
     module: str
     """Run as ``python -m module``; empty: it is the one that starts the others."""
     beat: Word
     """Its word on the board."""
     hung_after_s: float | None
-    """Without a beat; None: judged by what it leaves undone instead."""
+    """Time without a heartbeat; None: judged by what it leaves undone instead."""
     grace_s: float
-    """In which it has to end when it is asked to; then it is terminated, then killed."""
+    """Time in which it has to end when asked to; then it is terminated, then killed."""
     for_one_session: bool
     """A new one is started for each session."""
     loss: str
@@ -365,7 +368,7 @@ SUPERVISOR = Process(
 )
 
 PROCESSES = (CONTROL, RECORDER, LIVE, SUPERVISOR)
-"""In the order in which they are ended: the one with the torque first."""
+"""All processes, in the order in which they are ended: the one with the torque first."""
 
 
 class Pulse:

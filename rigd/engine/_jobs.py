@@ -1,4 +1,4 @@
-"""What the processes of a rig are told: at their start, and for each session."""
+"""Jobs of a rig's processes: what each is told at its start, and for each session."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ class ControlJob:
     """What the operator was told would move, and nothing else may; None: nothing was told."""
     channels: ChannelSpecs
     fast: bool
-    """Under the virtual clock."""
+    """Run under the virtual clock."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The way of a tick's results to the recorder, the live view and the status."""
+"""Publishing of a tick's results: to the status (`Display`), and to recorder and live view."""
 
 import time
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from rigd.session import Status, pack_control_into, pack_sample_into, pack_timin
 
 
 class Display:
-    """Writes the board's words of the control process, some times a second.
+    """Writes the control process's words on the board several times a second.
 
     Parameters
     ----------
     board
-        Where.
+        Board to write to.
     devices
-        Of whose lines it tells.
+        Devices whose line health it reports.
 
     Attributes
     ----------
@@ -41,9 +41,9 @@ class Display:
         Parameters
         ----------
         cycle
-            With the last readings.
+            Cycle with the last readings.
         now_ns
-            On the engine's clock: a line's load is taken from one call to the next.
+            Time on the engine's clock: a line's load is taken from one call to the next.
         """
         board = self._board
         board.beat(Word.CONTROL_BEAT)
@@ -80,6 +80,8 @@ class Display:
         self._before = now_ns, bits
 
 
+# Samples of a record
+
 _AFTER_MISSED = int(Status.AFTER_MISSED)
 _AFTER_LOST = int(Status.AFTER_LOST)
 _LATE = int(Status.LATE)
@@ -94,9 +96,9 @@ _ROOM_POLL_S = 0.0002
 
 @dataclass(slots=True)
 class Counts:
-    """The bookkeeping of a record: scheduled = recorded + missed + lost.
+    """Counts of a record's ticks: scheduled = recorded + missed + lost.
 
-    Of what was recorded, `late` ticks woke late, and `stale_angles` and `stale_wrenches` hold a
+    Of the recorded ticks, `late` woke late, and `stale_angles` and `stale_wrenches` hold a
     reading that is not of their own tick.
     """
 
@@ -114,9 +116,9 @@ class SampleLog:
     Parameters
     ----------
     cycle, metronome, clock
-        Where the contents of a sample come from.
+        Sources of a sample's content.
     channels
-        Where they go.
+        Channels that it writes to.
     late_ns
         Lateness above which a tick is flagged as late.
 
@@ -152,9 +154,9 @@ class SampleLog:
         Parameters
         ----------
         tick
-            Its number in the record.
+            Number of the tick in the record.
         reference_rad
-            What the angle was to be.
+            Reference angle.
         missed
             Ticks that were missed right before it.
         wait

@@ -1,4 +1,4 @@
-"""What the processes of a rig ask of the scheduler: each is tried, and what was obtained recorded.
+"""Real-time settings of a rig's processes: each is tried, and what was obtained is recorded.
 
 The control process gets all that a 1 kHz loop wants (:func:`obtain`). Supervisor and recorder get a
 priority below the loop's and above that of every ordinary program (:class:`Precedence`), for nobody
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 REFUSED = "refused: "
-"""How the report on a setting begins that was not granted."""
+"""Beginning of the report on a setting that was not granted."""
 LOCKED = "locked"
 """The report on memory of which no part is ever waited for."""
 WAKE_UP_US = 2
@@ -23,7 +23,7 @@ WAKE_UP_US = 2
 core would poll, and a rig that waits for its operator would heat the room."""
 
 NICE = -10
-"""For supervisor and recorder where the system grants no real-time priority."""
+"""Niceness of supervisor and recorder where the system grants no real-time priority."""
 
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
@@ -52,7 +52,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
         The one core to run on; -1 for the last isolated one, or where none is isolated the last one
         this process may use.
     root
-        Of the file system.
+        Root of the file system.
 
     Returns
     -------
@@ -86,12 +86,12 @@ class Precedence:
     loop_cpu
         ``realtime.cpu``, which says where the loop runs.
     root
-        Of the file system.
+        Root of the file system.
 
     Attributes
     ----------
     cores_before
-        Those that this process might use before it kept off the loop's.
+        Cores that this process could use before it left the loop's core.
     """
 
     def __init__(self, priority: int, loop_cpu: int, *, root: Path = Path("/")) -> None:
@@ -235,7 +235,7 @@ def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
     cpu
         As given to :func:`obtain`. One that is named is chosen whether it may be used or not.
     root
-        Of the file system.
+        Root of the file system.
     """
     if cpu >= 0:
         return cpu, False

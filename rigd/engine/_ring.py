@@ -1,21 +1,19 @@
 """Shared memory between the processes: rings of fixed-size records, and a session's reference.
 
-Bounded hand-over of fixed-size records between processes, through shared memory.
-
-One producer (the control loop), one consumer that must get everything (the recorder), and any
-number of observers that may miss records but never slow anybody down (the live publisher).
+A ring has one producer (the control loop), one consumer that must get everything (the recorder),
+and any number of observers that may miss records but never slow anybody down (the live publisher).
 
 The memory is an unlinked temporary file handed to children by file descriptor: nothing with a
 name is left behind, however a process ends.
 
-The two counters in the header only ever grow and are written by one side each, as aligned 64-bit
-words: a record is in place before the counter that announces it. That order is what the processor
-keeps on x86-64; on a weaker memory model the interpreter's own work between the two stores is all
-that separates them, and a reader's own check of the record (tags, consecutive ticks) is the guard.
+The two counters in a ring's header only ever grow and are written by one side each, as aligned
+64-bit words: a record is in place before the counter that announces it. That order is what the
+processor keeps on x86-64; on a weaker memory model the interpreter's own work between the two
+stores is all that separates them, and a reader's own check of the record (tags, consecutive ticks)
+is the guard.
 
-The reference of a session, in shared memory: the control process must not pause to take it.
-
-However long a session is, a drive that watches over the loop's heartbeat waits no longer.
+The reference of a session lies in shared memory, too, so that the control process does not pause to
+receive it: however long the session is, a drive that monitors the loop's heartbeat sees no gap.
 """
 
 import mmap
@@ -130,7 +128,7 @@ class Observer:
     Parameters
     ----------
     ring
-        Of which it sees the records from now on.
+        Ring whose records it sees from now on.
     first
         Number of the first record to see, counted since the ring was made, if not from now on.
 
@@ -169,6 +167,9 @@ class Observer:
         return block
 
 
+# Memory
+
+
 def shared_memory_fd() -> int:
     """Return a descriptor of shared memory, still of size 0, that child processes can inherit."""
     folder = "/dev/shm" if Path("/dev/shm").is_dir() else None
@@ -191,6 +192,8 @@ def reserve(fd: int, size: int) -> None:
     else:
         os.ftruncate(fd, size)
 
+
+# Reference of a session
 
 _SIZE = 8  # bytes of a double
 

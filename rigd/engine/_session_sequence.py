@@ -1,4 +1,4 @@
-"""A session from rest to rest: tare, enable, hold, record, return, disable, check the tare.
+"""Sequence of a session: tare, enable, hold, record, return, disable, check the tare.
 
 The record is what lies between tick 0 and the last tick of the excitation; everything else runs
 through the same cycle and leaves its results in the metadata.
@@ -26,7 +26,7 @@ _SETTLE_S = 0.5
 _GO_POLL_S = 0.0002
 _GO_PATIENCE_S = 10.0
 _SUPERVISOR_PATIENCE_S = 2.0
-"""Of time that this process has run itself: a computer that stands still is nobody's fault."""
+"""Counts the time that this process has run itself: a stalled computer is no supervisor's fault."""
 _OF_MOTION = tuple(BY_NAME[name].channel for name in ("angle", "velocity", "tracking error"))
 _AGAINST_TORQUE = (
     "The shaft gets faster against the torque: angle and torque do not count in the same sense. "
@@ -38,12 +38,12 @@ _SWINGING = 2.0
 
 
 class SessionEnd(Exception):
-    """A session ends before its time; carries the outcome and the reason.
+    """A session ends early; carries the outcome and the reason.
 
     Attributes
     ----------
     outcome, reason
-        For the file and for the operator.
+        Outcome and reason, for the file and the operator.
     device_failed
         A device did not do what it was asked: it must be connected anew.
     """
@@ -61,17 +61,17 @@ class Procedure:
     Parameters
     ----------
     profile
-        What the operator chose.
+        Profile that the operator chose.
     reference_rad
         Angle a tick, relative to the one at the start.
     cycle, clock, metronome
-        What a tick does, and when.
+        Work of a tick, and its schedule.
     standstill
-        Told of every angle that is read without torque.
+        Monitor of every angle that is read without torque.
     channels
-        Where samples, the controller's terms and events go.
+        Rings for samples, the controller's terms and events.
     display
-        Where the readings are shown.
+        Publishes the readings.
     parent
         The supervisor.
     stop
@@ -115,7 +115,7 @@ class Procedure:
         self._recording = False
         self.counts = self._log.counts
         self.results: dict[str, str] = {}
-        """What the record's outcome has to tell beside the counts."""
+        """Results for the record's outcome, in addition to the counts."""
 
     def tare(self) -> dict[str, str]:
         """Average the sensor at rest, before the drive is enabled.
@@ -321,7 +321,7 @@ class Procedure:
             raise SessionEnd("fault", str(violation))
 
     def _tick(self, reference_rad: float, *, excused: bool = False) -> None:
-        """One tick outside the record; what is missed there is nobody's loss, but has its limit."""
+        """Run one tick outside the record; missed ticks are not counted there, but limited."""
         missed = self._metronome.wait()
         self._cycle.watch.skip(missed)
         if missed > self._profile.limits.missed_ticks_in_a_row and not excused:

@@ -1,19 +1,16 @@
-"""What the processes of a rig share: words, topics, events, and the memory of them all.
+"""Shared state of a rig's processes: words, events and topics, and the memory that holds them.
 
-The board: a few shared words by which processes tell each other where they are.
-
-Every word has one writer. Reading or writing one takes a fraction of a microsecond and never
-blocks, which is why the control loop may do so.
-
-What the control process has to say, as fixed-size records in a ring of their own.
-
-The loop must not wait for anybody who listens, so it writes to shared memory instead of a pipe;
-the recorder puts every event into the file, the supervisor shows it to the operator.
-
-What the control process publishes: one table, from which everything that carries it works.
-
-The shared memory is laid out from it, the recorder logs by it, and ``rigd status`` compares what
-comes with what is expected.
+Words
+    `Board` holds a few words by which processes tell each other where they are. Each word has one
+    writer. Access takes a fraction of a microsecond and never blocks, so the control loop may use
+    them.
+Events
+    What the control process has to say, as fixed-size records in a ring of their own. The loop must
+    not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
+    event into the file, the supervisor shows it to the operator.
+Topics
+    What the control process publishes: one table, `TOPICS`, from which the shared memory is laid
+    out, by which the recorder logs, and with which ``rigd status`` compares the rates it sees.
 """
 
 import contextlib
@@ -29,9 +26,11 @@ from rigd.engine._ring import Ring, RingSpec, reserve
 from rigd.safety import BUFFERED_S
 from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
+# Words
+
 
 class Phase(IntEnum):
-    """Where the control process is."""
+    """What the control process is doing."""
 
     PREPARING = 0
     """Connecting the devices."""
@@ -45,11 +44,11 @@ class Phase(IntEnum):
     OFF = 6
     """Torque is zero and the drive is disabled: between sessions, and at the end."""
     WAITING = 7
-    """Until the beam is at rest, before the tare."""
+    """Waiting until the beam is at rest, before the tare."""
 
     @property
     def words(self) -> str:
-        """What the operator reads."""
+        """Name of the phase for the operator."""
         return _WORDS.get(self, self.name.lower())
 
 
@@ -69,13 +68,13 @@ class Stop(IntEnum):
 
 
 class Word(IntEnum):
-    """The words of the board."""
+    """Index of each word of the :class:`Board`."""
 
     # Written by the supervisor
     STOP = 0
     GO = 1
     SUPERVISOR_BEAT = 2
-    """Beats count up several times a second: whoever does not beat hangs."""
+    """Heartbeats count up several times a second: a process whose beat stands still hangs."""
     # Written by the control process
     PHASE = 3
     START_UTC_NS = 4
@@ -89,15 +88,15 @@ class Word(IntEnum):
     TORQUE_COMMAND_NNM = 11
     CONTROL_BEAT = 12
     BUS_LOAD_PPM = 17
-    """Of the busiest line, as measured, or UNKNOWN. Likewise:"""
+    """Measured load of the busiest line, or UNKNOWN."""
     BUS_ERRORS = 18
-    """On all lines, since the devices were connected."""
+    """Errors on all lines since the devices were connected, or UNKNOWN."""
     SENSOR_STATUS = 19
-    """Status word; 0: all is well."""
+    """Status word, 0: no fault; or UNKNOWN."""
     # Written by the recorder
     RECORDER_BEAT = 13
     DISK_FREE_MB = 14
-    """Of the disk that the session goes to, in 10⁶ bytes, at least 1; 0: not known yet."""
+    """Free space on the disk of the session file, in 10⁶ bytes, at least 1; 0: not known yet."""
     # Written by the live publisher
     LIVE_DROPPED = 15
     LIVE_BEAT = 16
@@ -105,12 +104,13 @@ class Word(IntEnum):
     """Samples up to this one of the ring have been shown, or counted as dropped."""
     # Written by the control process
     STALE_ANGLES = 21
-    """Recorded ticks whose angle is an old one; likewise:"""
+    """Recorded ticks with a stale angle."""
     STALE_WRENCHES = 22
+    """Recorded ticks with a stale wrench."""
 
 
 UNKNOWN = -1
-"""Of a line that there is not, or that does not tell."""
+"""Value for a line that does not exist, or does not report."""
 
 
 class Board:
@@ -152,6 +152,8 @@ class Board:
             self._memory.close()
 
 
+# Events
+
 Level = Literal["debug", "info", "warning", "error", "fatal"]
 LEVELS: tuple[Level, ...] = ("debug", "info", "warning", "error", "fatal")
 
@@ -192,6 +194,8 @@ def read_events(block: bytes) -> list[Event]:
     return events
 
 
+# Topics
+
 HURRIED_BUFFERED_S = 160.0
 """What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
 second, and the live view lags."""
@@ -220,7 +224,7 @@ class Topic:
         return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
 
     def expected_hz(self, rate_hz: float) -> float | None:
-        """Return the records a second of a recorded session; None where there is no saying."""
+        """Return the records a second of a recorded session; None where the rate is not fixed."""
         return rate_hz / self.every if self.every else None
 
 
@@ -233,8 +237,10 @@ TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
 """The samples last: what explains a sample is in the file no later than the sample."""
 
 
+# Memory of a rig
+
 DESCRIPTORS = len(TOPICS) + 2
-"""Of shared memory, for :func:`create_channels`."""
+"""File descriptors of shared memory, for :func:`create_channels`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,13 +248,13 @@ class ChannelSpecs:
     """What a child process needs to attach."""
 
     rings: tuple[RingSpec, ...]
-    """In the order of :data:`rigd.engine._shared_state.TOPICS`."""
+    """All rings, in the order of :data:`TOPICS`."""
     board_fd: int
 
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The rings, in the order of :data:`rigd.engine._shared_state.TOPICS`, and the board."""
+    """The rings, in the order of :data:`TOPICS`, and the board."""
 
     events: Ring
     controls: Ring
@@ -265,7 +271,7 @@ class Channels:
 
     @property
     def specs(self) -> ChannelSpecs:
-        """What to hand to a child process."""
+        """Descriptors and layout to hand to a child process."""
         return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
 
     def ask_to_stop(self) -> None:

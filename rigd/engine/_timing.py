@@ -1,9 +1,8 @@
-"""The two clocks a cycle can run under, and when a tick is due.
+"""Clocks of the cycle, real and virtual, and the schedule of its ticks.
 
-The two clocks a cycle can run under.
-
-Both count nanoseconds of monotonic time and both are asked the same two questions, so the cycle
-is the same code under either.
+Both clocks count nanoseconds of monotonic time and answer the same two questions, so the cycle is
+the same code under either. `Metronome` says when a tick is due and how many were missed,
+`SuspendWatch` whether the computer was suspended.
 """
 
 import time
@@ -100,7 +99,7 @@ class SuspendWatch:
     ) -> None:
         self._monotonic_ns = monotonic_ns
         self._boot_ns = boot_ns or _clock_since_boot()
-        # Of the two readings the order counts: what comes between them never looks like a suspend.
+        # This order of the two readings: a delay between them never looks like a suspend.
         before_ns = self._monotonic_ns()
         self._ahead_ns = self._boot_ns() - before_ns
 
@@ -131,7 +130,7 @@ class Metronome:
     due_ns
         The same on the clock: it goes on evenly through a restart.
     lateness_ns
-        By how much its deadline was missed: less than a period.
+        Wake-up latency: time since its deadline, less than a period.
     """
 
     def __init__(self, clock: Clock, rate_hz: float) -> None:

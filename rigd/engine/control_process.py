@@ -1,7 +1,7 @@
 """The control process: it alone talks to the devices, and it never leaves the torque on.
 
 It connects them, observes them at the rig's rate with the torque off, and runs the sessions that
-the supervisor orders, one after the other. A device that fails ends it: connecting anew is the
+the supervisor requests, one after the other. A device that fails ends it: connecting anew is the
 operator's decision.
 """
 
@@ -35,12 +35,12 @@ from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY
 
 _SILENCE_S = 1.0
-"""For which a device may be silent between sessions."""
+"""Time for which a device may be silent between sessions."""
 _STANDSTILL_POLL_S = 0.05
 _ZERO_S = 0.2
 _SIGN_OF_LIFE_S = 1.0
 _TAKE_UP_TICKS = 2
-"""After which it is known where the motor stands and that it does."""
+"""Ticks after which it is known where the motor stands, and that it does."""
 
 
 def main() -> None:
@@ -78,7 +78,7 @@ def attend(
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     devices
         Not yet connected.
     clock, channels, parent, stop
@@ -114,7 +114,7 @@ def attend(
 
 
 class _Attendance:
-    """Connected devices, and what is ordered of them."""
+    """Connected devices, and the requests of the supervisor."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class _Attendance:
         self._cycle = self._make_cycle(profile)
 
     def remember(self) -> None:
-        """Keep how warm the motor is for whoever connects next, once nothing hurries."""
+        """Store the motor's heat for the next connection, at a time when nothing is urgent."""
         if not self._devices.simulated:
             remember_heat(self._profile, self._watch.heat_nm2)
 
@@ -164,7 +164,7 @@ class _Attendance:
                 self._read_at_rest()
 
     def serve(self) -> None:
-        """Do what the supervisor orders, until it is gone or a stop is asked for between sessions.
+        """Serve the supervisor until it is gone, or a stop is asked for between sessions.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The recorder process: ring → session file.
+"""The recorder process: from the rings to the session file.
 
 It opens the file before anything moves, takes what the loop publishes as fast as the disk lets
 it, and closes the file with the outcome. If the supervisor dies it waits until the loop has
@@ -123,7 +123,7 @@ class Recorder:
     channels
         Attached.
     writer
-        Of the file, not yet begun.
+        Writer of the file, not yet begun.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class Recorder:
         ]
         self._recorded = 0
         self.header: Message | None = None
-        """What the file is to say of the session, as soon as the supervisor has told."""
+        """Metadata, segments and attachments of the session, once the supervisor has sent them."""
         self.begun = False
 
     def _begin(self, header: Message) -> None:

@@ -1,7 +1,9 @@
 """Reference trajectories of a session: chirp, hold, step, multisine, narrow sweeps, from a file.
 
 A reference is relative to the angle at which the session starts. Every excitation has the same
-three segments: rest (reference zero), sweep, ring-down (the sweep's last value held).
+three segments: rest (reference zero), sweep, ring-down (the sweep's last value held). Offers a
+function per kind (`chirp` … `from_csv`, `modes`) and `make_excitation` for one by its name. Whether
+a rig can follow a reference is not known here: `rigd.runner` predicts it.
 """
 
 import lazy_loader as lazy

@@ -1,4 +1,4 @@
-"""Reference signals from files."""
+"""Reference signals from CSV files, and the opening of files that a user names."""
 
 import csv
 import os
@@ -17,34 +17,6 @@ from rigd.excitation._signals import (
     lay_out_segments,
     within_a_turn,
 )
-
-
-def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
-    """Open a text file of limited size; a pipe that nobody writes to is not waited for.
-
-    Parameters
-    ----------
-    path
-        Its name.
-    most_bytes
-        The limit.
-    newline
-        As `open` has it.
-
-    Raises
-    ------
-    ExcitationError
-        If it is no such file.
-    OSError
-        If it cannot be opened.
-    """
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    status = os.fstat(fd)
-    if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
-        os.close(fd)
-        raise ExcitationError(f"{path}: is not a file of at most {most_bytes / 1e6:g} MB.")
-    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor
-
 
 MOST_BYTES: Final = 256_000_000
 
@@ -152,3 +124,33 @@ def _cell(path: Path, line: int, row: list[str], column: int, name: str) -> floa
             f"{path}: line {line}: {name} is not a finite number."
         )
     return value
+
+
+# Files that a user names
+
+
+def open_plain_file(path: Path, most_bytes: int, *, newline: str | None = None) -> TextIO:
+    """Open a text file of limited size; a pipe that nobody writes to is not waited for.
+
+    Parameters
+    ----------
+    path
+        Name of the file.
+    most_bytes
+        The limit.
+    newline
+        Argument of `open`.
+
+    Raises
+    ------
+    ExcitationError
+        If it is no such file.
+    OSError
+        If it cannot be opened.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
+        os.close(fd)
+        raise ExcitationError(f"{path}: is not a file of at most {most_bytes / 1e6:g} MB.")
+    return open(fd, newline=newline, encoding="utf-8-sig")  # noqa: PTH123 - of a descriptor

@@ -1,4 +1,4 @@
-"""An excitation by its name and its parameters, as a request or a command line gives them."""
+"""Excitations by name and parameters, as a request or a command line gives them."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -18,7 +18,7 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
     "file": from_csv,
     "modes": modes,
 }
-"""By the names that the command line and session files have for them."""
+"""Functions by the names that the command line and session files use."""
 
 FROM_THE_RIG = frozenset({"rate_hz", "rig"})
 """Arguments that are no options: the rig's own data."""

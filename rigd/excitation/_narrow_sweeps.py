@@ -1,11 +1,11 @@
-"""Narrow sweeps over the modes of a beam.
+"""Narrow sweeps over the modes of a beam: their bands, amplitudes and times.
 
-Narrow bands round modes: where they lie, how far the reference goes in each, and for how long.
-
-What a sweep tells of the damping is measured by the Fisher information of the exact model
-(`rigd.beam`): of the torque, white noise of any size on it, for the damping's parameters beside
-density, stiffness, delay and tool inertia. Of a band swept slowly it is proportional to the time
-spent there, so that the times follow from the information of each band in a second.
+A table of modes says where the bands lie. The amplitude in each is what the rig's limits allow, and
+the time in each follows from what a sweep tells of the damping. That is measured by the Fisher
+information of the exact model (`rigd.beam`): information from the torque, with white noise of any
+size on it, on the damping's parameters, with density, stiffness, delay and tool inertia free as
+well. A band that is swept slowly gives information in proportion to the time spent there, so the
+times follow from the information of each band per second.
 """
 
 import json
@@ -33,10 +33,25 @@ from rigd.excitation._signals import (
     within_a_turn,
 )
 
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+SHARE_OF_LIMITS: Final = 0.9
+"""Share that the sweeps are predicted to take; the rest is for a beam unlike the profile's."""
+
+_EASINGS: Final = 8
+_CLOSE_ENOUGH: Final = 1.005
+
+LEAST_SHARE: Final = 0.5
+"""Least share of an equal part of the time for every band: a mode is never left out."""
+
 MOST_BYTES: Final = 64_000_000
 SAME_MODE: Final = 1.1
 """Fits of one record differ by less than this factor in a mode's frequency; the frequencies of a
 slender beam differ by more."""
+
+
+# Table of modes
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -72,7 +87,7 @@ class FoundMode:
     frequency_hz: float
     damping_ratio: float
     uncertainty_hz: float
-    """Of the frequency: two standard deviations, as stated or as the fits differ."""
+    """Uncertainty of the frequency: two standard deviations, as stated or as the fits differ."""
 
 
 def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
@@ -147,7 +162,7 @@ def _complaint(detail: ErrorDetails) -> str:
 
 
 def _groups(entries: Sequence[_Entry]) -> Iterator[list[_Entry]]:
-    """Put together what is one mode, seen by several fits."""
+    """Group the entries of several fits that are one mode."""
     group: list[_Entry] = []
     for entry in sorted(entries, key=_frequency_hz):
         if group and _frequency_hz(entry) > SAME_MODE * _frequency_hz(group[0]):
@@ -174,19 +189,18 @@ def _frequency_hz(entry: _Entry) -> float:
     return entry.frequency_hz or 0.0
 
 
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+# Bands, and the time spent in each
 
 _POINTS: Final = 64
 """Frequencies in a band at which the information is computed."""
 
 _ROUNDS: Final = 500
 _RIDGE: Final = 1e-12
-"""Of the information, relatively: few bands leave some combinations of parameters untold."""
+"""Relative ridge on the information: few bands leave some parameter combinations undetermined."""
 
 
 class Foresight(Protocol):
-    """What is known of the rig before it moves."""
+    """Loop preview: what is known of the rig before it moves."""
 
     @property
     def beam(self) -> Beam:
@@ -312,16 +326,7 @@ def _tuned(beam: Beam, frequency_hz: float) -> Beam:
     )
 
 
-FloatArray = NDArray[np.float64]
-
-SHARE_OF_LIMITS: Final = 0.9
-"""That the sweeps may be predicted to take: the rest is for a beam other than the profile's."""
-
-_EASINGS: Final = 8
-_CLOSE_ENOUGH: Final = 1.005
-
-LEAST_SHARE: Final = 0.5
-"""Of an equal part of the time, for every band: a mode is never left out."""
+# Sweeps
 
 
 def modes(
@@ -352,7 +357,7 @@ def modes(
     widths
         Half-power widths swept to either side of a mode, beside its frequency's uncertainty.
     duration_s
-        Of all sweeps together.
+        Duration of all sweeps together.
     rest_s, ring_down_s
         Time before and after them.
     taper_s
@@ -424,9 +429,7 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
     return bands
 
 
-def _within_limits(
-    sweeps: Sequence[FloatArray], amplitude_rad: float, rig: Foresight
-) -> list[float]:
+def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: Foresight) -> list[float]:
     """Return for each sweep the amplitude, or the largest that leaves the rig within its limits.
 
     One after the other, since a mode still rings while the next is swept.
@@ -445,13 +448,13 @@ def _within_limits(
     return amplitudes_rad
 
 
-def _lengths(shares: FloatArray, ticks: int) -> list[int]:
+def _lengths(shares: Real, ticks: int) -> list[int]:
     """Split ticks by shares, without losing one to rounding."""
     ends = np.round(np.cumsum(shares) * ticks).astype(int)
     return [int(length) for length in np.diff(ends, prepend=0)]
 
 
-def _at_least(shares: FloatArray) -> FloatArray:
+def _at_least(shares: Real) -> Real:
     """Raise shares to the least one, at the cost of the others in proportion."""
     least = LEAST_SHARE / len(shares)
     low = shares < least
@@ -462,7 +465,7 @@ def _at_least(shares: FloatArray) -> FloatArray:
     return raised
 
 
-def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> FloatArray:
+def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> Real:
     """Sweep of amplitude 1, (ticks,), with raised-cosine ends of ``fades / 2`` ticks each."""
     duration_s = ticks / rate_hz
     t = np.arange(ticks) / rate_hz

@@ -1,4 +1,4 @@
-"""Reference signals: angle, speed and acceleration by time."""
+"""Reference signals: chirp, hold, step and multisine, and the segments of every excitation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,12 +7,45 @@ from math import isfinite, pi
 import numpy as np
 from numpy.typing import NDArray
 
+FloatArray = NDArray[np.float64]
+
 SAMPLES_PER_PERIOD = 4
 """Fewest samples in a period of the reference: with less it is no sine any more."""
+
+MAX_TICKS = 7_200_000
+"""Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
 
 
 class ExcitationError(ValueError):
     """An option of an excitation is absurd; the message names option, value, unit and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """A reference, tick by tick.
+
+    Attributes
+    ----------
+    kind
+        ``chirp``, ``hold``, ``step``, ``multisine``, ``file`` or ``modes``.
+    parameters
+        The options it was made from, and what follows from them, with units in the names.
+    rate_hz
+        Ticks a second.
+    reference_rad
+        Shape (n,), relative to the start angle; read-only.
+    segments
+        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive).
+    """
+
+    kind: str
+    parameters: Mapping[str, float | int | str]
+    rate_hz: float
+    reference_rad: FloatArray
+    segments: Mapping[str, tuple[int, int]]
+
+
+# Checks of options
 
 
 def whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
@@ -69,35 +102,7 @@ def frequency(option: str, value: float, rate_hz: float, *, zero_allowed: bool =
         )
 
 
-FloatArray = NDArray[np.float64]
-
-MAX_TICKS = 7_200_000
-"""Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
-
-
-@dataclass(frozen=True, slots=True)
-class Excitation:
-    """A reference, tick by tick.
-
-    Attributes
-    ----------
-    kind
-        ``chirp``, ``hold``, ``step``, ``multisine``, ``file`` or ``modes``.
-    parameters
-        The options it was made from, and what follows from them, with units in the names.
-    rate_hz
-        Ticks a second.
-    reference_rad
-        Shape (n,), relative to the start angle; read-only.
-    segments
-        ``rest``, ``sweep``, ``ring_down`` → first tick and end (exclusive).
-    """
-
-    kind: str
-    parameters: Mapping[str, float | int | str]
-    rate_hz: float
-    reference_rad: FloatArray
-    segments: Mapping[str, tuple[int, int]]
+# Segments
 
 
 def lay_out_segments(
@@ -141,6 +146,9 @@ def assemble(
     reference[slice(*segments["ring_down"])] = sweep[-1]
     reference.flags.writeable = False
     return Excitation(kind, parameters, rate_hz, reference, segments)
+
+
+# Signals
 
 
 def chirp(
@@ -282,7 +290,7 @@ def multisine(
     taper_s
         Raised-cosine fade at both ends of the whole sweep; the periods in it are then not equal.
     seed
-        Of the phases: equal seeds give equal references.
+        Seed of the phases: equal seeds give equal references.
 
     Raises
     ------

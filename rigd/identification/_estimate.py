@@ -1,25 +1,18 @@
 """Inertia, friction, torque scale and delay of a motor from windows of its motion.
 
-The motor's equation as linear rows: moments of the readings, frequency by frequency.
-
-The motor's equation, with the torque held between commands,
+Windows of one key are repeats of the same motion. The motor's equation, with the torque held
+between commands,
 
     ``s u(t - D) = J θ'' + B θ' + C sign(θ') + z + τ_c``,
 
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
-reading is differentiated. All integrals are exact for a command that changes at any moment of a
-period. The measured coupling torque τ_c stands alone on its side because it carries the noise.
+reading is differentiated; frequency by frequency this gives linear rows, moments of the readings
+(`moments`). All integrals are exact for a command that changes at any moment of a period. The
+measured coupling torque τ_c stands alone on its side because it carries the noise.
 
-Weighted least squares on the moments of repeats: the unknowns, and how far to trust them.
-
-The mean of repeats is fitted, because the loop feeds the noise of a reading back into the command
-and so biases a fit of single ones; their scatter gives the weights, what is left of that bias, and
-the standard deviations.
-
-Inertia, friction, torque scale and delay of a motor from windows of its motion.
-
-The equation they are fitted to stands in :mod:`rigd.identification._estimate`, the fit in
-:mod:`rigd.identification._estimate`. Windows of one key are repeats of the same motion.
+The rows are fitted by weighted least squares (`fit`). The mean of repeats is fitted, because the
+loop feeds the noise of a reading back into the command and so biases a fit of single ones; their
+scatter gives the weights, what is left of that bias, and the standard deviations.
 """
 
 from collections.abc import Hashable, Sequence
@@ -32,8 +25,11 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+
+# The motor's equation as linear rows
+
 SCALE, INERTIA, VISCOUS, COULOMB, DELAY, ZERO = range(6)
-"""Where the unknowns stand; from the last on, one zero of the torque for each session."""
+"""Indices of the unknowns; from the last on, one zero of the torque for each session."""
 
 _FLANK = 0.15
 """Part of a window in which the test functions rise, and fall."""
@@ -124,6 +120,8 @@ def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
     return w, w1, w2
 
 
+# Weighted least squares
+
 _MARGIN = 1.25
 """On all deviations: they are themselves known to some 15 %, and the filter of the readings and the
 beam's share in a jump of torque are not in the model."""
@@ -135,7 +133,7 @@ _SMOOTHED_BINS = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The unknowns in the order of `moments`, and what the fit says of itself."""
+    """The unknowns in the order of `moments`, and the fit's own diagnostics."""
 
     values: Real
     """Scale, inertia, viscous, Coulomb, delay from command to angle, zeros of the sessions."""
@@ -152,7 +150,7 @@ def fit(stacks: Sequence[Stack], timing: Timing, *, hold_scale: bool) -> Fit | N
     stacks
         At least two repeats in each.
     timing
-        Of the readings; the search for the delay begins at what it states.
+        Timing of the readings; the search for the delay starts at its value.
     hold_scale
         Take the commanded torque for the true one.
     """
@@ -225,7 +223,7 @@ def _judge(
     solution: Real,
     delay_s: float,
 ) -> Fit:
-    """Take the bias by noise off the solution, and say how far to trust it."""
+    """Remove the bias by noise from the solution, and estimate its uncertainty."""
     chosen = np.flatnonzero(free)
     normal = np.zeros((chosen.size, chosen.size))
     bias = np.zeros(chosen.size)
@@ -272,22 +270,24 @@ def _coverage(freedom: Real) -> Real:
     return 1.0 + (7.5 / freedom + 17.25 / freedom**2) / 3.0
 
 
+# Estimate of a motor
+
 LEAST_REPEATS = 4
 """Fewer tell too little of the scatter."""
 
 _LEAST_SPEED_PART = 0.1
-"""Of the nominal speed: below, a window may contain a standstill."""
+"""Share of the nominal speed below which a window may contain a standstill."""
 _SPEED_S = 0.01
 """Half the time over which that speed is taken."""
 _MAX_SCALE_STD = 0.05
-"""What a torque constant from a datasheet is good for."""
+"""Accuracy of a torque constant from a datasheet."""
 _SCALES = (0.5, 2.0)
 """Without a beam the equation is solved by no torque and no motor too: a scale beyond these is no
 torque constant."""
 
 
 class EstimateError(ValueError):
-    """The windows do not tell the motor's data; the message says why."""
+    """The windows do not determine the motor's data; the message says why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,7 +317,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class MotorEstimate:
-    """What the windows tell of the motor, at its output shaft."""
+    """Estimate of the motor, at its output shaft."""
 
     inertia_kg_m2: Quantity
     viscous_nm_s_per_rad: Quantity
@@ -343,9 +343,9 @@ def estimate_motor(
     Parameters
     ----------
     windows
-        Of equal length; at least `LEAST_REPEATS` of each key, and both directions.
+        Windows of equal length; at least `LEAST_REPEATS` of each key, and both directions.
     timing
-        Of the readings. Only the delay from command to angle shows in them: that of the angle is
+        Timing of the readings. They show only the delay from command to angle: that of the angle is
         taken off it.
     tool_inertia_kg_m2
         Between sensor and beam: it makes the coupling torque jump with each command, and where

@@ -30,20 +30,20 @@ TOP_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
 
 _MAX_SPEED_RAD_S = 1.0
 _LIMIT_SHARE = 0.5
-"""Of the profile's speed limit: the rest is for the multisine and for a motor unlike its data."""
+"""Share of the profile's speed limit: the rest is for multisine and a motor unlike its data."""
 _STROKE_SHARE = 0.93
-"""Of the stroke, for the passes; the rest is for multisine, offsets and overshoot."""
+"""Share of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
 _SPEED_PARTS = (0.1, 0.3, 0.6, 1.0)
 _MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
-"""Of the speed by the multisine. The trial knows little of the motor: a quarter of the inertia that
-the profile states must not yet turn the speed round."""
+"""Part of the speed that the multisine modulates. The trial knows little of the motor: a quarter of
+the inertia that the profile states must not yet reverse the speed."""
 _CYCLES = {TRIAL: 6, MULTISINE: 16, SPEEDS: 5}
 _BAND_HZ = (1.6, 32.0)
 """The beam's clamped-free modes in it make its torque unlike an inertia's, so that the scale of the
 motor's own torque shows; below 32 Hz the encoder's steps do not yet hide the acceleration."""
 _LEAST_MULTISINE = 0.1
 _OFFSET_STEPS = 40.0
-"""Of the encoder: enough for its roundings not to repeat from cycle to cycle."""
+"""Encoder steps: enough for its roundings not to repeat from cycle to cycle."""
 _GOLDEN = 0.618033988749895
 
 
@@ -55,7 +55,7 @@ class Layout:
     """
 
     speeds_rad_s: tuple[float, ...]
-    """Of a cycle; each is run forward, then back."""
+    """Speeds of a cycle; each is run forward, then back."""
     cycles: int
     rest_s: float = 0.5
     approach_s: float = 2.0
@@ -111,7 +111,7 @@ def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: fl
     Parameters
     ----------
     profile
-        Of the rig; its loop shapes the reference and predicts the peaks.
+        Profile of the rig; its loop shapes the reference and predicts the peaks.
     torque_percent
         Largest predicted torque, in percent of the motor's rated torque.
     stroke_rad

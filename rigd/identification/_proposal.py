@@ -1,4 +1,4 @@
-"""What an estimate proposes for the profile; and controllers for the sessions that it needs."""
+"""Proposal of an estimate for the profile, and controllers for the sessions that it needs."""
 
 from dataclasses import dataclass, replace
 from math import floor, log10
@@ -7,6 +7,8 @@ from typing import Any
 from rigd.control import ControlDesignError, check_stability, close_loop
 from rigd.identification._estimate import MotorEstimate, Quantity
 from rigd.profile import Profile
+
+# Controllers
 
 _CAUTIOUS_POLES_RAD_S = (40.0, 50.0, 63.0)
 """At 40 rad/s the loop is stable for motors from a quarter to four times the inertia that the
@@ -50,6 +52,8 @@ def _is_stable(profile: Profile) -> bool:
     return True
 
 
+# Proposal
+
 _DIFFERS = 3.0
 """Standard deviations."""
 _HIGH_MISFIT = 1.5
@@ -64,7 +68,7 @@ class Row:
     measured: Quantity
     profile_value: float
     source: str
-    """Of the profile's value."""
+    """Source of the profile's value."""
     least: float = 0.0
     """Smallest value that the profile's other settings allow."""
 
@@ -163,14 +167,14 @@ class Proposal:
 
 
 def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> Proposal:
-    """Set an estimate beside a profile.
+    """Compare an estimate with a profile.
 
     Parameters
     ----------
     estimate
-        Of the profile's motor.
+        Estimate of the profile's motor.
     profile
-        In which the numbers are to go.
+        Profile in which the numbers are to go.
     unusable
         Passes that were left out before the estimate.
     """

@@ -1,4 +1,4 @@
-"""From recorded sessions to the windows that are fitted."""
+"""Windows of motion from recorded sessions, as the estimate takes them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _USELESS = int(
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What some sessions of one rig hold for the estimate."""
+    """Data of some sessions of one rig for the estimate."""
 
     windows: list[Window]
     timing: Timing
@@ -35,7 +35,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     paths
         Session files of one rig, in any order.
     actuation_delay_s
-        Where the search for the command's delay begins.
+        Start value of the search for the command's delay.
 
     Raises
     ------

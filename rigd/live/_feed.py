@@ -1,6 +1,6 @@
-"""The way from the publisher to the viewers, which never blocks and heals by itself.
+"""Connection from the publisher to the Rerun server, which never blocks and restores itself.
 
-With its server absent or frozen the SDK first buffers without telling, and then blocks for ever.
+With its server absent or frozen the SDK first buffers without telling, then blocks indefinitely.
 Therefore whatever is sent is flushed with a time limit, and nothing more is handed to the SDK until
 everything before it has left: what waits in the SDK is never more than what was sent at once.
 """
@@ -22,7 +22,7 @@ _PATIENCE_S: Final = 0.2
 _STALLED_PATIENCE_S: Final = 0.02
 """Once it stalls, the session must not be kept waiting again and again."""
 _MOST_STALLED_LOOKS: Final = 200
-"""Then the server is killed; at 20 a second, as the publisher looks, after 10 s."""
+"""Looks after which the server is killed: at 20 a second, as the publisher looks, 10 s."""
 
 
 class Feed:
@@ -31,12 +31,12 @@ class Feed:
     Parameters
     ----------
     outlet
-        Whose server passes it on.
+        Outlet whose server passes it on.
 
     Attributes
     ----------
     connections
-        How often a connection began, with the frame of what is shown.
+        Number of connections that began, each with the frame of what is shown.
     stalled
         The server does not take what was sent.
     """

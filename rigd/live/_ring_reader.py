@@ -1,4 +1,4 @@
-"""What the processes of a rig publish of one session, on its way into the picture."""
+"""Reader of a session's rings for the live view, and what the publisher is told of a session."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,6 +20,9 @@ from rigd.view import Note, Picture, Subject
 
 if TYPE_CHECKING:
     from rigd.view import Drawing
+
+
+# Jobs of the publisher
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +51,12 @@ class LiveSession:
     Attributes
     ----------
     subject
-        What its picture is of.
+        What the views need to know of it.
     recording_id
         By which viewers tell it from others; the same for a publisher that takes it over.
     begins
         How many records had been written to each ring before it, in the order of
-        :data:`rigd.engine._shared_state.TOPICS`.
+        :data:`rigd.engine.TOPICS`.
     """
 
     subject: Subject
@@ -78,12 +81,14 @@ class LiveEnd:
     reason: str = ""
 
 
+# Rings
+
 Records = TypeVar("Records")
 
 
 @dataclass(frozen=True, slots=True)
 class Harvest:
-    """What came since the last time.
+    """Records that came since the last time, as drawings.
 
     Attributes
     ----------
@@ -92,7 +97,7 @@ class Harvest:
     drawings
         Draw everything else.
     samples
-        How many samples those show that nobody has shown before.
+        Number of samples that the drawings show for the first time.
     """
 
     notes: "list[Drawing]"
@@ -108,21 +113,21 @@ class Intake:
     Parameters
     ----------
     session
-        To show.
+        Session to show.
     channels
         The memory of the rig's processes.
     seen
         Samples that another publisher showed before this one took over, counted as `begins` is:
-        what of them is there still is read again, for the picture is made of it.
+        those that are still there are read again, for the scene is made of them.
 
     Attributes
     ----------
     picture
-        Of the session.
+        Scene of the session.
     t_ns
         Time of the newest sample, since the start of the session.
     took_s
-        For how much of the session were the samples that were read last.
+        Duration of the samples that were read last.
     """
 
     def __init__(self, session: LiveSession, channels: Channels, seen: int = 0) -> None:
@@ -159,7 +164,7 @@ class Intake:
                 self._readers[topic].end = end
 
     def take(self) -> Harvest:
-        """Read what has come, and put it into the picture."""
+        """Read what has come, and put it into the scene."""
         picture, readers = self.picture, self._readers
         notes: list[Drawing] = []
         drawings: list[Drawing] = []

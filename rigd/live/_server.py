@@ -1,23 +1,19 @@
-"""What viewers connect to: a Rerun server, the page for browsers, and the file that tells of both.
+"""Server of the live view: Rerun's server, the page for browsers, and the file with the address.
 
-Where the live view of a rig is found: one small file for each, as long as there is one.
-
-It stands in the user's runtime folder. What a killed process left is told by its process, which is
-not there any more.
-
-The web viewer's page, on loopback, as Rerun brings it, but kept from reaching beyond.
-
-As it is, the page loads fonts and sends usage statistics to the internet, from the operator's
-browser. Therefore it is passed on from here, with a policy that browsers enforce: it may load from
-this computer, and from nowhere else. A few lines are added by which it is loaded again when a
-server was replaced: viewers do not connect a second time by themselves.
-
-What viewers connect to: a Rerun server, the page for browsers, and the file that tells of both.
-
-The server takes what the publisher sends, and passes it on to any number of viewers. It is a
-process of its own because a viewer that is slow or frozen then holds nobody up, and because the
-SDK's own server listens on every interface. Viewers connect to it without any authentication, so it
-must never be reachable from another machine.
+Server
+    It takes what the publisher sends, and passes it on to any number of viewers. It is a process of
+    its own because a viewer that is slow or frozen then holds nobody up, and because the SDK's own
+    server listens on every interface. Viewers connect to it without any authentication, so it must
+    never be reachable from another machine.
+Page
+    The web viewer's page on loopback, as Rerun brings it, but confined to this computer. Unchanged,
+    it loads fonts and sends usage statistics to the internet, from the operator's browser.
+    Therefore it is passed on from here, with a policy that browsers enforce: it may load from this
+    computer, and from nowhere else. A few lines are added by which it is loaded again when a server
+    was replaced: viewers do not connect a second time by themselves.
+Address
+    One small file for each live view in the user's runtime folder, as long as there is one. A file
+    that a killed process left is recognised by that process being gone.
 """
 
 import collections
@@ -45,6 +41,8 @@ from typing import Any, Final, Self
 
 from rigd.runtime import runtime_folder
 from rigd.view import without_settings
+
+# Rerun's program
 
 LOOPBACK: Final = "127.0.0.1"
 
@@ -84,9 +82,9 @@ class RerunProgram:
     Parameters
     ----------
     options
-        Of its command line.
+        Options of its command line.
     environment
-        What it is to find there beside this process's own.
+        Environment variables in addition to this process's own.
 
     Raises
     ------
@@ -135,12 +133,12 @@ class RerunProgram:
 
     @property
     def grpc_port(self) -> int:
-        """Where it takes connections; 0: not yet."""
+        """Port for connections; 0: none yet."""
         return self._ports.get(_LISTENING, 0)
 
     @property
     def page_port(self) -> int:
-        """Where it serves the web viewer's page, if it is to; 0: not yet."""
+        """Port of the web viewer's page, if it is to serve one; 0: none yet."""
         return self._ports.get(_SERVING_PAGE, 0)
 
     @property
@@ -191,6 +189,8 @@ def _die_with_parent() -> None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
+# Addresses
+
 _PREFIX: Final = "live-"
 _SUFFIX: Final = ".json"
 _MOST_BYTES: Final = 4096
@@ -205,14 +205,14 @@ class LiveAddress:
     rig
         The profile's name.
     pid
-        Of the publisher.
+        Process of the publisher.
     born
         When that process was started, in clock ticks since the computer was: no other process has
         both numbers.
     grpc_port
-        On loopback, for native viewers.
+        Port on loopback, for native viewers.
     page_port
-        On loopback, for browsers.
+        Port on loopback, for browsers.
     server
         Number of the server, another for each: viewers do not connect a second time by themselves.
     """
@@ -232,12 +232,12 @@ class LiveAddress:
 
     @property
     def proxy_url(self) -> str:
-        """Where native viewers connect."""
+        """Address for native viewers."""
         return proxy_url(LOOPBACK, self.grpc_port)
 
     @property
     def page_url(self) -> str:
-        """What to open in a browser."""
+        """Address to open in a browser."""
         return f"http://{LOOPBACK}:{self.page_port}"
 
     @property
@@ -339,6 +339,8 @@ def _born(pid: int) -> int | None:
     return None if state in "ZX" else int(rest[18])
 
 
+# Page for browsers
+
 PAGE_PORT: Final = 9090
 """Rerun's own, as long as nobody else has it."""
 _STATE: Final = "live.json"
@@ -353,7 +355,7 @@ _BLOCK: Final = 65_536
 _PATIENCE_S: Final = 10.0
 _LOOK_S: Final = 0.1
 _LONGEST_S: Final = 60.0
-"""For one connection: the viewer has 40 MB, and the tunnel may be slow."""
+"""Longest time of a connection: the viewer has 40 MB, and the tunnel may be slow."""
 _MOST_AT_ONCE: Final = 16
 _OWN_NAMES: Final = frozenset({LOOPBACK, "localhost"})
 """Any page on the internet can have its own name lead here; it is not to read what this shows."""
@@ -396,7 +398,7 @@ class PageServer:
     Parameters
     ----------
     port
-        To take on loopback; 0 leaves the choice to the system.
+        Port to take on loopback; 0 leaves the choice to the system.
     address
         Asked for the view that there is now; None: none at the moment.
     upstream
@@ -405,7 +407,7 @@ class PageServer:
     Attributes
     ----------
     port
-        Where it listens.
+        Port on which it listens.
 
     Raises
     ------
@@ -584,17 +586,19 @@ def kept_here(page: str) -> str:
     return _REMOTE_LINK.sub("", page).replace("</body>", f"{_AGAIN}</body>", 1)
 
 
+# Server of a rig
+
 GRPC_PORT: Final = 9876
 """Rerun's own: where viewers look unless told otherwise, and tunnels can be laid in advance."""
 _BACKLOG: Final = "16MiB"
-"""What a viewer that joins late is sent first: some 80 s."""
+"""Data that a viewer which joins late is sent first: some 80 s."""
 _MOST_SESSIONS: Final = 20
-"""Of some 300 kB each that stay, layout and charts; then another server takes its place."""
+"""Each leaves some 300 kB of layout and charts in the server; then another takes its place."""
 _START_S: Final = 15.0
-"""In which a server has to take connections, on a computer that is busy."""
+"""Time in which a server has to accept connections, on a busy computer."""
 _ANSWER_S: Final = 0.1
 _PAUSE_S: Final = 1.0
-"""From one start of a server to the next."""
+"""Least time between two starts of a server."""
 
 
 class Outlet:
@@ -608,7 +612,7 @@ class Outlet:
     Attributes
     ----------
     address
-        Of the server that takes connections now; None: there is none at the moment.
+        Address of the server that accepts connections now; None while there is none.
 
     Raises
     ------

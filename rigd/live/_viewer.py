@@ -1,4 +1,4 @@
-"""Rerun's native viewer: a window on a live view, or on a file."""
+"""Rerun's native viewer: a window on a live view, or on a file; and the page for a file."""
 
 import contextlib
 import threading
@@ -18,9 +18,9 @@ from rigd.live._server import (
 from rigd.runtime import runtime_folder
 
 _MOST_MEMORY: Final = "4GiB"
-"""Then the oldest is forgotten: a session of some hours has room."""
+"""Limit beyond which the oldest data are dropped: a session of some hours has room."""
 _START_S: Final = 30.0
-"""In which a server has to take connections."""
+"""Time in which a server has to accept connections."""
 _LOOK_S: Final = 0.05
 
 
@@ -33,6 +33,9 @@ def _fault_of(program: RerunProgram) -> str:
             "for most graphics cards, and one that needs none."
         )
     return f"The window was closed by a fault ({program.last_words})."
+
+
+# File in a window or a browser
 
 
 class _Playback:
@@ -76,7 +79,7 @@ class Window(_Playback):
     Parameters
     ----------
     path
-        Of the recording.
+        Path of the recording.
     scratch
         Folder in which Rerun may leave files: it does when it is ended.
     options
@@ -112,14 +115,14 @@ class PageOfFile(_Playback):
     Parameters
     ----------
     path
-        Of the recording.
+        Path of the recording.
     scratch
         Folder in which Rerun may leave files.
 
     Attributes
     ----------
     address
-        Where it is.
+        Address of the page.
 
     Raises
     ------
@@ -172,8 +175,10 @@ class PageOfFile(_Playback):
             time.sleep(_LOOK_S)
 
 
+# Window on a live view
+
 _WINDOW_MEMORY: Final = "2GiB"
-"""Then the oldest is forgotten; the same computer may be running the loop."""
+"""Limit beyond which the oldest data are dropped; the same computer may be running the loop."""
 _ANSWER_S: Final = 5.0
 _HOSTS: Final = ("127.0.0.1", "localhost")
 
@@ -186,7 +191,7 @@ class Viewer:
     Parameters
     ----------
     address
-        Of the live view that is shown first.
+        Address of the live view that is shown first.
     scratch
         Folder in which Rerun may leave files: it does when it is ended.
     options
@@ -224,7 +229,7 @@ class Viewer:
 
     @property
     def last_words(self) -> str:
-        """What it said last."""
+        """Last lines of its log."""
         return self._program.last_words
 
     @property
@@ -239,7 +244,7 @@ class Viewer:
 
     @property
     def control_url(self) -> str:
-        """Where the viewer itself takes orders; empty: not yet."""
+        """Address at which the viewer accepts commands; empty: none yet."""
         port = self._program.grpc_port
         return proxy_url(_HOSTS[0], port) if port else ""
 

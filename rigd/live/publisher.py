@@ -1,10 +1,9 @@
-"""What waits until the server takes it: some seconds of samples, and what must not be left out.
-
-The publisher process: rings → picture → Rerun, for one session after the other.
+"""The publisher process: from the rings to Rerun, for one session after the other.
 
 It only looks at the rings, so neither the loop nor the recorder can feel it; what it cannot show in
-time is dropped and counted. What the picture computes does not depend on what could be shown. It
-ends when its standard input does, and takes the server along.
+time is dropped and counted. Some seconds of samples wait until the server takes them, and so do
+events, which must not be left out (`Backlog`). What is computed for the view does not depend on
+what could be shown. The process ends when its standard input does, and takes the server along.
 """
 
 import collections
@@ -26,140 +25,16 @@ if TYPE_CHECKING:
     from rigd.live._ring_reader import LiveJob, LiveSession
     from rigd.view import Drawing
 
-_MOST_OWED: Final = 1000
-
-
-class Backlog:
-    """Drawings of one session on their way to the viewers.
-
-    Parameters
-    ----------
-    most_samples
-        How many samples may wait; beyond, the oldest are dropped.
-
-    Attributes
-    ----------
-    samples
-        Samples that wait.
-    dropped
-        Samples that were dropped.
-    """
-
-    def __init__(self, most_samples: int) -> None:
-        self._most_samples = most_samples
-        self._waiting: collections.deque[tuple[list[Drawing], int]] = collections.deque()
-        self.samples = 0
-        self._owed: collections.deque[Drawing] = collections.deque(maxlen=_MOST_OWED)
-        self.dropped = 0
-
-    def __bool__(self) -> bool:
-        return bool(self._waiting or self._owed)
-
-    def put(self, drawings: "list[Drawing]", samples: int) -> None:
-        """Add drawings that show so many samples; if need be, make room."""
-        if drawings:
-            self._waiting.append((drawings, samples))
-            self.samples += samples
-        while self.samples > self._most_samples and len(self._waiting) > 1:
-            _, lost = self._waiting.popleft()
-            self.samples -= lost
-            self.dropped += lost
-
-    def owe(self, drawings: "Iterable[Drawing]") -> None:
-        """Add drawings that wait as long as it takes."""
-        self._owed.extend(drawings)
-
-    def forgive(self) -> None:
-        """Forget those: what they show is in the frame of a new connection."""
-        self._owed.clear()
-
-    def take(self) -> "tuple[list[Drawing], int]":
-        """Return everything, and how many samples it shows; nothing waits any more."""
-        drawings = [*self._owed, *(draw for group, _ in self._waiting for draw in group)]
-        samples, self.samples = self.samples, 0
-        self._owed.clear()
-        self._waiting.clear()
-        return drawings, samples
-
-
-LOOK_S: Final = 0.25
-"""From one look to the next."""
-_RATE_LOOKS: Final = 4
-"""Over as many of them the rate is measured."""
-
-
-class Vitals:
-    """Looks at the board a few times a second while a session is run.
-
-    Parameters
-    ----------
-    channels
-        The memory of the rig's processes.
-    """
-
-    def __init__(self, channels: Channels) -> None:
-        self._board = channels.board
-        self._samples = channels.samples
-        self._ticks: collections.deque[tuple[float, int]] = collections.deque(
-            maxlen=_RATE_LOOKS + 1
-        )
-        self._due_s = 0.0
-
-    def due(self, now_s: float) -> bool:
-        """Whether it is time for another look, at `now_s` of any clock that does not jump."""
-        return now_s >= self._due_s
-
-    def look(self, now_s: float, view_dropped: int) -> Health:
-        """Return how it is.
-
-        Parameters
-        ----------
-        now_s
-            As for :meth:`due`.
-        view_dropped
-            Samples of the session that could not be shown.
-        """
-        board = self._board
-        self._due_s = now_s + LOOK_S
-        # Until tick 0 the board has the counts of the session before.
-        began = bool(board[Word.GO])
-        scheduled, missed, late, lost = (
-            board[word] if began else 0
-            for word in (Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST)
-        )
-        load_ppm = board.known(Word.BUS_LOAD_PPM)
-        return Health(
-            missed_ticks=missed,
-            late_ticks=late,
-            lost_ticks=lost,
-            recorder_lag_ticks=self._samples.waiting,
-            disk_free_mb=board[Word.DISK_FREE_MB] or None,
-            view_dropped=view_dropped,
-            bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
-            bus_errors=board.known(Word.BUS_ERRORS),
-            sensor_status=board.known(Word.SENSOR_STATUS),
-            rate_hz=self._rate_hz(now_s, scheduled),
-        )
-
-    def _rate_hz(self, now_s: float, scheduled: int) -> float | None:
-        ticks = self._ticks
-        if ticks and scheduled < ticks[-1][1]:
-            ticks.clear()  # another session
-        ticks.append((now_s, scheduled))
-        (first_s, first), (last_s, last) = ticks[0], ticks[-1]
-        # As long as nothing moves there is no session, or it is prepared.
-        return (last - first) / (last_s - first_s) if last > first else None
-
 
 _PERIOD_S: Final = 1 / 15
-"""What is sent costs more by the piece than by its size; the eye takes this for smooth."""
+"""Period of sending: the cost grows with the number of messages; the eye takes this for smooth."""
 _IDLE_PERIOD_S: Final = 1.0
 _HURRY_S: Final = 0.2
 _WAITING_S: Final = 10.0
-"""Of samples that wait for a server that stalls."""
+"""Duration of samples that may wait for a stalled server."""
 _STUCK_S: Final = 20
 _PARTING_S: Final = 0.3
-"""What was sent last is on its way to the viewers for so long."""
+"""Time that the last messages take to the viewers."""
 
 
 def main() -> None:
@@ -270,7 +145,7 @@ class _Shown:
     def __init__(self, session: "LiveSession", channels: Channels) -> None:
         board = self._board = channels.board
         begin, seen = session.begins[TOPICS.index(SAMPLE)], board[Word.LIVE_SEEN]
-        # Of a session that another publisher showed up to there, the count goes on.
+        # A session that another publisher has shown up to there keeps its count.
         self._dropped_before = board[Word.LIVE_DROPPED] if seen > begin else 0
         self.intake = Intake(session, channels, seen)
         self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
@@ -299,7 +174,7 @@ class _Shown:
         self._tell()
 
     def _tell(self) -> None:
-        """Put on the board what another publisher, if it takes over, has to know."""
+        """Write to the board what another publisher needs to know if it takes over."""
         board = self._board
         board[Word.LIVE_DROPPED] = self.dropped
         shown = self.intake.next - self.backlog.samples
@@ -317,7 +192,7 @@ class _Shown:
         self.over = True
 
     def send(self, feed: Feed, *, connected: bool) -> None:
-        """Send what waits; `connected` anew, with the frame of the picture."""
+        """Send what waits; if newly `connected`, with the frame of the scene."""
         if connected:
             self.backlog.forgive()
         if self.backlog:
@@ -335,6 +210,135 @@ def _arm_watchdog() -> None:
     so it is the default action of the signal that is relied upon; the server goes with it.
     """
     signal.alarm(_STUCK_S)
+
+
+# Queue of drawings
+
+_MOST_OWED: Final = 1000
+
+
+class Backlog:
+    """Drawings of one session on their way to the viewers.
+
+    Parameters
+    ----------
+    most_samples
+        How many samples may wait; beyond, the oldest are dropped.
+
+    Attributes
+    ----------
+    samples
+        Samples that wait.
+    dropped
+        Samples that were dropped.
+    """
+
+    def __init__(self, most_samples: int) -> None:
+        self._most_samples = most_samples
+        self._waiting: collections.deque[tuple[list[Drawing], int]] = collections.deque()
+        self.samples = 0
+        self._owed: collections.deque[Drawing] = collections.deque(maxlen=_MOST_OWED)
+        self.dropped = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting or self._owed)
+
+    def put(self, drawings: "list[Drawing]", samples: int) -> None:
+        """Add drawings that show so many samples; if need be, make room."""
+        if drawings:
+            self._waiting.append((drawings, samples))
+            self.samples += samples
+        while self.samples > self._most_samples and len(self._waiting) > 1:
+            _, lost = self._waiting.popleft()
+            self.samples -= lost
+            self.dropped += lost
+
+    def owe(self, drawings: "Iterable[Drawing]") -> None:
+        """Add drawings that wait as long as it takes."""
+        self._owed.extend(drawings)
+
+    def forgive(self) -> None:
+        """Forget those: what they show is in the frame of a new connection."""
+        self._owed.clear()
+
+    def take(self) -> "tuple[list[Drawing], int]":
+        """Return everything, and how many samples it shows; nothing waits any more."""
+        drawings = [*self._owed, *(draw for group, _ in self._waiting for draw in group)]
+        samples, self.samples = self.samples, 0
+        self._owed.clear()
+        self._waiting.clear()
+        return drawings, samples
+
+
+# Health of a session
+
+LOOK_S: Final = 0.25
+"""Time from one look to the next."""
+_RATE_LOOKS: Final = 4
+"""Number of looks over which the rate is measured."""
+
+
+class Vitals:
+    """Reads the board a few times a second while a session is run.
+
+    Parameters
+    ----------
+    channels
+        The memory of the rig's processes.
+    """
+
+    def __init__(self, channels: Channels) -> None:
+        self._board = channels.board
+        self._samples = channels.samples
+        self._ticks: collections.deque[tuple[float, int]] = collections.deque(
+            maxlen=_RATE_LOOKS + 1
+        )
+        self._due_s = 0.0
+
+    def due(self, now_s: float) -> bool:
+        """Whether it is time for another look, at `now_s` of any clock that does not jump."""
+        return now_s >= self._due_s
+
+    def look(self, now_s: float, view_dropped: int) -> Health:
+        """Return how it is.
+
+        Parameters
+        ----------
+        now_s
+            As for :meth:`due`.
+        view_dropped
+            Samples of the session that could not be shown.
+        """
+        board = self._board
+        self._due_s = now_s + LOOK_S
+        # Until tick 0 the board has the counts of the session before.
+        began = bool(board[Word.GO])
+        scheduled, missed, late, lost = (
+            board[word] if began else 0
+            for word in (Word.SCHEDULED, Word.MISSED, Word.LATE, Word.LOST)
+        )
+        load_ppm = board.known(Word.BUS_LOAD_PPM)
+        return Health(
+            missed_ticks=missed,
+            late_ticks=late,
+            lost_ticks=lost,
+            recorder_lag_ticks=self._samples.waiting,
+            disk_free_mb=board[Word.DISK_FREE_MB] or None,
+            view_dropped=view_dropped,
+            bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
+            bus_errors=board.known(Word.BUS_ERRORS),
+            sensor_status=board.known(Word.SENSOR_STATUS),
+            rate_hz=self._rate_hz(now_s, scheduled),
+        )
+
+    def _rate_hz(self, now_s: float, scheduled: int) -> float | None:
+        ticks = self._ticks
+        if ticks and scheduled < ticks[-1][1]:
+            ticks.clear()  # another session
+        ticks.append((now_s, scheduled))
+        (first_s, first), (last_s, last) = ticks[0], ticks[-1]
+        # As long as nothing moves there is no session, or it is prepared.
+        return (last - first) / (last_s - first_s) if last > first else None
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""Checks of a profile, and what is said of its mistakes."""
+"""Checks of a profile that go beyond types and ranges, and the texts about its mistakes.
+
+Values may contradict each other (`contradictions`), also about the wiring of the devices
+(`wiring_contradictions`); sources, keys and sections may be missing or unknown.
+"""
 
 import difflib
 import re
@@ -44,12 +48,17 @@ _UNITS_OF_SIX = {
 }
 
 _JUMP_FACTOR = 100.0
-"""Of the motor's own acceleration: a jump of the encoder up to that passes for motion."""
+"""Multiple of the motor's own acceleration: a jump of the encoder up to it passes for motion."""
 
 _NAME = re.compile(r"[^\W_][\w .-]{0,63}")
 
 _FIRST_MODE_HZ = 0.1, 100.0
-"""Of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
+"""First mode of the undamped beam: outside, a unit is wrong, or it is no antenna for this rig."""
+
+
+_PER_MILLE_LIMIT = 32.767
+"""Largest torque over rated torque that fits the 16 bits of object 6071."""
+_ROUNDING = 1e-9
 
 
 def no_source(key: str, source: object) -> str:
@@ -284,9 +293,7 @@ def _choice(words: tuple[str, ...]) -> str:
     return " or ".join(f'"{word}"' for word in words)
 
 
-_PER_MILLE_LIMIT = 32.767
-"""Largest torque over rated torque that fits the 16 bits of object 6071."""
-_ROUNDING = 1e-9
+# Devices and their wiring
 
 
 def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
@@ -305,7 +312,7 @@ def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _sections(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sections that the chosen devices lack, and those that nobody reads."""
+    """Yield sections that the chosen devices lack, and those that none of them uses."""
     drive, sensor = values["devices.drive"], values["devices.sensor"]
     needed = {*WIRING.get(drive, ()), *WIRING.get(sensor, ())}
     present = {

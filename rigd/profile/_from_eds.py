@@ -1,4 +1,4 @@
-"""A profile for a drive that nobody has connected yet: from its EDS and another profile."""
+"""Draft of a profile for a drive not yet connected: from its EDS and another profile."""
 
 import os
 import re
@@ -24,6 +24,11 @@ from rigd.profile._load import ProfileError, profile_of
 from rigd.profile._schema import Profile, keys
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
 
+_ACCEPT = "cia402.accept_without"
+_LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
+_MAKERS_OWN = range(0x2000, 0x6000)
+_MOST_NAMED = 4
+
 
 class UnusableDriveError(ValueError):
     """A drive that no profile can make fit; the message names what it lacks."""
@@ -31,7 +36,7 @@ class UnusableDriveError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What no EDS tells and a profile has to."""
+    """Setting that no EDS states and a profile needs."""
 
     key: str
     text: str
@@ -57,10 +62,6 @@ _OWN_WATCHDOG = Question(
     "Watchdog of the maker's own that takes the torque off when this computer falls silent, s "
     "(0: none)",
 )
-_ACCEPT = "cia402.accept_without"
-_LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
-_MAKERS_OWN = range(0x2000, 0x6000)
-_MOST_NAMED = 4
 
 
 class Draft:
@@ -73,7 +74,7 @@ class Draft:
     eds
         What the drive's file tells.
     path
-        Of the file that is to be written.
+        Path of the file to write.
 
     Raises
     ------
@@ -152,7 +153,7 @@ class Draft:
 
     @property
     def doubts(self) -> list[str]:
-        """What the operator has to know of this drive, in sentences."""
+        """Remarks on this drive for the operator, in sentences."""
         findings = judge(self._eds, profile_of(self._body(), self._path).rig).findings
         told = [f.sentence for f in findings if f.sentence]
         return told + [

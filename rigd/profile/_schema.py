@@ -1,4 +1,4 @@
-"""What a profile consists of: its sections, and the settings that no other module declares."""
+"""Schema of a profile: its sections, and the settings that no other module declares."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
@@ -29,7 +29,7 @@ from rigd.safety import Limits
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """What happens round a record: taring before it, the way back and the check after it."""
+    """Settings round a record: taring before it, the way back and the check after it."""
 
     tare_s: Annotated[float, Ge(0.5), Le(60)]
     """Time at rest over which the sensor is averaged."""
@@ -71,7 +71,7 @@ class RealtimeSettings:
 
 @dataclass(frozen=True, slots=True)
 class RigSection:
-    """What is of the rig as a whole."""
+    """Settings of the rig as a whole."""
 
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
     """Slower loops look too seldom at who else is at work."""

@@ -1,4 +1,4 @@
-"""A new profile in the text of another: other values, each with its source and its reason."""
+"""Writing of a profile in the text of another: new values, each with its source and its reason."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     Parameters
     ----------
     text
-        Of a profile that can be used.
+        Text of a valid profile.
     settings
         What is to stand in it. A key that it has left out takes the place of the comment that
         shows it, or comes first in its section.
@@ -153,7 +153,7 @@ def _taken(path: Path) -> ProfileError:
 def _places(lines: Sequence[str]) -> dict[str, int]:
     """Return the number of the line on which each section and each key of a profile stands.
 
-    Of a key that only a comment shows, it is that of the comment.
+    A key that stands in a comment only has the comment's place.
     """
     places: dict[str, int] = {}
     shown: dict[str, int] = {}

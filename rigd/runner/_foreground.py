@@ -173,7 +173,7 @@ def _tell_plan(tell: Tell, profile: Profile, excitation: Excitation, plan: Plan)
 
 
 def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
-    """Say that a stop came between two sessions or before the first; in a session, that tells."""
+    """Tell of a stop between two sessions or before the first; within one, the session tells."""
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""
@@ -236,7 +236,7 @@ class _ProgressView:
         self._thread.join(_TERMINAL_PATIENCE_S)
 
     def update(self, state: SessionProgress, events: list[Event]) -> None:
-        """Have it shown where the session is, and what it has to say."""
+        """Show the progress of the session, and its events."""
         with self._lock:
             self._state = state
             self._events += events

@@ -17,7 +17,7 @@ _START_PATIENCE_S = 60.0
 """On a computer that is busy, before one that only starts counts as hung."""
 _BEGIN_PATIENCE_S = 1.0
 _MOST_RESTARTS = 3
-"""In one session: what dies again and again is not worth the processor time."""
+"""Most restarts in one session: a process that dies again and again is given up."""
 
 
 class LiveView:
@@ -26,14 +26,14 @@ class LiveView:
     Parameters
     ----------
     crew
-        With a publisher, its memory laid out.
+        Processes with a publisher, their memory laid out.
     rig
         The profile's name.
 
     Attributes
     ----------
     address
-        Where the view is, as far as is known.
+        Address of the view, as far as it is known.
     """
 
     def __init__(self, crew: Crew, rig: str) -> None:
@@ -53,7 +53,7 @@ class LiveView:
         Parameters
         ----------
         order
-            What is run.
+            Session that is run.
         stop
             The operator's: then the view is waited for no longer.
 
@@ -92,7 +92,7 @@ class LiveView:
         return told
 
     def finish(self, outcome: str, reason: str) -> None:
-        """Take note of the end of the session that is shown; how it ended may be unknown."""
+        """Note the end of the session that is shown; its outcome may be unknown."""
         if self._session is not None:
             self._session = None
             ends = tuple(ring.written for ring in self._crew.channels.rings)
@@ -105,7 +105,7 @@ class LiveView:
             self._listen(0.1)
 
     def _start(self) -> None:
-        """Set a new process to work."""
+        """Start a new process."""
         self._heard = False
         self._lost = ""
         self._pulse = Pulse()
@@ -173,7 +173,7 @@ class LiveView:
 
 
 def subject_of(order: Order) -> Subject:
-    """Return what the picture of a session is of."""
+    """Return what the live view needs to know of a session."""
     rig = order.profile.rig
     return Subject(
         name=order.path.stem,

@@ -1,4 +1,4 @@
-"""What a session will do, before anything moves: stability of the loop, peaks, limits."""
+"""Planning of a session, before anything moves: stability of the loop, peaks, limits."""
 
 import math
 from collections.abc import Mapping
@@ -34,12 +34,12 @@ class Prediction:
     peak_tracking_error_rad: float
     peak_coupling_torque_nm: float
     tip: TipMotion | None = None
-    """Of the beam's free end in a vacuum; None without a beam, or where it does not matter."""
+    """Motion of the beam's free end in a vacuum; None without a beam, or where it is irrelevant."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A session that may be run."""
+    """A session that stays within the limits."""
 
     prediction: Prediction
     warnings: tuple[str, ...]
@@ -48,12 +48,12 @@ class Plan:
 
 
 class Foresight:
-    """What an excitation that is made for one rig may know of it.
+    """Loop preview: what an excitation made for one rig may know of it.
 
     Parameters
     ----------
     profile
-        Of the rig. Its loop is closed when it is first asked for.
+        Profile of the rig. Its closed loop is computed when first needed.
     """
 
     def __init__(self, profile: Profile) -> None:
@@ -96,7 +96,7 @@ def plan_session(profile: Profile, excitation: Excitation, *, force: bool = Fals
     Parameters
     ----------
     profile, excitation
-        What is to be run.
+        Rig and excitation of the session.
     force
         Let torques be clipped, of the motor or of the sensor. No other limit can be forced: leaving
         it would end the session.

@@ -1,4 +1,4 @@
-"""The processes of a rig, and the memory they share.
+"""Process group of a rig: control, recorder and live publisher, and the memory they share.
 
 This module is quick to import, so that the processes can be started before anything else: they
 import what they need while the supervisor reads the profile and plans.
@@ -46,7 +46,7 @@ class Crew:
     Attributes
     ----------
     live
-        As given.
+        Whether the live publisher is started too.
     cores
         For the processes that are still to be started, where this one keeps off some; empty: its
         own.

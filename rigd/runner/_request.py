@@ -1,8 +1,7 @@
-"""A session as asked for: rig, excitation, file and room for it, and the file's metadata.
+"""Session request: rig, excitation, file and room for it, and the file's metadata.
 
-From what the operator asks for to a session that can be run: rig, file, and room for it.
-
-Shared by sessions in the foreground and by the daemon.
+These are the steps from what the operator asks for to a session that can be run. Sessions in the
+foreground and those of the daemon share them.
 """
 
 import json
@@ -61,11 +60,11 @@ def load_rig(
     Parameters
     ----------
     name
-        Of the profile, or its file.
+        Name of the profile, or its file.
     fast
         Not in real time.
     seed
-        Of a simulated rig's noise; None leaves the profile's.
+        Seed of a simulated rig's noise; None keeps the profile's.
     hardware
         The operator says that the hardware is to move.
 
@@ -204,7 +203,7 @@ def another_path(path: Path) -> Path:
 
 
 def what_is_kept(path: Path | None) -> str:
-    """Say what there is of a session that failed, once its processes have ended.
+    """Say what is kept of a session that failed, once its processes have ended.
 
     Parameters
     ----------
@@ -239,7 +238,7 @@ def file_header(order: Order, connected: Message, tare: Message) -> Message:
     Parameters
     ----------
     order
-        What is run.
+        Session that is run.
     connected
         What the control process told of the devices and of its real-time settings.
     tare

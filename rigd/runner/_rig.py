@@ -1,4 +1,4 @@
-"""A rig as whoever runs sessions on it sees it: connect, run, tare, zero, status, disconnect."""
+"""The rig on which sessions are run: connect, run, tare, zero, status, disconnect."""
 
 import contextlib
 import gc
@@ -32,7 +32,7 @@ from rigd.runtime import StopRequest
 _POLL_S = 0.05
 _CONNECT_PATIENCE_S = 30.0
 _ANSWER_PATIENCE_S = 10.0
-"""Beyond the time that is measured."""
+"""Time to wait for an answer, beyond the time that is measured."""
 
 
 class RigError(Exception):
@@ -47,9 +47,9 @@ class Rig:
     Parameters
     ----------
     profile
-        Of the rig.
+        Profile of the rig.
     fast
-        Under the virtual clock.
+        Run under the virtual clock.
     live
         Show each session in a live view.
     crew
@@ -133,7 +133,7 @@ class Rig:
         Parameters
         ----------
         order
-            What to run.
+            Session to run.
         stop
             The operator's, which ends it.
         watcher, listens
@@ -254,7 +254,7 @@ class Rig:
             raise RigError(message.get("ended") or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
-        """Return a look at the board, from any thread; None while there is none."""
+        """Return the status from shared memory, from any thread; None while there is none."""
         with self._looking:
             crew, view = self._crew, self._view
             if crew is None or not crew.laid_out:
@@ -338,7 +338,7 @@ class Rig:
 
 
 def _wipe(board: Board) -> None:
-    """Take from the board what is said to or of one session."""
+    """Clear the words of the board that belong to one session."""
     board[Word.STOP] = Stop.NO
     board[Word.GO] = 0
     board[Word.LIVE_DROPPED] = 0

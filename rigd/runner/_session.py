@@ -37,9 +37,9 @@ from rigd.runtime import StopRequest
 _POLL_S = 0.05
 _PATIENCE_S = 5.0
 _SLOW_PATIENCE_S = 30.0
-"""For enabling a drive and for switching it off, which may take its time."""
+"""Time for enabling a drive and for switching it off, which may be slow."""
 _START_PATIENCE_S = 30.0
-"""For a recorder that is only starting, on a computer that is busy; nothing moves yet."""
+"""Time for a recorder to start on a busy computer; nothing moves yet."""
 _MOST_NAMES = 100
 _TORQUE_PHASES = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
 
@@ -50,7 +50,7 @@ _COUNTED = {
     "stale_angles": Word.STALE_ANGLES,
     "stale_wrenches": Word.STALE_WRENCHES,
 }
-"""What the control process counts on the board, by the names of the outcome."""
+"""Words that the control process counts in, by the names in the outcome."""
 _NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
 
 
@@ -60,11 +60,11 @@ class SessionFailedError(Exception):
     Attributes
     ----------
     path
-        Its file, if one was begun.
+        File of the session, if one was begun.
     kept
-        Where its record was saved, if that is not the ``.part`` of the file.
+        Path where the record was saved, if that is not the ``.part`` of the file.
     counts
-        Of ticks, as far as they are known: ``scheduled``, ``missed``, ``late``,
+        Counts of ticks, as far as known: ``scheduled``, ``missed``, ``late``,
         ``stale_angles``, ``stale_wrenches``.
     """
 
@@ -103,27 +103,27 @@ class _NameTakenError(SessionFailedError):
 
 @dataclass(frozen=True, slots=True)
 class SessionResult:
-    """How a session ended."""
+    """Result of a session."""
 
     path: Path | None
-    """None: there is no file, for it ended before tick 0, or none that is whole."""
+    """Path of the file; None: it ended before tick 0, or no complete file could be made."""
     outcome: str
     reason: str
     scheduled: int
     recorded: int | None
-    """None: not known before the file is recovered; likewise `lost`."""
+    """None, as `lost`, where it is not known before the file is recovered."""
     missed: int
     late: int
     lost: int | None
     fault: bool
     """Something failed, in the record or after it, whatever was asked for meanwhile."""
     stale_angles: int = 0
-    """Recorded ticks whose angle is an old one; likewise `stale_wrenches`."""
+    """Recorded ticks with a stale angle; `stale_wrenches` counts stale wrenches."""
     stale_wrenches: int = 0
     live_dropped: int = 0
     """Samples that the live view did not get."""
     part: Path | None = None
-    """What there is of a file that could not be made whole."""
+    """Path of an incomplete file that could not be completed."""
     hardware: bool | None = None
     """Whether it was the hardware that moved, and nothing simulated; None: not known."""
 
@@ -152,7 +152,7 @@ class SessionResult:
 
 @dataclass(frozen=True, slots=True)
 class SessionProgress:
-    """Where a running session is."""
+    """Progress of a running session."""
 
     phase: Phase
     tick: int
@@ -169,11 +169,11 @@ class Session:
     Parameters
     ----------
     order
-        What to run.
+        Session to run.
     crew
-        Whose control process is connected and idle.
+        Processes of the rig; its control process is connected and idle.
     connected
-        What that process told when it was.
+        Message of that process when it had connected.
     live
         The view to keep up, or None.
     watcher
@@ -216,7 +216,7 @@ class Session:
         self.device_failed = False
 
     def run(self, stop: StopRequest) -> SessionResult:
-        """Run it to its end.
+        """Run the session to its end.
 
         Raises
         ------
@@ -361,7 +361,7 @@ class Session:
         return self._as_finished(reason)
 
     def _as_finished(self, reason: str) -> Message:
-        """Say what the control process would have said, as far as the board tells."""
+        """Make up the control process's result from its words on the board."""
         counts = self._counts()
         whole = counts["scheduled"] == self._order.excitation.reference_rad.size
         return {

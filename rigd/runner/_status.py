@@ -1,4 +1,4 @@
-"""What the shared memory tells of a rig and of a record that grows."""
+"""Status of a rig and of a growing record, read from shared memory."""
 
 import os
 import time
@@ -16,7 +16,7 @@ from rigd.runner._process_group import Crew
 from rigd.session import decode_samples
 
 _WINDOW_S: Final = 1.0
-"""Of samples by which lateness and rate are told."""
+"""Window of samples from which lateness and rate are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,24 +26,28 @@ class SignalStatus:
     rate_hz: float
     """Ticks a second over the last second, without those that were missed."""
     lateness_p50_us: float
-    """Over the last second; likewise:"""
+    """Wake-up latency over the last second: median."""
     lateness_p99_us: float
+    """Wake-up latency over the last second: 99th percentile."""
     work_p99_us: float
+    """Execution time of a tick over the last second: 99th percentile."""
     tracking_error_rad: float
     """Reference less angle, now."""
     peak_tracking_error_rad: float
-    """Largest magnitude since the record began; likewise:"""
+    """Largest magnitude since the record began."""
     peak_coupling_torque_nm: float
+    """Largest magnitude since the record began."""
     peak_torque_command_nm: float
+    """Largest magnitude since the record began."""
 
 
 class SignalWatch:
-    """Looks at the samples in the ring, as one who may miss some and holds nobody up.
+    """Observes the samples in the ring; it may miss some and delays nobody.
 
     Parameters
     ----------
     rate_hz
-        Of the rig.
+        Rate of the rig.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -102,19 +106,19 @@ class SignalWatch:
 
 @dataclass(frozen=True, slots=True)
 class ProcessStatus:
-    """How one process of the table is."""
+    """Status of one process of the table."""
 
     name: str
     pid: int
     state: str
     """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
     still_s: float
-    """For how long it has shown no sign of work, as far as somebody looked."""
+    """Time without a heartbeat, as far as somebody looked."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
-    """What came of one topic of the table."""
+    """Status of one topic of the table."""
 
     name: str
     written: int
@@ -128,11 +132,11 @@ class TopicStatus:
 
 @dataclass(frozen=True, slots=True)
 class RigStatus:
-    """A look at the board."""
+    """Status of the rig, as read from shared memory."""
 
     phase: Phase
     angle_rad: float
-    """From the rig's zero."""
+    """Angle from the rig's zero."""
     coupling_torque_nm: float
     torque_command_nm: float
     tick: int
@@ -140,18 +144,21 @@ class RigStatus:
     late: int
     lost: int
     bus_load_percent: float | None
-    """Of the busiest line; None where there is none. Likewise:"""
+    """Load of the busiest line; None where there is none."""
     bus_errors: int | None
+    """Errors on all lines; None where they are not known."""
     sensor_status: int | None
+    """Status word of the sensor; None where it is not known."""
     disk_free_mb: int | None
+    """Free space on the disk of the session file; None before it is known."""
     view_dropped: int
     """Samples that the live view did not get."""
     signals: SignalStatus | None
-    """Of the record; None before its first sample."""
+    """Figures of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
     topics: tuple[TopicStatus, ...]
     live_view: LiveAddress | None = None
-    """Where the sessions are shown, if they are."""
+    """Address at which the sessions are shown, if they are."""
 
 
 class StatusWatch:
@@ -160,7 +167,7 @@ class StatusWatch:
     Parameters
     ----------
     rate_hz
-        Of the rig.
+        Rate of the rig.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -170,7 +177,7 @@ class StatusWatch:
         self._signals = SignalWatch(rate_hz)
 
     def look(self, crew: Crew) -> RigStatus:
-        """Return how it stands now."""
+        """Return the status now."""
         board = crew.channels.board
         load_ppm = board.known(Word.BUS_LOAD_PPM)
         return RigStatus(

@@ -1,4 +1,4 @@
-"""The folder of this user's sockets, locks and addresses; gone after a restart."""
+"""Folder of this user's sockets, locks and addresses; it does not survive a restart."""
 
 import contextlib
 import itertools

@@ -17,7 +17,7 @@ _NAME_SIZE = 200
 
 
 class HeldError(Exception):
-    """Another program holds the file; carries what it says of itself."""
+    """Another program holds the file; carries its own description."""
 
 
 class HeldFile:
@@ -26,7 +26,7 @@ class HeldFile:
     Parameters
     ----------
     name
-        What is locked; other characters than letters and digits count alike.
+        Name of what is locked; other characters than letters and digits count alike.
     everybody
         It is hardware, which all users of this computer share: the lock is in ``/run/lock`` where
         there is one. Otherwise it is in the user's own runtime folder.
@@ -109,6 +109,9 @@ def _others(fd: int, said: str) -> str:
     return found
 
 
+# One program at a time on a rig
+
+
 class RigBusyError(Exception):
     """Another program runs the rig; the message says which."""
 
@@ -121,7 +124,7 @@ class RigLock:
     rig
         The profile's name.
     holder
-        Which program this is, for whoever comes second.
+        Name of this program, for messages to a second one.
     hardware
         The rig is none of a user's own: all users of this computer have to be asked.
     alone

@@ -1,11 +1,10 @@
 r"""Signals that ask for an end, and what each process makes of them.
 
-Signals that ask for an end: what each process makes of them.
-
 Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal reach every process in it; a service manager
-sends SIGTERM to all at once. To the supervisor and to the control process each of them means: stop
-safely. (A suspended control process would leave its last torque on.) The recorder and the live
-publisher let them pass: they end when the supervisor has no more use for them.
+sends SIGTERM to all at once. A command ends by an exception (`raise_on`). To the supervisor and to
+the control process each of the signals means: stop safely (`StopRequest`); a suspended control
+process would leave its last torque on. The recorder and the live publisher let them pass
+(`ignore`): they end when the supervisor has no more use for them.
 """
 
 import signal
@@ -67,6 +66,8 @@ def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
     signal.setitimer(signal.ITIMER_REAL, _REPEAT_S)
 
 
+# In the processes of a rig
+
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 
 
@@ -84,7 +85,7 @@ def held_back() -> Iterator[None]:
 
 
 def ignore() -> None:
-    """Let these signals pass."""
+    """Ignore the signals that ask for an end."""
     for number in _STOPPING:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPPING)

@@ -1,7 +1,8 @@
 """Limits and interlocks: what ends a session, what warns, and what the operator is told.
 
-The software stops a session that leaves its limits; it is no safety function. That is the wired
-STO of the drive (docs/safety.md).
+Offers the table of interlocks (`INTERLOCKS`), the levels of a profile (`Limits`), and the check of
+every tick (`LimitWatch`), which the loop calls. The software stops a session that leaves its
+limits; it is no safety function. That is the wired STO of the drive (docs/safety.md).
 """
 
 import lazy_loader as lazy

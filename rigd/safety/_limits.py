@@ -1,9 +1,7 @@
 """Limits of the rig, and the table of interlocks.
 
-Every interlock: what is watched, against what, by whom, and what follows.
-
-This table is what the checks, the messages and docs/safety.md agree on. The levels themselves stand
-in the profile.
+The table says for every interlock what is watched, against what, by whom, and what follows; the
+checks, the messages and docs/safety.md agree on it. The levels themselves stand in the profile.
 """
 
 from dataclasses import dataclass, field
@@ -18,12 +16,12 @@ BelowAll = Annotated[float, Gt(0), Lt(100)]
 """Per cent; a share is never more than all."""
 
 BUFFERED_S = 16.0
-"""What shared memory holds for the recorder, so that no stall of a disk loses a sample."""
+"""Time that shared memory buffers for the recorder, so that no stall of a disk loses a sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What ends a session; from which part of it on there is a warning, the table says.
+    """Levels that end a session; the table says from which part on there is a warning.
 
     The angle is relative to the rig's zero; all but the free space of the disk are magnitudes that
     must not be exceeded.
@@ -41,7 +39,7 @@ class Limits:
     torque_command_nm: Positive
     """What the controller asks for, before it is cut to the motor's peak torque."""
     sensor_range_percent: Annotated[float, Gt(0), Le(200)]
-    """Of the range of each of the sensor's axes; above 100 a clipped reading ends nothing (it is
+    """Share of the range of each sensor axis; above 100 a clipped reading ends nothing (it is
     flagged in its sample)."""
     saturated_ticks_in_a_row: Annotated[int, Ge(1)]
     """Ticks for which the sensor may report an axis or a gauge at the end of its range."""
@@ -49,7 +47,7 @@ class Limits:
     """Ticks for which an old angle or wrench may stand in for one that did not come."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
     missed_percent: BelowAll
-    """Of all ticks scheduled so far, counted as if they were at least ten seconds' worth."""
+    """Share of all ticks scheduled so far, counted as at least ten seconds' worth."""
     tare_drift_nm: Positive
     """Change of the coupling torque's zero over a session, or since the one before."""
     recorder_lag_s: Positive
@@ -57,8 +55,8 @@ class Limits:
     disk_free_mb: Positive
     """Free space of the disk that the session goes to, below which it ends; 1 MB is 10⁶ bytes."""
     stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
-    """Of all ticks scheduled so far, counted as `missed_percent` is: those whose angle is an old
-    one, and likewise those whose wrench is. ``analyze`` takes no record with more than 1 %."""
+    """Share of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as for
+    `missed_percent`. ``analyze`` takes no record with more than 1 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +66,11 @@ class Violation:
     Attributes
     ----------
     channel, value, limit, unit
-        What is wrong by how much.
+        Quantity, its value, and the limit that it exceeds.
     remedy
-        What the operator can do, a sentence; may be empty.
+        Advice for the operator, a sentence; may be empty.
     key
-        Of the profile, where the limit stands; may be empty.
+        Key of the profile where the limit stands; may be empty.
     below
         The value must not fall below the limit, instead of exceeding it.
     warning
@@ -104,8 +102,11 @@ class Violation:
         )
 
 
+# Table of interlocks
+
+
 class Checked(Enum):
-    """By whom an interlock is checked, and when."""
+    """Place and time of an interlock's check."""
 
     TICK = "loop, every tick"
     LOOK = "loop, every 64 ticks"
@@ -114,7 +115,7 @@ class Checked(Enum):
 
 
 class Action(Enum):
-    """What follows when a limit is left."""
+    """Consequence of a violated limit."""
 
     FAULT = "torque off, session ends as fault"
     STOP = "torque off, session ends as stopped"
@@ -127,19 +128,19 @@ class Interlock:
     Attributes
     ----------
     name
-        Of the interlock.
+        Name of the interlock.
     channel
-        What is watched, as messages name it.
+        Quantity that is watched, as messages name it.
     unit
-        Of value and limit; empty where there is nothing to measure.
+        Unit of value and limit; empty where nothing is measured.
     limit
-        Key of the profile with the level that ends a session; empty likewise.
+        Key of the profile with the level that ends a session; empty where nothing is measured.
     warning
-        Where a warning begins: a part of the limit, or a key of the profile; None: nowhere.
+        Level of the warning: a part of the limit, or a key of the profile; None: no warning.
     checked, action
-        By whom, and what follows.
+        Who checks it, and what follows.
     remedy
-        What the operator is told to do.
+        Advice for the operator.
     below
         The limit is the least that the value may be.
     follows_missed_ticks

@@ -1,4 +1,4 @@
-"""The checks of the loop, and the notices of what comes near a limit."""
+"""Limit monitor: the checks of the loop in every tick, and warnings near a limit."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ _UNSURE_TICKS = 3
 """After missed ticks the next latches come unevenly, and no jump can be told from that."""
 
 _BLAMED_S = 0.005
-"""A standstill of the loop as long as this explains what a limit finds right after it."""
+"""A stall of the loop this long explains a limit that is exceeded right after it."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _FORCES = 3
@@ -43,11 +43,11 @@ class LimitWatch:
     rate_hz
         Ticks a second.
     resolution_rad
-        Of the encoder.
+        Resolution of the encoder.
     peak_torque_nm
-        Of the motor: where torque commands are cut, and a warning begins.
+        Peak torque of the motor: commands are cut there, and a warning begins.
     continuous_torque_nm, thermal_time_constant_s
-        Of the motor: root of the mean square that it bears, and over which time.
+        Continuous (rms) torque rating of the motor and its thermal time constant.
     tare_warning_nm
         Drift of the coupling torque's zero from which on there is a warning.
 
@@ -383,13 +383,13 @@ class LimitWatch:
         Parameters
         ----------
         due_ns
-            When the present tick was due.
+            Time at which the present tick was due.
         torque_squares_nm2
             Sum over the ticks since the last call, of the torques exerted.
         recorder_lag_s
-            By how much the recorder is behind the loop.
+            Time by which the recorder is behind the loop.
         disk_free_mb
-            Of the disk that the session goes to.
+            Free space on the disk that holds the session file.
         """
         self._looks += 1
         if self._warned:

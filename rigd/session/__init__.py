@@ -1,7 +1,9 @@
-"""Session files: format, writer, reader, recovery.
+"""Session files (MCAP): format, writer, reader, recovery.
 
-The names below are imported on first use, so that the control process, which needs the message
-layout only (:mod:`rigd.session._format`), does not pay for the container.
+Offers the messages' byte layout (`SAMPLE_TYPES`, `pack_sample_into`, `Status`), the writer
+(`SessionWriter`), readers (`read_session`, `read_controls`, `read_timings`), a summary (`describe`)
+and the recovery of torn files (`recover`). It knows of no devices and no loop. Names are imported
+on first use, so that the control process, which packs messages only, does not pay for the rest.
 """
 
 import lazy_loader as lazy

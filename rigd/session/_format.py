@@ -1,14 +1,13 @@
-"""What can go wrong with a session file, told to the user.
-
-Byte layout of the messages of a session file: packing for the loop, decoding for the reader.
+"""Byte layout of a session file's messages, and the errors of session files.
 
 Every message of ``/rig/sample``, ``/rig/control`` and ``/rig/timing`` is protobuf of *fixed
 layout*: all fields are ``sfixed64``, ``fixed32`` or ``double``, numbered from 1 in the order below,
 and all are written, zero or not. Tags are then constant bytes and every message is equally long, so
-one ``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of them, and it is
-still what any protobuf decoder understands.
+one ``struct.pack_into`` writes it and one ``numpy.frombuffer`` reads a block of them, and any
+protobuf decoder still understands it.
 
-The control process imports this module: numpy and the standard library only.
+The control process packs with this module, which therefore imports numpy and the standard library
+only.
 """
 
 import struct
@@ -27,6 +26,8 @@ class SessionError(Exception):
 class SessionExistsError(SessionError):
     """The file to be written exists already, and nothing is ever overwritten."""
 
+
+# Messages
 
 Buffer = bytes | bytearray | memoryview
 

@@ -29,7 +29,7 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, slots=True)
 class SessionInfo:
-    """What there is to know of a session file without analysing it."""
+    """Summary of a session file without analysing it."""
 
     path: Path
     size_bytes: int
@@ -38,7 +38,7 @@ class SessionInfo:
     rate_hz: float
     samples: int
     ticks: int
-    """From the first recorded tick to the last, both counted."""
+    """Ticks from the first recorded one to the last, both counted."""
     duration_s: float
     """`ticks` at the nominal rate."""
     missing_ticks: int
@@ -212,11 +212,11 @@ class _Shown:
         return shown
 
     def texts(self, values: Mapping[str, str]) -> dict[str, str]:
-        """Return the first entries, values cut likewise."""
+        """Return the first entries, with long values cut."""
         return self.mapping({key: _cut(value, _LONGEST_TEXT) for key, value in values.items()})
 
     def events(self, events: Sequence[Event], unread: int) -> list[Event]:
-        """Return the first events, likewise; `unread` more are in the file."""
+        """Return the first events, with long texts cut; `unread` more are in the file."""
         shown: list[Event] = []
         for event in events:
             short = replace(

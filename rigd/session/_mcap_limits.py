@@ -1,8 +1,8 @@
-"""What an MCAP file may take of memory and time, and the unpacking of its chunks within that.
+"""Limits on memory and time for reading an MCAP file, and the unpacking of its chunks.
 
-However few bytes unpack to however many records: what a chunk claims to hold is bounded by
-`MAX_CHUNK_BYTES`, the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked piece by
-piece; and all that takes a step of the program is counted against `MAX_STEPS`.
+A few bytes may unpack to any number of records. So the size that a chunk claims is bounded by
+`MAX_CHUNK_BYTES` and the sum over the file by `MAX_TOTAL_BYTES`; a long chunk is unpacked piece by
+piece; and whatever takes a step of the program is counted against `MAX_STEPS`.
 """
 
 import struct
@@ -34,7 +34,7 @@ MAX_SKIPPED: Final = 20
 
 CHUNK_STEPS: Final = 20
 DECLARATION_STEPS: Final = 15
-"""What a chunk and a declaration cost of them."""
+"""Steps that a chunk and a declaration count as."""
 
 _DECLARED_COST: Final = 1000
 """Bytes that an object for one of them takes, about, however small its record."""
@@ -50,15 +50,15 @@ class McapError(Exception):
 
 
 class McapTooLargeError(McapError):
-    """The file takes more memory or time than it may; the message likewise."""
+    """The file takes more memory or time than allowed; the message is a predicate to its name."""
 
 
 class McapDamageError(Exception):
-    """Something in the file contradicts the format; the message likewise."""
+    """Something in the file contradicts the format; the message is a predicate to its name."""
 
 
 class Allowance:
-    """What one file has taken so far."""
+    """Memory and time that one file has taken so far."""
 
     def __init__(self) -> None:
         self._steps = 0
@@ -103,7 +103,7 @@ class Allowance:
         Parameters
         ----------
         opcode, content
-            Of its record.
+            Opcode and content of the record.
         where
             It stands, for messages.
 
@@ -145,9 +145,9 @@ def unpacked(
     zstd
         Of :func:`zstd_decompressor`.
     compression
-        As the chunk names it.
+        Compression that the chunk names.
     packed
-        Its content.
+        Packed content of the chunk.
     size
         Bytes that it claims to hold.
     where

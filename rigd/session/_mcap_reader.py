@@ -64,7 +64,7 @@ _FIRST_STRETCH: Final = 256
 _MOST_RUNS: Final = 1 << 16
 """Runs that are handed on at once."""
 _PASSED_BYTES: Final = 32 << 20
-"""After so much of the file what was read of it is given back to the system."""
+"""Length of the file after which the memory of what was read is given back to the system."""
 
 _Record = TypeVar("_Record")
 Run = tuple[int, int, int, int]
@@ -77,16 +77,16 @@ class Stretch:
     """Message records that stand in one stretch of a file."""
 
     records: Buffer
-    """In which the runs lie; it is not kept by the reader."""
+    """Buffer in which the runs lie; it is not kept by the reader."""
     runs: list[Run]
-    """Of the wanted topics, in the order of the file."""
+    """Runs of messages of the wanted topics, in the order of the file."""
     unit: int
     """Byte of the file at which their chunk begins, or that of some messages without chunk."""
 
 
 @dataclass(slots=True)
 class McapContents:
-    """What was read of a file, as far as it could be, but for the messages."""
+    """Content of a file as far as it could be read, without the messages."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -102,7 +102,7 @@ class McapContents:
     stated_counts: dict[int, int] = field(default_factory=dict)
     """Channel → how many messages the file had, by its statistics; empty if they are not sound."""
     sound_bytes: int = 0
-    """How far the file was read: up to the end of a record."""
+    """Length of the file that was read: up to the end of a record."""
     verified: bool = False
     """Whether a checksum over the whole data section was there, and right."""
     complete: bool = False
@@ -486,7 +486,7 @@ class _Reader:
     ) -> tuple[int, int]:
         """Hand on the messages that follow one another from `start` on and end before `limit`.
 
-        Of those outside of chunks `most` at most. Returns where the first other record begins, and
+        At most `most` of those outside of chunks. Returns where the first other record begins, and
         how many they were.
         """
         unpack = _RUN_HEAD.unpack_from

@@ -48,17 +48,6 @@ INDEX_DTYPE: Final = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 """One entry of a message index: where in the uncompressed chunk a message's record begins."""
 
 
-def _serialised(record: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    record.write(builder)
-    return _contents(builder)
-
-
-def _contents(builder: RecordBuilder) -> bytes:
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return data
-
-
 class McapWriter:
     """Writes an indexed MCAP file of lz4 chunks with all checksums.
 
@@ -225,3 +214,14 @@ class McapWriter:
         )
         footer.summary_crc = zlib.crc32(_serialised(footer)[: _FOOTER_HEAD.size], zlib.crc32(data))
         self._stream.write(data + _serialised(footer) + MAGIC)
+
+
+def _serialised(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return _contents(builder)
+
+
+def _contents(builder: RecordBuilder) -> bytes:
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data

@@ -1,4 +1,4 @@
-"""Messages of samples, controls and timings as arrays, whoever wrote them.
+"""Decoder of messages: samples, controls and timings as arrays, whoever wrote them.
 
 Messages of the fixed layout (`rigd.session._format`) are taken as they are. Any other protobuf
 library may put the fields in another order, leave out zeros, number or type them differently: the
@@ -55,12 +55,12 @@ MAX_MESSAGE_BYTES: Final = 1 << 14
 """Longest message that is decoded; the fixed layout takes 119."""
 
 _BLOCK_BYTES: Final = 1 << 18
-"""Of messages that are decoded together: they stay in a processor's cache."""
+"""Size of the messages that are decoded together: they stay in a processor's cache."""
 _BLOCK_RUNS: Final = 1 << 16
 _FEW: Final = 16
 """Messages that are sooner decoded one by one."""
 _MOST_LAYOUTS: Final = 16
-"""Of messages of one channel and length: a writer that leaves out zeros makes a few."""
+"""Layouts of messages of one channel and length: a writer that omits zeros makes a few."""
 _MOST_GROUPS: Final = 100_000
 """Times that messages of one layout are taken together, at some 100 µs each."""
 
@@ -68,7 +68,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types of protobuf
 _MOST_FIELD_NUMBER: Final = (1 << 29) - 1
 _MOST_TAG_BYTES: Final = 5
 _MOST_VARINT_BYTES: Final = 9
-"""Of 63 bits: what is longer is negative, or padded."""
+"""Bytes of 63 bits: what is longer is negative, or padded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ _SAME: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where the fields stand in messages of one length whose bytes are `pattern` under `mask`."""
+    """Places of the fields in messages of one length whose bytes are `pattern` under `mask`."""
 
     mask: npt.NDArray[np.uint8]
     pattern: npt.NDArray[np.uint8]
@@ -141,7 +141,7 @@ class _Places:
 
 
 class Keeper(Protocol):
-    """Where decoded messages go."""
+    """Destination of decoded messages."""
 
     def room(self, count: int) -> npt.NDArray[np.void]:
         """Return an array (count,) of the decoder's dtype to be filled with the next messages."""

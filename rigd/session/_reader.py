@@ -1,4 +1,4 @@
-"""Reader of session files: the whole file to arrays, or an error that says what is wrong."""
+"""Reader of session files: the whole file as arrays, or an error that says what is wrong."""
 
 import mmap
 import shlex
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MAX_SAMPLES: Final = 2_400_000
 """Most samples that are read into memory: 40 minutes at 1 kHz, 0.27 GB."""
 SURVEY_FIELDS: Final = ("t_ns", "tick", "status")
-"""Of the samples, what tells how many there are, whether they are in order, and their flags."""
+"""Fields that tell how many samples there are, whether they are in order, and their flags."""
 MAX_SURVEYED: Final = 7_200_000
 """Most samples of which only that is read: two hours at 1 kHz, the longest of `rigd run`."""
 MAX_EVENTS: Final = 100_000
@@ -302,7 +302,7 @@ class _Log:
 
     def __init__(self) -> None:
         self.first_log_time: int | None = None
-        """That of the first sample."""
+        """Log time of the first sample."""
         self.left_out = 0
         """Messages of the log that were not kept."""
         self._kept: list[tuple[int, int, bytes | int]] = []  # channel, log time, data or its length

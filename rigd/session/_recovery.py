@@ -1,11 +1,11 @@
-"""Recovery of damaged session files.
-
-What is left of a torn or damaged session file, made into a sound one.
+"""Recovery of damaged session files: what is intact of a torn one, made into a sound one.
 
 Nothing is taken that is not proven: messages, channels and schemas stand in chunks with a checksum
 each, the records ``session`` and ``segments`` are taken from the copy in such a chunk, attachments
 have a checksum of their own, and the outcome counts only if that of the whole data section is
 right. A file of another writer may lack some of this; it is recovered and marked as unprotected.
+
+`remedy` tells the user of an incomplete file how much of it can be saved, and by which command.
 """
 
 import contextlib
@@ -51,60 +51,6 @@ from rigd.session._writer import (
     rename_new,
 )
 
-_BEGINNING_BYTES: Final = 1 << 20
-"""In which the first samples are, if there are any."""
-
-
-def holds_samples(path: Path) -> bool:
-    """Tell whether `recover` finds a sample in a file, as far as its beginning says.
-
-    That of a file that cannot be read is not known, and counts as if there were one.
-    """
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(_BEGINNING_BYTES)
-            longer = bool(file.read(1))
-    except OSError:
-        return True
-    try:
-        contents = read_mcap(memoryview(beginning), (), salvage=True)
-    except McapError:
-        return False
-    return longer or contents.count(SAMPLE_TOPIC) > 0
-
-
-def remedy(path: Path, *, was_whole: bool) -> str:
-    """Say how much of an incomplete or damaged file is intact, and how to save that.
-
-    Parameters
-    ----------
-    path : the file
-    was_whole : it was complete once, so that a sound one may be elsewhere
-
-    Returns
-    -------
-    What goes on behind what is wrong with it, from the mark after that on.
-    """
-    try:
-        count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
-    except SessionError:
-        count = 0
-    again = ". Copy it again from where it was recorded"
-    readable = f"; {count} complete samples are readable before that"
-    if not count:
-        nothing = ", so there is nothing to recover"
-        if was_whole:
-            return f"{readable}{nothing}{again}."
-        return f"{readable}{nothing}. Copy it again if there is a whole one, or record it again."
-    target = recovered_path(path)
-    command = f"`rigd recover {shlex.quote(str(path))}`"
-    if os.path.lexists(target):
-        command += f", once {target}, which may hold it already, is moved away"
-    if was_whole:
-        return f"{again}, or save what is intact with {command}."
-    return f"{readable}. Save them with {command}."
-
-
 RECOVERED_FROM: Final = "recovered_from"
 """Key of the record ``outcome`` that marks a recovered file: the name of the one it is from."""
 
@@ -117,12 +63,15 @@ _MOST_CHUNKS: Final = 10_000
 MAX_CHANNELS: Final = 32
 """Most channels that are taken over, of the session's own topics and of others each."""
 _READING_SHARE: Final = 0.3
-"""Of the time that recovering takes."""
+"""Share of reading in the time that recovery takes."""
+
+_BEGINNING_BYTES: Final = 1 << 20
+"""Length of the beginning that holds the first samples, if there are any."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What was made of a file."""
+    """Result of a recovery."""
 
     source: Path
     path: Path | None
@@ -266,7 +215,7 @@ class _Survey:
         self.left_out: str | None = None
         """What is wrong with the order of the samples, a sentence's predicate."""
         self.kept: npt.NDArray[np.bool_] = np.empty(0, np.bool_)
-        """Of each sample in the file, whether it is kept."""
+        """Whether each sample in the file is kept."""
         self.samples: npt.NDArray[np.void] = np.empty(0, SAMPLE_DTYPE)
         """Tick and status of those that are."""
         self._samples = Kept(path, SAMPLES, SURVEY_FIELDS, MAX_SURVEYED)
@@ -308,6 +257,56 @@ class _Survey:
         kept_in = kept[ends] - kept[ends - counts]
         dropped = (counts > 0) & (kept_in == 0)
         return {unit for unit, is_dropped in zip(self._units, dropped, strict=True) if is_dropped}
+
+
+def holds_samples(path: Path) -> bool:
+    """Tell whether `recover` finds a sample in a file, as far as its beginning says.
+
+    That of a file that cannot be read is not known, and counts as if there were one.
+    """
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(_BEGINNING_BYTES)
+            longer = bool(file.read(1))
+    except OSError:
+        return True
+    try:
+        contents = read_mcap(memoryview(beginning), (), salvage=True)
+    except McapError:
+        return False
+    return longer or contents.count(SAMPLE_TOPIC) > 0
+
+
+def remedy(path: Path, *, was_whole: bool) -> str:
+    """Say how much of an incomplete or damaged file is intact, and how to save that.
+
+    Parameters
+    ----------
+    path : the file
+    was_whole : it was complete once, so that a sound one may be elsewhere
+
+    Returns
+    -------
+    What goes on behind what is wrong with it, from the mark after that on.
+    """
+    try:
+        count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
+    except SessionError:
+        count = 0
+    again = ". Copy it again from where it was recorded"
+    readable = f"; {count} complete samples are readable before that"
+    if not count:
+        nothing = ", so there is nothing to recover"
+        if was_whole:
+            return f"{readable}{nothing}{again}."
+        return f"{readable}{nothing}. Copy it again if there is a whole one, or record it again."
+    target = recovered_path(path)
+    command = f"`rigd recover {shlex.quote(str(path))}`"
+    if os.path.lexists(target):
+        command += f", once {target}, which may hold it already, is moved away"
+    if was_whole:
+        return f"{again}, or save what is intact with {command}."
+    return f"{readable}. Save them with {command}."
 
 
 def _increasing(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
@@ -391,7 +390,7 @@ def _plan(
     damage: str,
     skipped: list[str],
 ) -> Recovery:
-    """Decide what the new file says of itself."""
+    """Decide outcome and protection of the new file."""
     samples = survey.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
     # What it says of its end is of all its samples.

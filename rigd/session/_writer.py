@@ -1,4 +1,9 @@
-"""Writing a session file."""
+"""Writer of session files.
+
+Samples, controls and timings come as blocks of records and are written chunk by chunk, events with
+them, an error at once. The file has the suffix ``.part`` and carries a lock until it is complete,
+and is then renamed to its own name, never over another file.
+"""
 
 import contextlib
 import errno
@@ -48,78 +53,6 @@ except ImportError:  # sessions are recorded on Linux, but read anywhere
     fcntl = None  # type: ignore[assignment]
 
 
-_COPY_BYTES: Final = 1 << 20
-
-
-def fsync_directory(path: Path) -> None:
-    """Bring the names in a folder to the disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def copy_new(descriptor: int, target: Path) -> None:
-    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
-    with target.open("xb") as copy:
-        try:
-            position = 0
-            while data := os.pread(descriptor, _COPY_BYTES, position):
-                copy.write(data)
-                position += len(data)
-            copy.flush()
-            os.fsync(copy.fileno())
-        except OSError:
-            target.unlink()
-            raise
-
-
-def rename_new(source: Path, target: Path) -> None:
-    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
-    try:
-        os.link(source, target)
-    except OSError as error:
-        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
-            raise
-        # A file system without hard links (FAT, some network shares): reserve the name, which
-        # fails if anybody has it, and replace the empty file that then is our own.
-        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-        source.replace(target)
-    else:
-        source.unlink()
-
-
-def mark_as_written(descriptor: int) -> None:
-    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
-
-    An advisory lock; a file system without locks goes without it.
-    """
-    if fcntl is not None:
-        with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_being_written(path: Path) -> bool:
-    """Tell whether a living process holds the mark of `mark_as_written`."""
-    if fcntl is None:
-        return False
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    else:
-        return False
-    finally:
-        os.close(descriptor)
-
-
 PART_SUFFIX: Final = ".part"
 
 CHUNK_SAMPLES: Final = 250
@@ -148,72 +81,6 @@ _CHANNELS: Final = {
 
 _MEDIA_TYPES: Final = {".toml": "application/toml", ".json": "application/json"}
 _URGENT: Final = ("error", "fatal")
-
-
-def _fixed_records(
-    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
-) -> npt.NDArray[np.void]:
-    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
-    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
-    records["opcode"] = Opcode.MESSAGE
-    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
-    records["channel"] = channel
-    records["sequence"] = wire["tick"]
-    records["log_time"] = wire["t_ns"] + start_utc_ns
-    records["publish_time"] = records["log_time"]
-    records["data"] = wire
-    return records
-
-
-def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
-    index = np.empty(records.shape, INDEX_DTYPE)
-    index["log_time"] = records["log_time"]
-    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
-    return index
-
-
-def _event_records(
-    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
-) -> tuple[bytes, npt.NDArray[np.void]]:
-    """Make message records of events (log time, message), and their index."""
-    records = b""
-    index = np.empty(len(events), INDEX_DTYPE)
-    for i, (log_time, data) in enumerate(events):
-        index[i] = (log_time, offset + len(records))
-        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
-        records += MESSAGE_HEAD.pack(
-            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
-        )
-        records += data
-    return records, index
-
-
-def _chunk_samples(metadata: Mapping[str, str]) -> int:
-    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
-    try:
-        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
-    except (ValueError, OverflowError):
-        return CHUNK_SAMPLES
-    return min(max(in_time, 1), CHUNK_SAMPLES)
-
-
-def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
-    """Make the channels of a session; that of the samples repeats what the file says of them."""
-    schemas, channels = [], []
-    for topic, (number, schema_name) in _CHANNELS.items():
-        schemas.append(
-            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
-        )
-        channels.append(
-            Channel(
-                id=number,
-                topic=topic,
-                message_encoding="protobuf",
-                schema_id=number,
-                metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
-            )
-        )
-    return schemas, channels
 
 
 class SessionWriter:
@@ -345,7 +212,7 @@ class SessionWriter:
             self._sync_when_due()
 
     def log(self, t_ns: int, level: str, message: str, name: str = "rigd") -> None:
-        """Record an event for whoever reads the file.
+        """Record an event in the file.
 
         It is written with the chunk in progress; an error or a fatal one at once, together with
         what that chunk has so far.
@@ -541,3 +408,143 @@ class SessionWriter:
         os.fsync(self._stream.fileno())
         self._synced_at = time.monotonic()
         self._dirty = False
+
+
+def _fixed_records(
+    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
+) -> npt.NDArray[np.void]:
+    """Put the head of an MCAP message record before each message (n,) of a wire dtype."""
+    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
+    records["opcode"] = Opcode.MESSAGE
+    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
+    records["channel"] = channel
+    records["sequence"] = wire["tick"]
+    records["log_time"] = wire["t_ns"] + start_utc_ns
+    records["publish_time"] = records["log_time"]
+    records["data"] = wire
+    return records
+
+
+def _fixed_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
+    index = np.empty(records.shape, INDEX_DTYPE)
+    index["log_time"] = records["log_time"]
+    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
+    return index
+
+
+def _event_records(
+    events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
+) -> tuple[bytes, npt.NDArray[np.void]]:
+    """Make message records of events (log time, message), and their index."""
+    records = b""
+    index = np.empty(len(events), INDEX_DTYPE)
+    for i, (log_time, data) in enumerate(events):
+        index[i] = (log_time, offset + len(records))
+        length = MESSAGE_HEAD.size - RECORD_HEAD_SIZE + len(data)
+        records += MESSAGE_HEAD.pack(
+            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
+        )
+        records += data
+    return records, index
+
+
+def _chunk_samples(metadata: Mapping[str, str]) -> int:
+    """Return how many samples a chunk gets: `CHUNK_SAMPLES`, or fewer at a slow rate."""
+    try:
+        in_time = int(float(metadata.get("rate_hz", "inf")) * CHUNK_S)
+    except (ValueError, OverflowError):
+        return CHUNK_SAMPLES
+    return min(max(in_time, 1), CHUNK_SAMPLES)
+
+
+def _session_channels(metadata: Mapping[str, str]) -> tuple[list[Schema], list[Channel]]:
+    """Make the channels of a session; that of the samples repeats what the file says of them."""
+    schemas, channels = [], []
+    for topic, (number, schema_name) in _CHANNELS.items():
+        schemas.append(
+            Schema(id=number, name=schema_name, encoding="protobuf", data=schema_data(schema_name))
+        )
+        channels.append(
+            Channel(
+                id=number,
+                topic=topic,
+                message_encoding="protobuf",
+                schema_id=number,
+                metadata=dict(metadata) if topic == SAMPLE_TOPIC else {},
+            )
+        )
+    return schemas, channels
+
+
+# New files on the disk
+
+_COPY_BYTES: Final = 1 << 20
+
+
+def fsync_directory(path: Path) -> None:
+    """Bring the names in a folder to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def copy_new(descriptor: int, target: Path) -> None:
+    """Copy what an open file holds, of whatever name, to a new file and to the disk."""
+    with target.open("xb") as copy:
+        try:
+            position = 0
+            while data := os.pread(descriptor, _COPY_BYTES, position):
+                copy.write(data)
+                position += len(data)
+            copy.flush()
+            os.fsync(copy.fileno())
+        except OSError:
+            target.unlink()
+            raise
+
+
+def rename_new(source: Path, target: Path) -> None:
+    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
+            raise
+        # A file system without hard links (FAT, some network shares): reserve the name, which
+        # fails if anybody has it, and replace the empty file that then is our own.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        source.replace(target)
+    else:
+        source.unlink()
+
+
+def mark_as_written(descriptor: int) -> None:
+    """Say for as long as `descriptor` is open, and its process lives, that the file grows.
+
+    An advisory lock; a file system without locks goes without it.
+    """
+    if fcntl is not None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_being_written(path: Path) -> bool:
+    """Tell whether a living process holds the mark of `mark_as_written`."""
+    if fcntl is None:
+        return False
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    else:
+        return False
+    finally:
+        os.close(descriptor)

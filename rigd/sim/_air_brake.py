@@ -37,7 +37,7 @@ class AirBrake:
     Parameters
     ----------
     beam, damping, realisation
-        Of the beam. The first oscillating poles of the realisation are those of the first modes.
+        The beam's. The first oscillating poles of the realisation are those of the first modes.
     drag_m
         ``C_D d``.
 

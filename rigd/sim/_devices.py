@@ -43,7 +43,7 @@ class SimulatedRig:
     Attributes
     ----------
     plant, sensor
-        What moves, and what measures it.
+        Plant, and the sensor that measures it.
     records_per_period : int
         Readings of the sensor in one period.
     """
@@ -119,7 +119,7 @@ class SimulatedDrive:
         return torque_nm
 
     def health(self) -> LineHealth:
-        """Tell that there is no line."""
+        """Report that there is no line."""
         return LineHealth()
 
     def disable(self) -> None:
@@ -156,9 +156,9 @@ class SimulatedSensor:
     Parameters
     ----------
     plant, sensor, simulation
-        What is measured, and how well.
+        Plant, sensor and its noise.
     weights
-        Of the last readings in what is read, oldest first; one weight: each reading is taken when
+        Weights of the last readings in the value, oldest first; one weight: a reading is taken when
         it is asked for.
     """
 
@@ -193,7 +193,7 @@ class SimulatedSensor:
         """Nothing to connect to."""
 
     def calibration(self) -> dict[str, object]:
-        """Return what a real sensor would say of itself."""
+        """Return the calibration as a real sensor would report it."""
         return {
             "device": "simulated force-torque sensor",
             "axes": ["fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm"],
@@ -218,7 +218,7 @@ class SimulatedSensor:
         return fx, fy, fz, tx, ty, tz
 
     def health(self) -> LineHealth:
-        """Tell that there is no line, and that all is well."""
+        """Report that there is no line, and no fault."""
         return LineHealth(status=0)
 
     def sample(self) -> None:

@@ -43,12 +43,12 @@ class SimulatedPlant:
     Parameters
     ----------
     parameters
-        Of the rig. Delays may be any non-negative times, fractions of a period included.
+        Parameters of the rig. Delays may be any non-negative time, also a fraction of a period.
 
     Attributes
     ----------
     angle_rad, velocity_rad_s : float
-        Of the output shaft at this instant.
+        Angle and speed of the output shaft at this instant.
     coupling_torque_nm : float
         What an ideal sensor between motor and clamp measures at this instant, ``Γ + J_tool θ''``.
         It jumps with the motor's torque. At a jump the mean of both sides is given, which is where
@@ -327,9 +327,9 @@ def _step(
     period_s
         Length of the step.
     switch_s
-        When the motor's torque changes, from the step's start.
+        Time at which the motor's torque changes, from the step's start.
     angle_instant_s, torque_instant_s
-        Of which instants the sensed values are, from the step's start.
+        Instants of the sensed values, from the start of the step.
 
     Returns
     -------
@@ -383,7 +383,7 @@ def _held(
     model
         Motor and beam.
     of_force
-        What the force adds to the state's derivative, (n, points).
+        Effect of the force on the state's derivative, (n, points).
     holding_torque, period_s, angle_instant_s, torque_instant_s
         As for `_step`.
 
@@ -415,7 +415,7 @@ class OtherClock:
     periods
         Age of the first reading, in ticks.
     growth
-        By which the age grows each tick, in ticks; not negative.
+        Growth of the age per tick, in ticks; not negative.
     """
 
     __slots__ = ("_age", "_growth", "_readings")

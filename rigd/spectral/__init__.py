@@ -1,7 +1,9 @@
-"""Frequency response estimates from sampled records: Welch (H1, H2, Hv, Hiv), whole-record FFT.
+"""Frequency responses estimated from sampled records.
 
-Welch's also while the record grows (`rigd.spectral._running`), and a spectrogram that does
-(`rigd.spectral._spectrogram`).
+Offers Welch's estimate (`welch_response`: H1, H2, Hv), the instrumental-variable estimate within a
+control loop (`instrumental_response`: Hiv), the transform of a whole record (`fft_response`),
+Welch's estimate of a record that still grows (`RunningResponse`) and a running spectrogram
+(`RunningSpectrogram`). It works on arrays and knows neither sessions nor the beam.
 """
 
 import lazy_loader as lazy

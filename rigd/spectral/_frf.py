@@ -1,26 +1,26 @@
 """Frequency responses and their estimators: Welch, instrumental variable, whole record.
 
-Auto- and cross-spectra of two records, summed over segments, and what follows from the sums.
+H1, H2, Hv
+    Welch's method [1]_: auto- and cross-spectra of the two records, summed over overlapping
+    windowed segments, and ratios of the sums [2]_. The default segmentation is the paper's.
+Hiv
+    Response within a control loop, with the loop's reference as instrument [3]_. A controller that
+    feeds a measured output back lets the sensor's noise move the input. Noise and input are then
+    correlated, and the estimates that average products of the two take that for response: H1 by the
+    share that such motion has in the input's power. The reference is independent of the noise, so
+    the cross-spectra with it average the noise out.
+FFT
+    Empirical transfer function estimate: ratio of the transforms of the whole records [4]_. The
+    paper compares Welch's estimate with it.
 
-H1, H2 and Hv: J. S. Bendat and A. G. Piersol, "Random Data".
-
-Welch's estimate of a frequency response, with the segmentation the paper used.
-
-P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans.
-Audio Electroacoust. 15 (1967) 70-73.
-
-Frequency response from one transform of the whole record.
-
-The empirical transfer function estimate of L. Ljung, "System Identification", section 6.3. The
-paper compares Welch's estimate with it.
-
-Frequency response within a control loop, with the loop's reference as instrument.
-
-A controller that feeds a measured output back lets the sensor's noise move the input. Noise and
-input are correlated then, and the estimates that average products of the two take that for
-response: H1 by the share that such motion has in the input's power. The reference owes nothing to
-the noise, so the cross-spectra with it have it averaged out: P. E. Wellstead, "Non-parametric
-methods of system identification", Automatica 17 (1981) 55-69.
+References
+----------
+.. [1] P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE
+   Trans. Audio Electroacoust. 15 (1967) 70-73.
+.. [2] J. S. Bendat and A. G. Piersol, "Random Data".
+.. [3] P. E. Wellstead, "Non-parametric methods of system identification", Automatica 17 (1981)
+   55-69.
+.. [4] L. Ljung, "System Identification", section 6.3.
 """
 
 import math
@@ -138,6 +138,8 @@ def checked_records(
     return x, y
 
 
+# Segments of a record
+
 PAPER_RATE_HZ: Final = 1000.0
 PAPER_SEGMENT_LENGTH: Final = 17266
 PAPER_OVERLAP: Final = 2590
@@ -180,7 +182,7 @@ def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
 
 
 def segment_count(samples: int, segment_length: int, overlap: int) -> int:
-    """Whole segments that fit a record; what is left over at its end goes unused."""
+    """Count the whole segments in a record; a rest at its end is unused."""
     return max(0, (samples - overlap) // (segment_length - overlap))
 
 
@@ -243,6 +245,9 @@ def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
         )
 
 
+# Estimators
+
+
 @dataclass(slots=True)
 class CrossSpectra:
     """Sums over segments, bin by bin.
@@ -253,11 +258,11 @@ class CrossSpectra:
     Attributes
     ----------
     sxx, syy : ndarray of float, shape (n,)
-        Of the input's and the output's squared magnitudes.
+        Sums of squared magnitudes of input and output.
     sxy : ndarray of complex, shape (n,)
-        Of the input's conjugate times the output.
+        Sum of the conjugate of the input times the output.
     segments : int
-        How many were added.
+        Number of segments that were added.
     """
 
     sxx: NDArray[np.float64]
@@ -267,7 +272,7 @@ class CrossSpectra:
 
     @classmethod
     def of_nothing(cls, bins: int) -> "CrossSpectra":
-        """Return sums to begin with."""
+        """Return sums of no segment."""
         return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
 
     def copy(self) -> "CrossSpectra":
@@ -439,7 +444,7 @@ def instrumental_response(
     Parameters
     ----------
     reference : array_like, shape (n,)
-        What the loop was asked for, in any unit and with any delay: both cancel.
+        Reference of the loop, in any unit and with any delay: both cancel.
     input_, output : array_like, shape (n,)
     rate_hz, segment_length, overlap, nfft
         See `rigd.spectral.welch_response`.

@@ -1,9 +1,14 @@
-"""Frequency response of a record that still grows.
+"""Frequency response of a record that still grows, by Welch's method.
 
-The lowest bins of a padded transform, without the rest of it.
+Samples come in blocks of any length and are cut into segments, short gaps interpolated. Each
+segment adds to the sums of `rigd.spectral._frf`; at any time these give the response, its
+coherence, and the bins that the reference has excited so far. Only the lowest bins of each padded
+transform are of interest, and Bluestein's algorithm [1]_ computes them without the rest.
 
-L. I. Bluestein, "A linear filtering approach to the computation of discrete Fourier transform",
-IEEE Trans. Audio Electroacoust. 18 (1970) 451-455.
+References
+----------
+.. [1] L. I. Bluestein, "A linear filtering approach to the computation of discrete Fourier
+   transform", IEEE Trans. Audio Electroacoust. 18 (1970) 451-455.
 """
 
 from collections.abc import Iterator
@@ -23,18 +28,20 @@ from rigd.spectral._frf import (
     segmentation_of,
 )
 
+Real = NDArray[np.float64]
+
 LEAST_SHARE: Final = 0.25
-"""Of a segment, before it tells anything: shorter ones do not resolve what they show."""
+"""Least share of a segment that is estimated from: shorter ones do not resolve what they show."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunningEstimate:
-    """What is known of a response so far.
+    """Estimate of a response so far.
 
     Attributes
     ----------
     response : FrequencyResponse
-        Its coherence is None until there are two whole segments.
+        Response; its coherence is None until there are two whole segments.
     excited : ndarray of bool, shape (n,)
         Bins of the response where the reference has been; what it shows elsewhere is noise and
         what leaks.
@@ -159,7 +166,7 @@ class RunningResponse:
         sums.add(self._transform(input_ * window), self._transform(output * window))
 
 
-Real = NDArray[np.float64]
+# Segments of a growing record
 
 LONGEST_GAP_S: Final = 0.1
 """Longest gap that is interpolated linearly; a segment with a longer one is left out."""
@@ -175,7 +182,7 @@ class Segments:
     channels : int
         Values a tick.
     length, hop : int
-        Of a segment, and from the start of one to that of the next, in ticks.
+        Length of a segment, and distance from its start to the next one's, in ticks.
     longest_gap : int
         Most missing ticks in a row that are interpolated.
     end : int, optional
@@ -309,6 +316,8 @@ def _interpolated(ticks: NDArray[np.int64], values: Real) -> tuple[int, Real]:
     return first, np.stack([np.interp(every, ticks, channel) for channel in values])
 
 
+# Excited bins
+
 LEAST_POWER: Final = 2e-3
 """Least power of an excited bin, relative to the largest.
 
@@ -324,7 +333,7 @@ def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np
     Parameters
     ----------
     power : ndarray of float, shape (n,)
-        Of the reference, on bins from frequency 0 on.
+        Power of the reference, on bins from frequency 0 on.
     resolution_bins : int
         Bins per inverse length of the shortest window that made the power. A dip no wider than
         twice that is a ripple of the window's and counts as excited; at either end of a band so
@@ -348,6 +357,9 @@ def _any_near(marked: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     return near
 
 
+# Lowest bins of a transform
+
+
 def bins_up_to(last_hz: float, nfft: int, rate_hz: float) -> int:
     """Return how many bins a transform has from 0 to a frequency, included."""
     # A rounding error in the caller's arithmetic must not cost the last one.
@@ -368,7 +380,7 @@ class LowBins:
     nfft : int
         Length of the padded transform, at least `length`.
     bins : int
-        How many are wanted, from frequency 0 on; at most ``nfft // 2 + 1``.
+        Number of bins, from frequency 0 on; at most ``nfft // 2 + 1``.
     """
 
     def __init__(self, length: int, nfft: int, bins: int) -> None:

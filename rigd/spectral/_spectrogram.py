@@ -33,7 +33,7 @@ class RunningSpectrogram:
     Attributes
     ----------
     frequency_hz : ndarray of float, shape (m,)
-        From 0 on.
+        Frequencies from 0 on.
     """
 
     def __init__(

@@ -46,16 +46,16 @@ TITLE: Final = f"Antenna, its motion drawn × {FACTOR:g}"
 
 DRAWN_HZ: Final = 20.0
 TRAIL_S: Final = 0.5
-"""For this long each drawn shape stays in the picture: they show where it swings and where not."""
+"""Time that each drawn shape stays visible: the shapes show where the beam swings."""
 
 _LOOKS_HZ: Final = 100.0
 """How often the tip is looked at for its largest deflection."""
 _SELDOM_HZ: Final = 4.0
-"""How often what is not looked at that closely is sent: the label, and the trail."""
+"""Rate at which slow items are sent: the label, and the trail."""
 _LONGEST_GAP_S: Final = 10.0
-"""Of samples that are missing, no more than this is made up."""
+"""Longest gap of missing samples that is filled."""
 _ASSUMED_DAMPING_RATIO: Final = 2e-3
-"""Of the first mode, where the profile tells no damping; the least of the paper's fits has half."""
+"""First mode's, where the profile has no damping; the least of the paper's fits has half."""
 
 _HOUSING: Color = (105, 110, 120)
 _METAL: Color = (140, 145, 155)
@@ -88,7 +88,7 @@ class Antenna:
         self._trail: list[_Moment] = []  # not yet sent
 
     def frame(self) -> list["Drawing"]:
-        """Return what stays as it is."""
+        """Return the static drawings."""
         return static_drawings()
 
     def samples(self, samples: Records) -> list["Drawing"]:
@@ -168,7 +168,7 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
     Parameters
     ----------
     angle_rad
-        Of the motor.
+        Angle of the motor.
     deflection
         Shape (points,), evenly along the beam, relative to the line that its root points along; in
         beam lengths.
@@ -187,7 +187,7 @@ def lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
 
 
 def label(tip_m: float) -> str:
-    """Return what is said of the tip's deflection, to two figures or 0.1 mm."""
+    """Return the text of the tip's deflection, to two figures or 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
     return f"tip bends ± {text} mm, drawn × {FACTOR:g}"
@@ -289,7 +289,7 @@ def _draw_lines(stream: "RecordingStream", entity: str, moments: Sequence[_Momen
 
 
 def _draw_label(stream: "RecordingStream", t_ns: int, tip_m: float) -> None:
-    """Say how far the tip really bends."""
+    """Label the true deflection of the tip."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

@@ -1,10 +1,10 @@
-"""Fewer points of a curve without losing a peak of it.
-
-Charts whose horizontal axis is not time, drawn on a canvas.
+"""Charts whose horizontal axis is not time, drawn on a canvas, and curves of fewer points for them.
 
 Rerun plots over time only. A view of two-dimensional things shows a canvas of any size, and keeps
 its aspect; so each chart has the size in points that its view has in a window of 1280 × 800, and
 is scaled with it from there. Text keeps its size whatever the scale.
+
+`Thinning` reduces the points of a curve without losing a peak of it.
 """
 
 from collections.abc import Sequence
@@ -22,70 +22,13 @@ if TYPE_CHECKING:
 Real = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Thinning:
-    """Points of a grid, gathered in groups of which the extremes are kept.
-
-    Attributes
-    ----------
-    grid
-        (n,) of increasing values.
-    groups
-        (k, m) indices into the grid, each group filled up with its first one.
-    """
-
-    grid: Real
-    groups: npt.NDArray[np.intp]
-
-    @classmethod
-    def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
-        """Gather points from `first` to `last` in groups of equal ratio, leaving out empty ones."""
-        edges = np.geomspace(first, last, groups + 1)
-        # A point at the very end belongs to the last group.
-        edges[-1] = np.nextafter(last, np.inf)
-        bounds = np.unique(np.searchsorted(grid, edges))
-        starts, sizes = bounds[:-1], np.diff(bounds)
-        offsets = np.arange(sizes.max(initial=0))
-        return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
-
-    def strips(self, values: Real) -> list[Real]:
-        """Return the curve as strips (p, 2) of grid point and value, broken where values are NaN.
-
-        Of every group the least and the greatest value are kept, where they are.
-
-        Parameters
-        ----------
-        values
-            (n,) on the grid.
-        """
-        grouped = values[self.groups]
-        unknown = np.isnan(grouped)
-        rows = np.flatnonzero(~unknown.all(axis=1))
-        if rows.size == 0:
-            return []
-        grouped, unknown = grouped[rows], unknown[rows]
-        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
-        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
-        pair = np.sort(np.stack([least, greatest], axis=1), axis=1)
-        kept = np.take_along_axis(self.groups[rows], pair, axis=1)
-        breaks = np.flatnonzero(np.diff(rows) > 1) + 1
-        return [
-            np.column_stack([self.grid[part], values[part]])
-            for part in (_without_repeats(piece.ravel()) for piece in np.split(kept, breaks))
-        ]
-
-
-def _without_repeats(indices: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Leave out what follows itself: where a group has but one point."""
-    kept: npt.NDArray[np.intp] = indices[np.insert(np.diff(indices) != 0, 0, True)]
-    return kept
-
+# Chart
 
 _LEFT, _TOP, _BOTTOM = 62.0, 44.0, 54.0
 """Room for the tick labels and titles beside the frame, in points."""
 _RIGHT = 24.0
 _TITLE_RISE = 27.0
-"""Of the middle of titles and legend above the frame, in points."""
+"""Height of the middle of titles and legend above the frame, in points."""
 
 _LABEL_DROP = 12.0
 """How far Rerun puts the middle of a label under its point, in points."""
@@ -97,12 +40,12 @@ _SHADE_OPACITY = 0.18
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """What runs along one side of a chart.
+    """Axis of a chart.
 
     Attributes
     ----------
     title
-        With its unit.
+        Title with its unit.
     first, last
         Values at its ends.
     ticks
@@ -135,9 +78,9 @@ class Key:
     Attributes
     ----------
     label
-        What it stands for.
+        Name of what it stands for.
     color, width
-        Of the line, the width in points.
+        Color and width of the line, the width in points.
     is_area
         Whether it is a shade and no line.
     """
@@ -155,13 +98,13 @@ class Chart:
     Attributes
     ----------
     entity
-        Where Rerun keeps it.
+        Entity path in Rerun.
     width, height
-        Of the canvas, in points.
+        Size of the canvas, in points.
     x, y
-        Its axes.
+        Horizontal and vertical axis.
     legend
-        In the order it is read.
+        Entries of the legend, in reading order.
     left, right
         Room beside the frame, in points.
     """
@@ -269,7 +212,7 @@ class Chart:
         pixel = np.array([[GREY]], dtype=np.uint8)
         stream.log(
             f"{self.entity}/{name}",
-            # Of all there is, images alone are shown as transparent as they are said to be.
+            # Rerun honours an opacity for images only.
             rr.Image(
                 bytes=pixel.tobytes(),
                 width=1,
@@ -410,3 +353,65 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
     step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least)
     begin, end = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
     return tuple(float(f"{value:.9g}") for value in step * np.arange(begin, end + 1))
+
+
+# Fewer points of a curve
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinning:
+    """Points of a grid, gathered in groups of which the extremes are kept.
+
+    Attributes
+    ----------
+    grid
+        (n,) of increasing values.
+    groups
+        (k, m) indices into the grid, each group filled up with its first one.
+    """
+
+    grid: Real
+    groups: npt.NDArray[np.intp]
+
+    @classmethod
+    def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
+        """Gather points from `first` to `last` in groups of equal ratio, leaving out empty ones."""
+        edges = np.geomspace(first, last, groups + 1)
+        # A point at the very end belongs to the last group.
+        edges[-1] = np.nextafter(last, np.inf)
+        bounds = np.unique(np.searchsorted(grid, edges))
+        starts, sizes = bounds[:-1], np.diff(bounds)
+        offsets = np.arange(sizes.max(initial=0))
+        return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
+
+    def strips(self, values: Real) -> list[Real]:
+        """Return the curve as strips (p, 2) of grid point and value, broken where values are NaN.
+
+        The least and the greatest value of every group are kept at their places.
+
+        Parameters
+        ----------
+        values
+            (n,) on the grid.
+        """
+        grouped = values[self.groups]
+        unknown = np.isnan(grouped)
+        rows = np.flatnonzero(~unknown.all(axis=1))
+        if rows.size == 0:
+            return []
+        grouped, unknown = grouped[rows], unknown[rows]
+        least = np.where(unknown, np.inf, grouped).argmin(axis=1)
+        greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
+        pair = np.sort(np.stack([least, greatest], axis=1), axis=1)
+        kept = np.take_along_axis(self.groups[rows], pair, axis=1)
+        breaks = np.flatnonzero(np.diff(rows) > 1) + 1
+        return [
+            np.column_stack([self.grid[part], values[part]])
+            for part in (_without_repeats(piece.ravel()) for piece in np.split(kept, breaks))
+        ]
+
+
+def _without_repeats(indices: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Leave out what follows itself: where a group has but one point."""
+    kept: npt.NDArray[np.intp] = indices[np.insert(np.diff(indices) != 0, 0, True)]
+    return kept

@@ -1,4 +1,4 @@
-"""Frequency response and spectrogram as they grow, with the nominal model."""
+"""Charts over frequency: the growing frequency response with the nominal model, a spectrogram."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 
     from rigd.spectral import FrequencyResponse, RunningEstimate
     from rigd.view._session_info import Subject
+
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+
+# Estimate
 
 _HELD: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
 
@@ -62,17 +69,16 @@ class SweepResponse:
         )
 
     def estimate(self) -> RunningEstimate | None:
-        """Return what is known so far, None as long as that is too little."""
+        """Return the estimate so far, None as long as there are too few samples."""
         return self._running.estimate()
 
 
-Real = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
+# Frequency response
 
 FIRST_HZ: Final = 0.5
-"""Below, the torque that moves an antenna is lost in the sensor's noise."""
+"""Lowest frequency shown: below it the antenna's torque is lost in the sensor's noise."""
 LAST_HZ: Final = 60.0
-"""Beyond what the paper's chirp excites, and its third mode."""
+"""Highest frequency shown: beyond what the paper's chirp excites, and the third mode."""
 
 OVERVIEW_MAGNITUDE: Final = "/overview/magnitude"
 MAGNITUDE: Final = "/frequency_response/magnitude"
@@ -90,21 +96,21 @@ MEASURED_KEY: Final = Key("measured", SKY_BLUE)
 MODEL_KEY: Final = Key("nominal model", ORANGE, width=3.0)
 COHERENCE_KEY: Final = Key("coherence", GREEN)
 NOT_ESTIMATED_KEY: Final = Key("not estimated", GREY, is_area=True)
-"""Where the reference has not been, as far as the estimate has used it."""
+"""Key of the bands that the reference has not excited, as far as the estimate has used it."""
 
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
 
 _SHADES: Final = ("not_estimated_below", "not_estimated_above")
 _GROUPS: Final = 200
-"""Of points along the axis, two kept of each: enough for the pixels of a view."""
+"""Groups of points along the axis, two kept per group: enough for the pixels of a view."""
 _PHASE_FROM_DEG: Final = -90.0
 """Phases lie about 0 and 180 degrees; cut here, they do not jump from end to end."""
 _MODEL_STEP_HZ: Final = 0.01
 _FAINT: Final = Damping(zeta=3e-4)
-"""To know how high a magnitude may rise where the damping is not known."""
+"""Damping that gives the highest magnitude of the axis where the beam's is not known."""
 _DEEPEST_DB: Final = 140.0
-"""Below the highest magnitude, what an axis shows at the most."""
+"""Largest range of an axis below the highest magnitude."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +269,8 @@ def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
     return Chart(entity, width, height, frequency, y, (*keys, NOT_ESTIMATED_KEY))
 
 
+# Spectrogram
+
 SPECTROGRAM: Final = "/spectrogram"
 SIZE: Final = (1280.0, 677.0)
 """Width and height of the canvas, in points."""
@@ -270,7 +278,7 @@ SIZE: Final = (1280.0, 677.0)
 LOWEST_DB, HIGHEST_DB = -80.0, 0.0
 """Levels, in dB re 1 N·m, at the two ends of the colours."""
 MOST_COLUMNS: Final = 300
-"""Of the image: more than that many columns are merged, the highest level kept."""
+"""Columns of the image: more are merged, the highest level kept."""
 
 _BAR = 28.0
 """Width of the bar of colours, in points."""
@@ -293,7 +301,7 @@ class SpectrogramChart:
     Attributes
     ----------
     chart
-        Where it is drawn.
+        Chart on which it is drawn.
     """
 
     def __init__(self, subject: "Subject", frequency_hz: Real, step_s: float) -> None:
@@ -362,12 +370,12 @@ class SpectrogramChart:
 def _place_image(
     stream: "RecordingStream", entity: str, corners: Real, shape: tuple[int, ...]
 ) -> None:
-    """Say where an image of levels (0–255) lies, and in which colours.
+    """Log the place of an image of levels (0–255), and its colours.
 
     Parameters
     ----------
     stream, entity
-        Where to say it.
+        Stream and entity to log to.
     corners
         Bottom left and top right on the canvas, (2, 2).
     shape

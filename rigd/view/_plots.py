@@ -1,9 +1,8 @@
-"""What is plotted over time: which curves, in which units and colours.
+"""Plots over time: which curves, in which units and colours.
 
-Colours of what is shown, as red, green and blue from 0 to 255.
-
-Those of Okabe and Ito (2008) are told apart with any colour vision. Here are the ones of them that
-stand out from Rerun's dark background and from its light one.
+Colours are red, green and blue from 0 to 255. Those of Okabe and Ito (2008) are told apart with any
+colour vision; used here are the ones that stand out from Rerun's dark background and from its light
+one.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +16,9 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from rerun import ComponentColumn, RecordingStream
 
+
+# Colours
+
 Color = tuple[int, int, int]
 
 ORANGE: Color = (230, 159, 0)
@@ -25,8 +27,10 @@ GREEN: Color = (0, 158, 115)
 VERMILION: Color = (213, 94, 0)
 PURPLE: Color = (204, 121, 167)
 GREY: Color = (130, 130, 130)
-"""Of frames, grids and tick labels, and of a curve that is beside the point."""
+"""For frames, grids and tick labels, and for a curve of minor interest."""
 
+
+# Plots over time
 
 Records = npt.NDArray[Any]
 """Structured array (n,) with a field ``t_ns``."""
@@ -47,13 +51,13 @@ class Curve:
     Attributes
     ----------
     label
-        What the legend calls it, with its unit.
+        Name in the legend, with its unit.
     color
-        Of the line.
+        Color of the line.
     values
-        Its values (n,) from records (n,).
+        Function from records (n,) to values (n,).
     width
-        Of the line, in points.
+        Width of the line, in points.
     """
 
     label: str
@@ -69,11 +73,11 @@ class Plot:
     Attributes
     ----------
     component
-        What Rerun calls their values: a name that ends in the unit.
+        Rerun's name of their values; it ends in the unit.
     title
-        What the axis shows, with its unit.
+        Title of the axis, with its unit.
     curves
-        From the lowest to the topmost.
+        Curves from the lowest to the topmost.
     span
         The ends of the axis, where they are the same for every session.
     """
@@ -94,7 +98,7 @@ class Source:
         Where Rerun keeps them. One place for all of them: what sending costs is the number of
         places, hardly that of the values.
     plots
-        What is made of each record.
+        Plots that are made of each record.
     """
 
     entity: str
@@ -102,7 +106,7 @@ class Source:
 
     @property
     def ticks(self) -> str:
-        """Where Rerun keeps values that the axes must hold besides."""
+        """Entity in Rerun of the invisible values that stretch the axes."""
         return f"{self.entity}/ticks"
 
     def columns(self, records: Records) -> dict[str, Values]:
@@ -193,7 +197,7 @@ SIGNALS = Source(
     "/signals",
     (ANGLE, TRACKING_ERROR, COUPLING_TORQUE, TORQUE_COMMAND, FORCES, TORQUES, LOOP),
 )
-"""From samples."""
+"""Plots drawn from samples."""
 
 AGES = Plot(
     "ages_ms",
@@ -204,7 +208,7 @@ AGES = Plot(
     ),
 )
 READINGS = Source("/readings", (AGES,))
-"""From timings."""
+"""Plots drawn from timings."""
 
 FAULTY_TICKS = Plot(
     "faulty_ticks",
@@ -245,4 +249,4 @@ DISK = Plot(
     (Curve("free on the disk (GB)", GREEN, lambda r: 1e-3 * r["disk_free_mb"]),),
 )
 HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
-"""From readings of the health."""
+"""Plots drawn from health records."""

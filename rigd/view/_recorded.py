@@ -1,4 +1,4 @@
-"""A recorded session as a picture, and Rerun's files."""
+"""Recorded sessions as Rerun shows them, and Rerun's files."""
 
 import contextlib
 import os
@@ -25,133 +25,10 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
-def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return an environment without what is meant for Rerun: ``RERUN=off`` and so on."""
-    return {
-        name: value
-        for name, value in environment.items()
-        if not name.lstrip("_").startswith("RERUN")
-    }
-
-
-def settle_sdk() -> None:
-    """Prepare this process's environment for the SDK; to be called before it is imported.
-
-    What it has to say of a server that is gone or of a full disk is told by us.
-    """
-    for name in os.environ.keys() - without_settings(os.environ).keys():
-        del os.environ[name]
-    os.environ["RUST_LOG"] = "off"
-
-
-SUFFIX: Final = ".rrd"
-"""By which Rerun's viewer tells what a file is."""
-
-_MAGIC: Final = b"RRF"
-_TRIAL_BYTES: Final = 1 << 20
-_OS_ERROR: Final = re.compile(r"os error (\d+)")
-"""How the SDK tells the system's reason, within sentences that are not for the operator."""
-
-
-class RrdFileError(Exception):
-    """A file of Rerun's cannot be written, or is none."""
-
-
-@contextlib.contextmanager
-def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
-    """Give a recording that is written to a file, which has its name once all is in it.
-
-    Raises
-    ------
-    RrdFileError
-        If there is something of that name, or the file cannot be written.
-    """
-    settle_sdk()
-    import rerun as rr
-
-    check_new(path)
-    part = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
-    stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
-    try:
-        with _told(path, part):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            stream.save(part)
-        yield stream
-        with _told(path, part):
-            stream.flush()
-            stream.disconnect()
-            rename_new(part, path)
-    finally:
-        stream.disconnect()
-        part.unlink(missing_ok=True)
-
-
-def check_new(path: Path) -> None:
-    """Raise RrdFileError if something has that name, or it is no name of such a file."""
-    if path.suffix != SUFFIX:
-        raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return  # the folder is made, or why not is told, when the file is written
-    except OSError as error:
-        raise RrdFileError(
-            f"{path} cannot be written: {error.strerror}. Choose another name."
-        ) from None
-    raise RrdFileError(
-        f"{path} exists; choose another name or move it away, nothing is overwritten."
-    )
-
-
-def check_rrd_file(path: Path) -> None:
-    """Raise RrdFileError if a file is no recording of Rerun's, as far as its beginning tells."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
-        with path.open("rb") as file:
-            found = file.read(len(_MAGIC))
-    except OSError as error:
-        raise RrdFileError(
-            f"{path} cannot be read: {error.strerror}. Check the path and its permissions."
-        ) from None
-    if found != _MAGIC:
-        raise RrdFileError(
-            f"{path} is no recording of Rerun's, though its name says so. Give a session file "
-            "(*.mcap), or what `rigd replay … --save` or `analyze … --rerun` wrote."
-        )
-
-
-@contextlib.contextmanager
-def _told(path: Path, part: Path) -> Iterator[None]:
-    """Tell what kept a file from being written."""
-    try:
-        yield
-    except FileExistsError:
-        raise RrdFileError(
-            f"{path} has appeared meanwhile; choose another name, nothing is overwritten."
-        ) from None
-    except OSError as error:
-        raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
-    except RuntimeError as error:  # from the SDK
-        number = _OS_ERROR.search(str(error))
-        cause = os.strerror(int(number[1])) if number else _why_not(part)
-        raise RrdFileError(f"{path} cannot be written: {cause}.") from None
-
-
-def _why_not(part: Path) -> str:
-    """Find out by trying why a file does not grow; the SDK may only say that it gave up."""
-    try:
-        with part.open("ab") as file:
-            file.write(bytes(_TRIAL_BYTES))
-    except OSError as error:
-        return error.strerror or str(error)
-    return "Rerun gave up"
-
-
 Records = npt.NDArray[Any]
 
 _BLOCK_S: Final = 1.0
-"""Of the session, drawn at a time: as often as the charts are drawn anew."""
+"""Part of the session that is drawn at a time: as often as the charts are drawn anew."""
 _MOST_SPAN: Final = 10
 """Ticks per sample: what lies between few samples would be made up, and fill the disk."""
 _LAST_UTC_NS: Final = 2**63 - 1
@@ -160,9 +37,9 @@ _PROFILE: Final = "profile.toml"
 
 
 def subject_of_session(session: Session) -> Subject:
-    """Return what the picture of a recorded session is of.
+    """Return what the views need to know of a recorded session.
 
-    Of a session that was stopped it is what was planned, as it was live. Without segments all of
+    A stopped session is shown as it was planned, as it was live. Without segments all of
     the record is the sweep.
 
     Raises
@@ -233,11 +110,11 @@ def draw_session(
     stream
         Takes the drawings.
     session
-        To be drawn.
+        Session to draw.
     timings
         The readings' ages (n,) of ``TIMING_DTYPE``; there may be none.
     layout
-        Of the window; by default what `recorded_blueprint` returns.
+        Layout of the window; by default what `recorded_blueprint` returns.
     on_progress
         Told the share that is drawn, from time to time.
 
@@ -248,7 +125,7 @@ def draw_session(
     """
     subject = subject_of_session(session)
     picture = Picture(subject, lambda: layout or recorded_blueprint())
-    # Of the moment at which it is drawn nothing is to be seen.
+    # The time at which it is drawn is not to be shown.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.send_recording_start_time_nanos(session.start_utc_ns)
@@ -338,3 +215,128 @@ def _blocks(
     for end, timing_end in zip(ends, timing_ends, strict=True):
         yield samples[first:end], timings[first_timing:timing_end]
         first, first_timing = end, timing_end
+
+
+# Files of Rerun's
+
+SUFFIX: Final = ".rrd"
+"""Suffix by which Rerun's viewer recognises its files."""
+
+_MAGIC: Final = b"RRF"
+_TRIAL_BYTES: Final = 1 << 20
+_OS_ERROR: Final = re.compile(r"os error (\d+)")
+"""The system's error number in the SDK's messages, whose sentences are not for the operator."""
+
+
+def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return an environment without what is meant for Rerun: ``RERUN=off`` and so on."""
+    return {
+        name: value
+        for name, value in environment.items()
+        if not name.lstrip("_").startswith("RERUN")
+    }
+
+
+def settle_sdk() -> None:
+    """Prepare this process's environment for the SDK; to be called before it is imported.
+
+    What it has to say of a server that is gone or of a full disk is told by us.
+    """
+    for name in os.environ.keys() - without_settings(os.environ).keys():
+        del os.environ[name]
+    os.environ["RUST_LOG"] = "off"
+
+
+class RrdFileError(Exception):
+    """A file of Rerun's cannot be written, or is none."""
+
+
+@contextlib.contextmanager
+def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
+    """Give a recording that is written to a file, which has its name once all is in it.
+
+    Raises
+    ------
+    RrdFileError
+        If there is something of that name, or the file cannot be written.
+    """
+    settle_sdk()
+    import rerun as rr
+
+    check_new(path)
+    part = path.with_name(f".rigd-{os.getpid()}-{uuid.uuid4().hex[:8]}.part")
+    stream = rr.RecordingStream(APPLICATION_ID, recording_id=str(uuid.uuid4()))
+    try:
+        with _told(path, part):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream.save(part)
+        yield stream
+        with _told(path, part):
+            stream.flush()
+            stream.disconnect()
+            rename_new(part, path)
+    finally:
+        stream.disconnect()
+        part.unlink(missing_ok=True)
+
+
+def check_new(path: Path) -> None:
+    """Raise RrdFileError if something has that name, or it is no name of such a file."""
+    if path.suffix != SUFFIX:
+        raise RrdFileError(f"{path}: name the file ….rrd, which is how Rerun's viewer knows it.")
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return  # the folder is made, or why not is told, when the file is written
+    except OSError as error:
+        raise RrdFileError(
+            f"{path} cannot be written: {error.strerror}. Choose another name."
+        ) from None
+    raise RrdFileError(
+        f"{path} exists; choose another name or move it away, nothing is overwritten."
+    )
+
+
+def check_rrd_file(path: Path) -> None:
+    """Raise RrdFileError if a file is no recording of Rerun's, as far as its beginning tells."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
+        with path.open("rb") as file:
+            found = file.read(len(_MAGIC))
+    except OSError as error:
+        raise RrdFileError(
+            f"{path} cannot be read: {error.strerror}. Check the path and its permissions."
+        ) from None
+    if found != _MAGIC:
+        raise RrdFileError(
+            f"{path} is no recording of Rerun's, though its name says so. Give a session file "
+            "(*.mcap), or what `rigd replay … --save` or `analyze … --rerun` wrote."
+        )
+
+
+@contextlib.contextmanager
+def _told(path: Path, part: Path) -> Iterator[None]:
+    """Say what kept a file from being written."""
+    try:
+        yield
+    except FileExistsError:
+        raise RrdFileError(
+            f"{path} has appeared meanwhile; choose another name, nothing is overwritten."
+        ) from None
+    except OSError as error:
+        raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
+    except RuntimeError as error:  # from the SDK
+        number = _OS_ERROR.search(str(error))
+        cause = os.strerror(int(number[1])) if number else _why_not(part)
+        raise RrdFileError(f"{path} cannot be written: {cause}.") from None
+
+
+def _why_not(part: Path) -> str:
+    """Find out by trying why a file does not grow; the SDK may only say that it gave up."""
+    try:
+        with part.open("ab") as file:
+            file.write(bytes(_TRIAL_BYTES))
+    except OSError as error:
+        return error.strerror or str(error)
+    return "Rerun gave up"

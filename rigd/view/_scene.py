@@ -1,4 +1,4 @@
-"""Everything that is shown of one session."""
+"""Scene of one session: records, events and health come in, drawings for Rerun go out."""
 
 import collections
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ _BLOCK_S: Final = 0.1
 _CHARTS_S: Final = 1.0
 """Session time between drawings of the charts: a response is computed anew for each."""
 _STEP_S: Final = 0.5
-"""Between columns of the spectrogram."""
+"""Time between columns of the spectrogram."""
 _MOST_NOTES: Final = 200
 """Lines of the log that a new connection is given again."""
 

@@ -1,4 +1,4 @@
-"""What a picture tells of a session in words: what it is of, its log lines, its health."""
+"""Session information for the viewer: the session's data, its log lines, its health, a summary."""
 
 from dataclasses import astuple, dataclass, fields
 from typing import TYPE_CHECKING, Any, Final
@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
 
+EVENTS: Final = "/events"
+
+
+SUMMARY: Final = "/summary"
+
+
 @dataclass(frozen=True, slots=True)
 class Subject:
     """A session, as far as its views depend on it.
@@ -20,11 +26,11 @@ class Subject:
     Attributes
     ----------
     name
-        Of the session; the viewer shows it as the recording's.
+        Name of the session; the viewer shows it as the recording's.
     rate_hz
         Scheduled ticks a second.
     ticks
-        Of the whole record, as scheduled.
+        Ticks of the whole record, as scheduled.
     sweep
         First tick of the excitation, and its end (exclusive).
     beam
@@ -33,7 +39,7 @@ class Subject:
         Nominal damping of the profile; None where it is not known: then no model is drawn over the
         frequency response.
     tool_inertia_kg_m2
-        Between the torque sensor and the beam, about the motor's axis.
+        Inertia between the torque sensor and the beam, about the motor's axis.
     angle_delay_s, torque_delay_s
         Age of either value at its time stamp; positive: the value is older.
     """
@@ -56,11 +62,11 @@ class Note:
     Attributes
     ----------
     t_ns
-        When, since the start of the session.
+        Time since the start of the session.
     level
         "debug", "info", "warning", "error" or "fatal", as in the session file.
     message
-        In the operator's words.
+        Text for the operator.
     """
 
     t_ns: int
@@ -80,24 +86,24 @@ _LEVEL_OF_OUTCOME = {"complete": "info", "fault": "error"}
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Readings of one moment; None is one that is not known (there is no bus, say).
+    """Health readings at one time; None where a value is not known (without a bus, say).
 
     Attributes
     ----------
     missed_ticks
         Skipped by the loop since the start of the session.
     late_ticks
-        That woke late but were not missed, since the start.
+        Ticks that woke late but were not missed, since the start.
     lost_ticks
-        Whose samples found no room in the ring, since the start.
+        Ticks whose samples found no room in the ring, since the start.
     recorder_lag_ticks
         Samples that wait in the ring for the recorder.
     disk_free_mb
-        On the disk that the session goes to, in 10⁶ bytes.
+        Free space on the disk of the session file, in 10⁶ bytes.
     view_dropped
         Samples that could not be shown in time, since the start.
     bus_load_percent
-        Of the CAN bus or the serial line.
+        Load of the CAN bus or the serial line.
     bus_errors
         Disturbed, damaged or missing messages, since the devices were connected.
     sensor_status
@@ -130,8 +136,6 @@ def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
     return np.array([(t_ns, *values)], HEALTH_DTYPE)
 
 
-EVENTS: Final = "/events"
-
 _RERUN_LEVELS: Final = {
     "debug": "DEBUG",
     "info": "INFO",
@@ -139,7 +143,7 @@ _RERUN_LEVELS: Final = {
     "error": "ERROR",
     "fatal": "CRITICAL",
 }
-"""What Rerun calls the levels: it has colours for these."""
+"""Rerun's names of the levels: it has colours for these."""
 
 
 def send_note(stream: "RecordingStream", note: "Note") -> None:
@@ -151,11 +155,8 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
     stream.log(EVENTS, rr.TextLog(note.message, level=_RERUN_LEVELS.get(note.level, "INFO")))
 
 
-SUMMARY: Final = "/summary"
-
-
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
-    """Return a Markdown table of how the session is doing; what is not known is left out."""
+    """Return a Markdown table of the session's health; unknown values are left out."""
     elapsed_s = 1e-9 * t_ns
     total_s = subject.ticks / subject.rate_hz
     rows = [

@@ -1,13 +1,11 @@
-"""Calibration of an ATI sensor: from gauge counts to a wrench; and the status words.
+"""Calibration of an ATI sensor, from gauge counts to a wrench, and its status words.
 
-The status words of both sensors in words, and which of their bits forbid measuring.
+A force (N after the unit's factor) is ``F_i = unit · Σ_j M_ij g_j / counts_per_force``, a torque
+(N·m) the same with its own unit and counts. NETCANOEM tells the matrix row by row, Digital F/T in
+a block of registers.
 
+The status words of both sensors are put into words, and some of their bits forbid measuring.
 Sources: devices.md 1.1 for NETCANOEM and 2.1 for Digital F/T. They differ in bits 9, 10 and 13.
-
-A calibration as an ATI sensor holds it, and the way from gauge counts to a wrench.
-
-For a force (N after the unit's factor) ``F_i = unit · Σ_j M_ij g_j / counts_per_force``, and
-likewise for a torque (N·m).
 """
 
 from collections.abc import Callable, Sequence
@@ -19,63 +17,8 @@ import numpy as np
 
 from rigd.devices import Wrench
 
-CAN_WATCHDOG_RESET = 0x0001
-CAN_BAD_CALIBRATION = 0x0040
-CAN_BUS_ERROR = 0x4000
-
-_COMMON_WORDS = {
-    0: "its watchdog has reset the board",
-    1: "the gauges' excitation is too high",
-    2: "the gauges' excitation is too low",
-    3: "its artificial analogue ground is out of range",
-    4: "its supply voltage is too high",
-    5: "its supply voltage is too low",
-    7: "its memory (EEPROM) has failed",
-    8: "its configuration is invalid",
-}
-_CAN_WORDS = {
-    **_COMMON_WORDS,
-    6: "the active calibration is bad",
-    11: "the sensor is too hot",
-    12: "the sensor is too cold",
-    14: "it has seen errors on the CAN bus",
-}
-CAN_CRITICAL = 0x18FE
-"""Bits 1 to 7, 11 and 12."""
-
-_SERIAL_WORDS = {
-    **_COMMON_WORDS,
-    9: "the bridges take too much current (broken gauge or cable)",
-    10: "the bridges take too little current (broken gauge or cable)",
-    11: "the reading of its thermistor is too high",
-    12: "the reading of its thermistor is too low",
-    13: "the reading of its analogue output is out of range",
-}
-SERIAL_CRITICAL = 0x3EBE
-"""Bits 1 to 5, 7 and 9 to 13: what is critical on NETCANOEM, and the bits only this one has."""
-
-
-def can_status(word: int) -> list[str]:
-    """Return what the status word of a NETCANOEM box says, one clause a bit."""
-    # Bit 15 only sums up the others.
-    return _words(word & 0x7FFF, _CAN_WORDS)
-
-
-def serial_status(word: int) -> list[str]:
-    """Return what the status word of a Digital F/T sensor says, one clause a bit."""
-    return _words(word, _SERIAL_WORDS)
-
-
-def _words(word: int, table: dict[int, str]) -> list[str]:
-    return [
-        table.get(bit, f"status bit {bit}, which has no known meaning, is set")
-        for bit in range(16)
-        if word >> bit & 1
-    ]
-
-
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
-"""Which gauge stands where in a reading, on CAN as on the serial line."""
+"""Gauge at each place of a reading, on CAN and on the serial line."""
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -109,7 +52,7 @@ _LEAST_RANK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What one calibration says.
+    """One calibration of a sensor.
 
     Parameters
     ----------
@@ -282,8 +225,10 @@ def text_of(raw: Sequence[int]) -> str:
     return text if text.isascii() and (text.isprintable() or not text) else data.hex(" ")
 
 
+# Calibration block of a Digital F/T
+
 BLOCK_REGISTERS = 133
-"""Of a block, as far as the driver needs it."""
+"""Length of a block, as far as the driver needs it."""
 
 _FIRST_BLOCK = 0x00E3
 _BLOCK_SPACING = 192
@@ -295,7 +240,7 @@ class CalibrationBlock:
 
     calibration: Calibration
     gains: tuple[int, ...]
-    """Of gauges 0 to 5, as register values."""
+    """Gains of gauges 0 to 5, as register values."""
     offsets: tuple[int, ...]
 
 
@@ -336,3 +281,60 @@ def parse_block(registers: Sequence[int]) -> CalibrationBlock:
         gains=unpack(">6H", part(121, 6)),
         offsets=unpack(">6H", part(127, 6)),
     )
+
+
+# Status words
+
+CAN_WATCHDOG_RESET = 0x0001
+CAN_BAD_CALIBRATION = 0x0040
+CAN_BUS_ERROR = 0x4000
+
+_COMMON_WORDS = {
+    0: "its watchdog has reset the board",
+    1: "the gauges' excitation is too high",
+    2: "the gauges' excitation is too low",
+    3: "its artificial analogue ground is out of range",
+    4: "its supply voltage is too high",
+    5: "its supply voltage is too low",
+    7: "its memory (EEPROM) has failed",
+    8: "its configuration is invalid",
+}
+_CAN_WORDS = {
+    **_COMMON_WORDS,
+    6: "the active calibration is bad",
+    11: "the sensor is too hot",
+    12: "the sensor is too cold",
+    14: "it has seen errors on the CAN bus",
+}
+CAN_CRITICAL = 0x18FE
+"""Bits 1 to 7, 11 and 12."""
+
+_SERIAL_WORDS = {
+    **_COMMON_WORDS,
+    9: "the bridges take too much current (broken gauge or cable)",
+    10: "the bridges take too little current (broken gauge or cable)",
+    11: "the reading of its thermistor is too high",
+    12: "the reading of its thermistor is too low",
+    13: "the reading of its analogue output is out of range",
+}
+SERIAL_CRITICAL = 0x3EBE
+"""Bits 1 to 5, 7 and 9 to 13: what is critical on NETCANOEM, and the bits only this one has."""
+
+
+def can_status(word: int) -> list[str]:
+    """Return what the status word of a NETCANOEM box says, one clause a bit."""
+    # Bit 15 only sums up the others.
+    return _words(word & 0x7FFF, _CAN_WORDS)
+
+
+def serial_status(word: int) -> list[str]:
+    """Return what the status word of a Digital F/T sensor says, one clause a bit."""
+    return _words(word, _SERIAL_WORDS)
+
+
+def _words(word: int, table: dict[int, str]) -> list[str]:
+    return [
+        table.get(bit, f"status bit {bit}, which has no known meaning, is set")
+        for bit in range(16)
+        if word >> bit & 1
+    ]

@@ -34,7 +34,7 @@ _ASSUMED = (
     f"{'.'.join(map(str, netcanoem.FIRST_FIRMWARE_WITH_SCALE))} tells neither counts per unit nor "
     "units"
 )
-"""What is taken for granted of old firmware, for the session file and the operator."""
+"""Scale assumed for old firmware, for the session file and the operator."""
 
 
 class AtiCanSensor:
@@ -43,16 +43,16 @@ class AtiCanSensor:
     Parameters
     ----------
     rig
-        With sections ``ati_can`` and ``acquisition``.
+        Parameters with sections ``ati_can`` and ``acquisition``.
     link
         The bus, shared with the drive.
 
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        Of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
+        State of the last reading; the time (``time.monotonic_ns``) is when its poll was sent.
     polls : GaugePolls
-        With the last turn-round time and the count of lost replies.
+        Polls, with the last turn-round time and the count of lost replies.
     late_replies : int
         Replies that came after the deadline, but before the next tick.
     bus_errors : int
@@ -215,7 +215,7 @@ class AtiCanSensor:
         return self._evaluate(answer)
 
     def health(self) -> LineHealth:
-        """Tell what went wrong between this computer and the sensor, and its status word."""
+        """Return the health of the line to the sensor, and the sensor's status word."""
         errors = self.polls.lost + self.bus_errors
         return LineHealth(errors=errors, status=self._status_word)
 

@@ -1,15 +1,12 @@
-"""The NETCANOEM protocol, and the polls of a box: the two frames of each reply brought together.
-
-The NETCANOEM protocol: identifiers, requests and the content of replies.
+"""The NETCANOEM protocol: requests and replies, and the polls of a box.
 
 An identifier is seven bits of base and four of opcode; a reply has the request's base, and the
 opcodes named here. Everything of several bytes is big-endian.
 
-Polls of a NETCANOEM box, and the two frames of each reply brought together.
-
-The protocol has no counter: nothing in a reply says to which poll it belongs. So both frames are
-counted (`rigd.devices.canbus._exchange`), each for itself, for either may be lost or late; where it
-is in doubt whose they are, a tick is left without a poll.
+A poll is answered by two frames, which `GaugePolls` brings together. The protocol has no counter:
+nothing in a reply says to which poll it belongs. So both frames are counted (`ReplyPairing` in
+`rigd.devices.canbus`), each for itself, for either may be lost or late; where it is in doubt whose
+they are, a tick is left without a poll.
 """
 
 import time
@@ -86,6 +83,8 @@ def firmware(reply: bytes) -> tuple[int, int, int]:
     return major, minor, build
 
 
+# Polls
+
 Answer = tuple[bytes, bytes]
 """The data of both frames of a reading."""
 
@@ -107,21 +106,21 @@ class _Frames:
 
 
 class GaugePolls:
-    """The polls, and what came of them.
+    """Polls of a box, and their answers.
 
     Parameters
     ----------
     frame
         The request, of 16 bytes.
     name
-        Of the sensor, for messages.
+        Name of the sensor, for messages.
 
     Attributes
     ----------
     answer : tuple of bytes, or None
-        To the last poll, as of the last `settle`.
+        Answer to the last poll, as of the last `settle`.
     sent_ns, turnaround_ns : int
-        When the last poll was sent (``time.monotonic_ns``); from a poll to its answer.
+        Time of the last poll (``time.monotonic_ns``), and time from a poll to its answer.
     """
 
     __slots__ = (
@@ -155,13 +154,13 @@ class GaugePolls:
         self.forget()
 
     def close(self) -> None:
-        """Use none."""
+        """Stop using the exchange."""
         self._exchange = None
         self.forget()
 
     @property
     def exchange(self) -> CanExchange:
-        """The open one.
+        """The open exchange.
 
         Raises
         ------

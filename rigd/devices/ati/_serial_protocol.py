@@ -1,11 +1,10 @@
-"""What a Digital F/T sensor speaks on its line: Modbus RTU frames, then a stream of records.
-
-The record stream of a Digital F/T sensor: finding the records, and keeping hold of them.
+"""Protocol of a Digital F/T sensor: Modbus RTU frames for set-up, then a stream of records.
 
 A record has 13 bytes: gauges 0, 2, 4, 1, 3, 5 as big-endian int16, then the sum of these bytes in
 seven bits, with the sensor's error bit above. Nothing marks where a record begins and nothing
 counts them, and the sum also fits one of 128 false beginnings. Worse, the records of a load at
-rest are nearly alike, so that a false beginning that fits once may well fit again. Hence:
+rest are nearly alike, so that a false beginning that fits once may well fit again. Hence
+`RecordStream` has these rules:
 
 * after a disturbance a beginning counts only once several records in a row fit it, and these are
   then delivered, too;
@@ -18,7 +17,7 @@ from collections.abc import Sequence
 from struct import pack, unpack
 
 ADDRESS = 0x0A
-"""Of every such sensor."""
+"""Modbus address of every such sensor."""
 MAX_REGISTERS = 64
 """Most that are asked for at once."""
 
@@ -51,6 +50,9 @@ class BadReply(ValueError):
 
 class Refused(ValueError):
     """The sensor understood and declined: asking again will not help."""
+
+
+# Modbus RTU frames
 
 
 def _crc_of_byte(value: int) -> int:
@@ -147,6 +149,8 @@ def registers_of(content: bytes) -> tuple[int, ...]:
     return unpack(f">{len(content) // 2}H", content)
 
 
+# Record stream
+
 RECORD_SIZE = 13
 RECORD_BITS = RECORD_SIZE * 11
 """On the line: each byte with start, parity and stop bit."""
@@ -154,7 +158,7 @@ SYNC_RECORDS = 6
 """Records in a row that must fit. Less than come in a tick of 1 ms, so that one damaged record
 makes no tick go without any."""
 ERROR_BIT = 0x80
-"""In the last byte of a record: the sensor's status word has something to say."""
+"""Bit in the last byte of a record: the sensor's status word reports something."""
 
 _SUM_AT = RECORD_SIZE - 1
 _SUM_MASK = 0x7F
@@ -171,9 +175,9 @@ class RecordStream:
     records : int
         Delivered so far.
     checksum_errors : int
-        How often a record did not fit where one had to begin.
+        Number of times that a record did not fit where one had to begin.
     dropped_bytes : int
-        That belonged to no record.
+        Number of bytes that belonged to no record.
     pending : int
         Bytes that are held until it is clear which record they belong to.
     """

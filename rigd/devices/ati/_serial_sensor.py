@@ -34,16 +34,17 @@ class AtiSerialSensor:
     Parameters
     ----------
     rig
-        With sections ``ati_serial`` and ``acquisition``.
+        Parameters with sections ``ati_serial`` and ``acquisition``.
     simulator
-        Of the simulated rig that stands in for it, or None.
+        Address of the simulated rig that stands in for it, or None.
 
     Attributes
     ----------
     wrench_stale, wrench_saturated, wrench_time_ns
-        Of the last reading; the time (``time.monotonic_ns``) is when its newest record was read.
+        State of the last reading; the time (``time.monotonic_ns``) is when its newest record was
+        read.
     stream : RecordStream
-        With the counts of records and checksum errors.
+        Stream, with the counts of records and checksum errors.
     status : list of str
         What the sensor's status word said last, in words; it can only be asked while the sensor
         does not stream, that is in `connect` and `close`.
@@ -215,7 +216,7 @@ class AtiSerialSensor:
         return False
 
     def health(self) -> LineHealth:
-        """Tell how the line is doing, and the status word that was read before the stream."""
+        """Return the health of the line, and the status word that was read before the stream."""
         return LineHealth(
             bits=self._arrived * _BITS_PER_BYTE,
             bit_rate_bit_s=self._settings.baud,

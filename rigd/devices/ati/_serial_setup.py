@@ -1,8 +1,7 @@
 """The serial port of a Digital F/T sensor, and its set-up over Modbus while it does not stream.
 
-A serial port as the loop uses it: opened and configured by pyserial, then read without blocking.
-
-Configuration is pyserial's work; its own reading costs several system calls for what is one here.
+Pyserial opens and configures the port; the loop then reads it without blocking and without
+pyserial, whose own reading costs several system calls for what is one here.
 """
 
 import os
@@ -33,11 +32,11 @@ class SerialLine:
     Parameters
     ----------
     port
-        Its file name.
+        File name of the port.
     baud
         Bits a second; any that the adapter can make.
     device
-        At its other end, for messages.
+        Device at the other end, for messages.
 
     Attributes
     ----------
@@ -193,6 +192,8 @@ def _remedy(error: Exception) -> str:
     )
 
 
+# Set-up over Modbus
+
 SILENCE_S = 0.002
 """Modbus: a frame is over when the line has been silent for this long."""
 
@@ -216,11 +217,11 @@ class SerialSetup:
     Parameters
     ----------
     line
-        Open.
+        Open line.
     settings
-        Of the sensor.
+        Settings of the sensor.
     name
-        Of the sensor, for messages.
+        Name of the sensor, for messages.
     """
 
     def __init__(self, line: SerialLine, settings: AtiSerial, name: str) -> None:

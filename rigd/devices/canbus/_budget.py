@@ -1,16 +1,18 @@
-"""What a profile puts on the bus, before anything is connected: identifiers and load.
-
-Which CAN identifiers each device of a rig uses, and where two of them would meet.
+"""Use of the CAN bus by a profile, before anything is connected: identifiers and bus load.
 
 CANopen's predefined set ties a node's identifiers to its number, and an ATI sensor takes sixteen in
 a row. Where they overlap, raw gauges are obeyed as controlword and torque, or a torque command
 resets the sensor (base 0x20 is RPDO1 of the nodes 1 to 15): no device may be talked to then.
+
+The bus load counts every cyclic frame with the most bits that may be stuffed into it.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rigd.devices import AtiCan, RigParameters, ServoDrive
+
+# Identifiers
 
 _FREE_BASE = 0x68
 """Base of a sensor whose identifiers the predefined set leaves free, whatever the nodes are."""
@@ -88,6 +90,8 @@ def _collisions(rig: RigParameters) -> Iterator[str]:
         )
 
 
+# Bus load
+
 SYNC_LENGTH = 0
 RPDO_LENGTH = 4
 """Controlword and target torque."""
@@ -96,17 +100,17 @@ TPDO_LENGTH = 8
 HEARTBEAT_LENGTH = 1
 REQUEST_LENGTH = 0
 REPLY_LENGTHS = (8, 6)
-"""Of an ATI sensor to one request: status and gauges 0, 2, 4; gauges 1, 3, 5."""
+"""Replies of an ATI sensor to one request: status and gauges 0, 2, 4; gauges 1, 3, 5."""
 
 FRAME_BITS = 47
-"""Of a frame with an 11-bit identifier and no data: start, identifier, control, checksum,
+"""Bits of a frame with an 11-bit identifier and no data: start, identifier, control, checksum,
 acknowledgement, end, and the pause of 3 bits before the next frame."""
 _STUFFED_BITS = 34
-"""Of these, those from the start to the checksum, among which bits are stuffed."""
+"""Bits among these from the start to the checksum, where bits are stuffed."""
 
 
 MAX_LOAD = 0.9
-"""Of a bus or line, with the most stuffed bits: above, a frame may miss its period."""
+"""Largest load of a bus or line, with the most stuffed bits: above, a frame may miss its period."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +132,7 @@ class BusLoad:
     plain: float
     """Part of the time, 0 to 1 and beyond, if no bit had to be stuffed."""
     worst: float
-    """With as many stuffed bits as there can be."""
+    """Load with as many stuffed bits as there can be."""
     frames_per_s: float
 
 

@@ -1,12 +1,13 @@
-"""The cyclic exchange on one port: who gets which frame, and waiting for replies.
+"""The cyclic exchange on one port: who gets which frame, which reply answers which request.
 
-Which request the last reply answers, on a bus whose replies do not say so: both are counted.
+`CanLink` opens a bus once for all its users, `CanExchange` routes each frame to its driver.
 
-A device answers every request with one reply, in order. Where one is missing, the next to come may
-be the missing one, late, or the next one, the missing one being lost; and from then on there is one
-reply to each request either way. So one tick is left without a request: if no reply comes in it,
-none is on its way, and what is missing is lost. If one comes, replies are late by whole periods,
-and no reading counts until they have caught up.
+Replies on the bus do not say which request they answer, so `ReplyPairing` counts both. A device
+answers every request with one reply, in order. Where one is missing, the next to come may be the
+missing one, late, or the next one, the missing one being lost; and from then on there is one reply
+to each request either way. So one tick is left without a request: if no reply comes in it, none is
+on its way, and what is missing is lost. If one comes, replies are late by whole periods, and no
+reading counts until they have caught up.
 """
 
 import time
@@ -27,12 +28,14 @@ from rigd.devices.canbus._port import (
 )
 from rigd.runtime import HeldError, HeldFile
 
+# Pairing of replies
+
 _STEADY_PERIODS = 3
 """Periods with one reply each after which what is missing is given up where there is no pause."""
 
 
 class Counter(Protocol):
-    """Where replies are counted as they come."""
+    """Count of the replies that have come."""
 
     replies: int
     """Since somebody set this to zero, whatever was in them."""
@@ -44,7 +47,7 @@ class ReplyPairing:
     Parameters
     ----------
     inbox
-        Of the replies.
+        Counter of the replies that have come.
     pauses
         A tick may be left without a request. Not so with a device whose time passes with the
         requests: there what is missing is taken for lost in the end, unproven.
@@ -56,7 +59,7 @@ class ReplyPairing:
     lost : int
         Replies that were taken for lost.
     unproven : int
-        Those of them that may also be late for good.
+        Lost replies that may also be late by whole periods for good.
     """
 
     __slots__ = (
@@ -102,7 +105,7 @@ class ReplyPairing:
         self.owed += 1
 
     def pause(self) -> None:
-        """Note a tick without a request, likewise."""
+        """Note a tick without a request, right before its latch."""
         self._close()
         self._asked = self._alone = False
 
@@ -143,6 +146,8 @@ class ReplyPairing:
         return replies
 
 
+# Exchange
+
 Handler = Callable[[bytes], None]
 
 # linux/can/error.h: class in the identifier, state of the controller in data[1].
@@ -154,7 +159,7 @@ _NO_ACKNOWLEDGE = 0x20
 _FAILURES_SKIPPED = 10
 """Failures to receive that one drain bears in `regardless`: an adapter may have several queued."""
 _FAILURES_WAITED = 100
-"""Likewise of one wait."""
+"""Failures of reading after which one wait gives up."""
 _FAILURE_PAUSE_S = 0.001
 
 
@@ -164,14 +169,14 @@ class CanExchange:
     Parameters
     ----------
     port
-        Open.
+        Open port.
 
     Attributes
     ----------
     error_frames : int
-        How often the controller reported a disturbance.
+        Number of disturbances that the controller reported.
     bits : int
-        Of all frames sent and received, nothing stuffed.
+        Bits of all frames sent and received, without stuff bits.
     """
 
     def __init__(self, port: CanPort) -> None:
@@ -302,13 +307,16 @@ class CanExchange:
             )
 
 
+# Bus and its users
+
+
 class BusLock:
     """Held from the opening of a bus to its closing.
 
     Parameters
     ----------
     bus
-        Where the bus is: a channel, or the socket of a simulated one.
+        Channel of the bus, or socket of a simulated one.
     simulated
         It is a simulated one: other users have others.
     """
@@ -349,9 +357,9 @@ class CanLink:
     Parameters
     ----------
     settings
-        Which bus.
+        Settings of the bus.
     simulator
-        Of the simulated rig that stands in for it, or None.
+        Address of the simulated rig that stands in for it, or None.
     """
 
     def __init__(self, settings: CanBus, simulator: SimulatorAddress | None) -> None:

@@ -1,5 +1,6 @@
-"""The kernel's ``struct can_frame``: identifier, length, up to eight bytes; 16 bytes in all.
+"""Ports of a CAN bus: a socket of the kernel, the Unix socket of a simulated bus, or python-can.
 
+All carry the kernel's ``struct can_frame``: identifier, length, up to eight bytes; 16 bytes in all.
 Classical CAN with identifiers of 11 bits is all that the rig speaks.
 """
 
@@ -19,11 +20,11 @@ if TYPE_CHECKING:
 
 FRAME_SIZE = 16
 ERROR_FLAG = 0x2000_0000
-"""In the identifier of a frame by which a controller reports on itself (linux/can/error.h)."""
+"""Flag in the identifier: the controller reports on itself (linux/can/error.h)."""
 LONG_FLAG = 0x8000_0000
-"""In the identifier of a frame that has 29 bits of it; no device of the rig sends such."""
+"""Flag in the identifier: it has 29 bits; no device of the rig sends such frames."""
 REMOTE_FLAG = 0x4000_0000
-"""In the identifier of a request for data; no device of the rig sends such either."""
+"""Flag in the identifier: a request for data; no device of the rig sends such frames."""
 ERROR_MASK = 0x1FFF_FFFF
 SFF_MASK = 0x7FF
 
@@ -33,13 +34,16 @@ _PROTOCOL_VIOLATION = 0x08
 
 _FRAME = Struct("=IB3x8s")
 BUS_OFF_FRAME = _FRAME.pack(ERROR_FLAG | BUS_OFF, 8, bytes(8))
-"""What the kernel reports then."""
+"""Error frame with which the kernel reports bus-off."""
 DAMAGED_FRAME = _FRAME.pack(ERROR_FLAG | _PROTOCOL_VIOLATION, 8, bytes(8))
-"""What stands in for a frame that came damaged; it is counted, and nothing else follows."""
+"""Frame that stands in for a damaged one; it is counted, and nothing else follows."""
 LENGTH_AT = 4
-"""Where the number of data bytes stands in a raw frame."""
+"""Place of the number of data bytes in a raw frame."""
 read_head = Struct("=IB").unpack_from
 """Identifier with flags, and length, from raw frame."""
+
+
+# Frames
 
 
 def pack_frame(can_id: int, data: bytes = b"") -> bytes:
@@ -63,6 +67,8 @@ def unpack_frame(raw: bytes) -> tuple[int, bytes]:
     return can_id, data[: min(length, 8)]
 
 
+# Ports
+
 # What the kernel keeps for a reader that is late: some 200 ms of a full bus.
 _RECEIVE_BUFFER = 212_992
 # As much as the system allows: a simulated rig that stands still is told by its silence.
@@ -80,7 +86,7 @@ class CanPort(Protocol):
     """
 
     name: str
-    """Of the bus, for messages."""
+    """Name of the bus, for messages."""
 
     def send(self, frame: bytes) -> None:
         """Send 16 bytes made by :func:`rigd.devices.canbus.pack_frame`.
@@ -135,11 +141,11 @@ class SocketPort:
     Parameters
     ----------
     link
-        Connected; made non-blocking.
+        Connected socket; it is made non-blocking.
     name
-        Of the bus, for messages.
+        Name of the bus, for messages.
     remedy
-        What to look at when it has gone.
+        Advice for the operator where the bus is gone.
     """
 
     def __init__(
@@ -295,7 +301,7 @@ class PythonCanPort:
 
 
 def _words(error: Exception) -> str:
-    """Return what an adapter's driver says, and by which error: some say nothing else."""
+    """Return the text and the type of an adapter's error: some have no text."""
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 

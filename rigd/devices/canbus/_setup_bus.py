@@ -1,4 +1,4 @@
-"""A python-can bus on one of our ports: what the canopen library sets a drive up with."""
+"""A python-can bus on one of our ports, with which the canopen library sets a drive up."""
 
 import sys
 import time

@@ -1,4 +1,4 @@
-"""Objects of a maker's own that a profile has set: ``cia402.set_objects``.
+"""Vendor-specific objects that a profile sets: ``cia402.set_objects``.
 
 Each is one text, ``"3001:2 u32 2500"``: index and sub-index in hexadecimal as manuals print them,
 the type, and the value in decimal or as 0x…. They are written in pre-operational and read back.
@@ -40,7 +40,7 @@ class Assignment:
     index: int
     sub: int
     kind: str
-    """Of :data:`KINDS`."""
+    """Type of the value, one of :data:`KINDS`."""
     value: int
 
     @property

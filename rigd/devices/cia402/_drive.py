@@ -1,4 +1,4 @@
-"""The drive on its bus: set-up, the exchange of every tick, its guards, enabling and disabling.
+"""Driver of a CiA 402 drive: set-up, the exchange of every tick, guards, enabling and disabling.
 
 A TPDO does not say which SYNC it answers: :mod:`rigd.devices.canbus._exchange` counts both, and
 where that is in doubt a SYNC is left out. A drive that takes more than a period for its answer is
@@ -48,7 +48,7 @@ class Cia402Drive:
     Parameters
     ----------
     rig
-        With the sections ``cia402`` and ``acquisition``.
+        Parameters with the sections ``cia402`` and ``acquisition``.
     link
         The bus, which may be shared.
 
@@ -162,7 +162,7 @@ class Cia402Drive:
         return self._outfit
 
     def statement(self) -> dict[str, str]:
-        """Return what a session's file has to say of the drive's own safeguards.
+        """Return the drive's own safeguards as metadata of a session file.
 
         Returns
         -------
@@ -307,7 +307,7 @@ class Cia402Drive:
         return sent / self._per_mille_per_nm
 
     def health(self) -> LineHealth:
-        """Tell how the bus is doing, as far as its frames are sent or received here."""
+        """Return the health of the bus, as far as its frames are sent or received here."""
         if self._node is None:
             return LineHealth()
         exchange = self._node.exchange
@@ -385,7 +385,7 @@ class Cia402Drive:
             self._link.close()
 
     def _own_end(self) -> str:
-        """Return how a drive ends that nobody can switch off, as a sentence."""
+        """Say what takes the torque off a drive that cannot be switched off."""
         outfit = self._outfit
         if outfit is None or outfit.watchdog is Watchdog.NONE:
             return "It has no watchdog that would end it by itself."

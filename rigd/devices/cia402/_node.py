@@ -26,20 +26,23 @@ from rigd.devices.cia402._protocol import (
 _TOGGLE_BIT = 0x80
 
 
+# What has come
+
+
 class Inbox:
     """The drive's last words. A frame of the wrong length changes nothing but counts.
 
     Parameters
     ----------
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     sto_error_code
-        Of the emergency message that says that its STO was dropped; 0 if it has none.
+        Error code of the emergency message for a dropped STO; 0 if the drive has none.
 
     Attributes
     ----------
     statusword, position, torque
-        Of the last TPDO; position in counts, torque in 1/1000 of the rated one.
+        Content of the last TPDO; position in counts, torque in 1/1000 of the rated one.
     strayed : int or None
         First statusword that was not as :meth:`guard` asks, in whichever TPDO it came: the drive
         may be back in the next one.
@@ -48,7 +51,7 @@ class Inbox:
     legible : bool
         The last TPDO had the right length.
     nmt_state : int or None
-        Of the last heartbeat.
+        NMT state in the last heartbeat.
     heard : bool
         A heartbeat has come since somebody set this to False.
     watching : bool
@@ -174,9 +177,11 @@ class Inbox:
         self.reply = data
 
 
+# The node
+
 _LONG_AGO_NS = -(1 << 62)
 _START_PATIENCE_NS = 1_000_000_000
-"""For going operational, beside three periods of the drive's heartbeat."""
+"""Time to become operational, in addition to three periods of the drive's heartbeat."""
 _FIRST_REPLY_NS = 100_000_000
 _FIRST_REPLIES = 20
 """SYNCs on which a reply within a period is hoped for: this computer may be the slow one."""
@@ -191,11 +196,11 @@ class Node:
     Parameters
     ----------
     rig
-        With the sections ``cia402`` and ``acquisition``.
+        Parameters with the sections ``cia402`` and ``acquisition``.
     exchange
-        Started; delivers the drive's frames to the inbox.
+        Started exchange; it delivers the drive's frames to the inbox.
     frames, inbox
-        Of the drive.
+        Frames to the drive, and what has come from it.
 
     Attributes
     ----------
@@ -377,7 +382,7 @@ class Node:
         return True
 
     def await_alarm(self) -> None:
-        """Give a drive that has left operation a little time to say why."""
+        """Wait briefly for the reason of a drive that has left operation."""
         inbox = self.inbox
         if not inbox.alarm:
             self.exchange.wait_until(lambda: bool(inbox.alarm), time.monotonic_ns() + _REASON_NS)

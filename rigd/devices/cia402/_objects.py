@@ -24,7 +24,7 @@ RPDO_COMMUNICATION: Final = 0x1400
 RPDO_MAPPING: Final = 0x1600
 TPDO_COMMUNICATION: Final = 0x1800
 TPDO_MAPPING: Final = 0x1A00
-"""Of the first PDO; those of the n-th are n - 1 further."""
+"""Objects of the first PDO; those of the n-th have indices n - 1 higher."""
 INHIBIT_TIME: Final = 3
 EVENT_TIMER: Final = 5
 """Sub-indices of a PDO's communication parameters, in 100 µs and in ms; of an RPDO the event timer
@@ -48,7 +48,7 @@ ACTUAL_TORQUE: Final = 0x6077
 POLARITY: Final = 0x607E
 """Bit 7 turns the position round, bit 6 the speed, bit 5 the torque."""
 MAX_SPEED_RPM: Final = 0x6080
-"""Of the motor."""
+"""Highest speed of the motor."""
 INTERPOLATION_TIME: Final = 0x60C2
 """Sub 1: value; sub 2: power of ten of its unit in s."""
 SUPPORTED_MODES: Final = 0x6502
@@ -58,9 +58,9 @@ CYCLIC_TORQUE: Final = 10
 SUPPORTS_CYCLIC_TORQUE: Final = 0x200
 """Its bit in 6502."""
 PDO_DISABLED: Final = 0x8000_0000
-"""In the COB-ID of a PDO."""
+"""Bit in the COB-ID of a PDO: it is disabled."""
 NO_REMOTE_REQUEST: Final = 0x4000_0000
-"""In the COB-ID of a TPDO: nobody may ask for it. Drives are free to set it."""
+"""Bit in the COB-ID of a TPDO: no remote request allowed. Drives are free to set it."""
 SYNC_ID: Final = 0x080
 PDO_COUNT: Final = 4
 """Pairs of PDOs with identifiers that CiA 301 sets beforehand."""

@@ -1,13 +1,10 @@
-"""CANopen and CiA 402 as the driver speaks them: objects, frames, states and error codes.
+"""CANopen and CiA 402 as the driver speaks them: states, frames and error codes.
 
-Object dictionary entries that the driver uses, and constants of their contents.
+`DriveState` follows from the statusword; a controlword leads from one state to the next.
 
-Indices and meanings: CiA 301 (1xxx) and CiA 402 (6xxx), as vendors' manuals document them. The
-types are in ``drive.eds``, with which the canopen library encodes them.
-
-Frames of one CANopen node, to send and to read; CANopen is little-endian.
-
-Identifiers are those that CiA 301 sets beforehand. What is sent is made once, but for the torque.
+`NodeFrames` holds the frames of one CANopen node, to send and to read; CANopen is little-endian.
+Identifiers are those of the predefined connection set (CiA 301). Frames are packed once, except for
+the torque. Indices of objects are in :mod:`rigd.devices.cia402._objects`.
 """
 
 from enum import Enum
@@ -22,6 +19,8 @@ from rigd.devices.cia402._objects import (
     STATUSWORD,
     SYNC_ID,
 )
+
+# States of CiA 402
 
 
 class DriveState(Enum):
@@ -50,7 +49,7 @@ FAULT_BIT: Final = 0x0008
 VOLTAGE_ENABLED: Final = 0x0010
 """The power stage is supplied; STO takes it from most drives."""
 FOLLOWS_TARGET: Final = 0x1000
-"""In cyclic synchronous torque mode: without it the drive ignores the target torque."""
+"""Bit 12 in cyclic synchronous torque mode: without it the drive ignores the target torque."""
 STATE_BITS: Final = 0x006F
 ENABLED: Final = 0x0027
 """Statusword in operation enabled, of its state bits."""
@@ -85,6 +84,8 @@ def state_of(statusword: int) -> DriveState:
     return DriveState.UNKNOWN
 
 
+# Frames
+
 NMT_START: Final = 0x01
 NMT_STOP: Final = 0x02
 NMT_PRE_OPERATIONAL: Final = 0x80
@@ -105,7 +106,7 @@ unpack_tpdo = Struct("<Hih").unpack
 """Statusword, position in counts, torque in 1/1000 of the rated one; ``struct.error`` if the
 length is not 8."""
 unpack_short_tpdo = Struct("<Hi").unpack
-"""The same of a drive that does not tell its torque."""
+"""The same for a drive that does not report its torque."""
 _unpack_emergency = Struct("<HB").unpack_from
 _pack_rpdo = Struct("<Hh4x").pack
 _pack_sdo = Struct("<BHBI").pack
@@ -125,9 +126,9 @@ class NodeFrames:
     Parameters
     ----------
     node_id
-        Of the drive.
+        Node number of the drive.
     host_node_id
-        Of this computer.
+        Node number of this computer.
 
     Attributes
     ----------
@@ -199,6 +200,8 @@ def _read(data: bytes, wanted: int) -> bytes | None:
         return None
     return bytes(value)
 
+
+# Error codes
 
 # Most digits first. Classes: CiA 301; single codes: those on which vendors' manuals agree.
 _WORDS: Final = (

@@ -1,4 +1,4 @@
-"""What rigd asks of a drive's object dictionary: one table for set-up, for EDS files and for docs.
+"""Requirements on a drive's object dictionary: one table for set-up, EDS files and docs.
 
 An object is *core* where no session is possible without it, and *optional* where something else
 stands in. An optional object that is read-only is fine as long as it holds what is needed
@@ -24,16 +24,16 @@ TORQUE_LIMIT: Final = "torque_limit"
 ABORT_OPTION: Final = "abort_option"
 TORQUE_FEEDBACK: Final = "torque_feedback"
 ACCEPTABLE: Final = (WATCHDOG, TORQUE_LIMIT, ABORT_OPTION, TORQUE_FEEDBACK)
-"""What a profile may accept by name that its drive has not."""
+"""Names of what a profile may accept that its drive lacks."""
 
 
 class Access(Flag):
-    """What rigd does with an object."""
+    """Kind of access to an object."""
 
     READ = auto()
-    """By SDO."""
+    """Read by SDO."""
     WRITE = auto()
-    """By SDO, in pre-operational, unless the object already holds what is needed."""
+    """Written by SDO, in pre-operational, unless the object already holds what is needed."""
     SENT = auto()
     """Mapped into the drive's TPDO (an EDS has PDOMapping = 1, access ro, rw or rwr)."""
     RECEIVED = auto()
@@ -41,7 +41,7 @@ class Access(Flag):
 
 
 class Watchdog(Enum):
-    """What in the drive takes the torque off when this computer falls silent."""
+    """Watchdog in the drive that takes the torque off when this computer falls silent."""
 
     HEARTBEAT = "heartbeat consumer (1016:1)"
     RPDO_DEADLINE = "deadline of the RPDO (1400:5)"
@@ -92,19 +92,19 @@ class Requirement:
     Attributes
     ----------
     index, sub
-        Of the object.
+        Index and sub-index of the object.
     name
-        As CiA 301 and 402 call it.
+        Name in CiA 301 or 402.
     core
         No session without it.
     access
-        What is done with it.
+        Kind of access to it.
     stand_in
-        What does its work where it is absent; empty where nothing does.
+        Replacement where it is absent; empty where there is none.
     sentence
-        For the operator, where it is absent or cannot be used: what follows, and the remedy.
+        Consequence and remedy where it is absent or cannot be used, for the operator.
     fit
-        Which values it may hold where it cannot be written.
+        Values that it may hold where it cannot be written.
     accept
         Name under which ``cia402.accept_without`` has to accept its absence; empty where it does
         not have to. (For 1016:1 only where no other :class:`Watchdog` stands.)
@@ -492,7 +492,7 @@ def fixed_values(node_id: int) -> dict[tuple[int, int], int]:
     Parameters
     ----------
     node_id
-        Of the drive. CiA 301 sets its identifiers beforehand: it is added to all but that of SYNC.
+        Node number of the drive. It is added to all predefined identifiers (CiA 301) but SYNC's.
     """
     return {
         **{(row.index, row.sub): 0 for row in REQUIREMENTS if row.zero},
@@ -513,7 +513,7 @@ def wanted_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     Parameters
     ----------
     rig
-        With a section ``cia402``.
+        Parameters with a section ``cia402``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Reading and writing of the drive's objects by SDO, while no cycle runs.
+"""SDO access to the drive's objects, while no cycle runs.
 
 The canopen library does it, with a thread that receives; both are gone when the access is left.
 An object's type is taken from the drive's EDS file where the profile names one, else from
@@ -38,9 +38,9 @@ _SDO_TIMEOUT_S = 0.5
 _SDO_TRIES = 2
 _HURRIED_TIMEOUT_S = 0.05
 _LATE_REPLIES = 3
-"""How many replies to earlier requests, given up since, may come in place of the one awaited."""
+"""Number of replies to earlier, abandoned requests that may come instead of the awaited one."""
 _TIMED_OUT = "No SDO response"
-"""How canopen begins to tell that nothing came at all; what else it tells came, and was not it."""
+"""Beginning of canopen's message if no reply came; any other message means a wrong reply."""
 _RECEIVER_POLL_S = 0.02
 _ABSENT = {
     0x0602_0000: "no such object",
@@ -109,11 +109,11 @@ class SdoAccess:
     Parameters
     ----------
     port
-        Open; nobody else receives from it meanwhile.
+        Open port; nobody else receives from it meanwhile.
     node_id
-        Of the drive.
+        Node number of the drive.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     """
 
     def __init__(self, port: CanPort, node_id: int, name: str) -> None:

@@ -25,6 +25,22 @@ from rigd.devices.cia402._requirements import (
 from rigd.devices.cia402._sdo import EVERY_BIT, NotKept, SdoAccess, SdoRefusal, show_value
 from rigd.devices.cia402._standing import command_off, require_off, still_on, wait_for
 
+_READ_ONLY = 0x0601_0002
+_ABORTS = {
+    0x0601_0000: "unsupported access",
+    _READ_ONLY: "read-only",
+    0x0602_0000: "no such object",
+    0x0604_0041: "it cannot be mapped",
+    0x0604_0042: "the PDO gets too long",
+    0x0604_0043: "incompatible parameters",
+    0x0609_0030: "value out of range",
+    0x0609_0031: "value too great",
+    0x0609_0032: "value too small",
+    0x0800_0000: "general error",
+    0x0800_0022: "not in this state of the device",
+}
+"""SDO abort codes in short."""
+
 _MODE_PATIENCE_S = 0.3
 _RATED_TORQUE_TOLERANCE = 0.02
 _DUPLICATE_WATCHES = 127
@@ -33,12 +49,12 @@ _DUPLICATE_WATCHES = 127
 
 @dataclass(frozen=True, slots=True)
 class Outfit:
-    """What a drive turned out to have when it was set up.
+    """Equipment of a drive, as found when it was set up.
 
     Attributes
     ----------
     identity
-        What it says of itself.
+        Identity that the drive reports.
     watchdog, watchdog_s
         What takes the torque off when this computer falls silent, and after how long; infinite
         where nothing does.
@@ -73,16 +89,16 @@ def set_up(port: CanPort, rig: RigParameters, name: str) -> Outfit:
     Parameters
     ----------
     port
-        Open; nobody else receives from it meanwhile.
+        Open port; nobody else receives from it meanwhile.
     rig
-        With a section ``cia402``.
+        Parameters with a section ``cia402``.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
 
     Returns
     -------
     Outfit
-        What the drive says of itself, and what it has.
+        Identity that the drive reports, and what it has.
 
     Raises
     ------
@@ -172,11 +188,11 @@ class _SetUp:
     sdo
         The way to it.
     settings
-        Of the profile.
+        Settings of the profile.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     wanted
-        What its objects are to hold, by index and sub-index.
+        Values that its objects are to hold, by index and sub-index.
     """
 
     def __init__(
@@ -196,7 +212,7 @@ class _SetUp:
         Parameters
         ----------
         row
-            Of the object.
+            Row of the object in the table of requirements.
         wanted
             The value; the one of the table of values if it is not given.
 
@@ -283,7 +299,7 @@ class _SetUp:
         self._clear(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Have the drive not make the shaft ever faster, should nobody take a torque back."""
+        """Limit the speed that a torque which is never withdrawn can lead to."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
@@ -310,7 +326,7 @@ class _SetUp:
             self.settle(requirement(objects.INTERPOLATION_TIME, sub))
 
     def configure_guards(self) -> Watchdog:
-        """Set what the drive does when this computer falls silent, and how it is heard itself.
+        """Set the drive's reaction to this computer's silence, and its own heartbeat.
 
         Returns
         -------
@@ -442,7 +458,7 @@ class _SetUp:
         flags
             Further bits of its COB-ID.
         entries
-            What it carries, as mapping entries.
+            Objects that it carries, as mapping entries.
         parameters
             Further sub-indices of the communication parameters, and what they are to hold where
             the drive has them and they are not 0, or are wanted.
@@ -510,20 +526,3 @@ def _disable_others(sdo: SdoAccess, communication: int) -> None:
 
 def _words(refusal: SdoRefusal) -> str:
     return _ABORTS.get(refusal.code, "see CiA 301")
-
-
-_READ_ONLY = 0x0601_0002
-_ABORTS = {
-    0x0601_0000: "unsupported access",
-    _READ_ONLY: "read-only",
-    0x0602_0000: "no such object",
-    0x0604_0041: "it cannot be mapped",
-    0x0604_0042: "the PDO gets too long",
-    0x0604_0043: "incompatible parameters",
-    0x0609_0030: "value out of range",
-    0x0609_0031: "value too great",
-    0x0609_0032: "value too small",
-    0x0800_0000: "general error",
-    0x0800_0022: "not in this state of the device",
-}
-"""SDO abort codes in short."""

@@ -1,4 +1,4 @@
-"""The drive without the loop: off before anything else, reset, and whether it would get ready.
+"""The drive without the loop: switched off first of all, reset, and asked whether it could start.
 
 Everything goes by SDO, which a drive answers in each NMT state but stopped. Whether the motor has
 torque is what the statusword says, never what was commanded.
@@ -26,9 +26,15 @@ from rigd.devices.cia402._sdo import SdoAccess, SdoRefusal
 
 _POLL_S = 0.01
 _OFF_S = 0.2
-"""From the first command on: a drive that answers and shows torque after it is told to turn."""
+"""Time from the first command after which a drive that answers but has torque is an error."""
 _SILENT_S = 1.0
 """How long a drive that answers nothing at all is waited for."""
+
+
+_PRESS_STO = (
+    "the motor may still turn: press the wired stop (STO) and keep clear of the beam, then switch "
+    "the drive off and on"
+)
 
 
 def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
@@ -40,11 +46,11 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     Parameters
     ----------
     port
-        Open; nobody else receives from it meanwhile.
+        Open port; nobody else receives from it meanwhile.
     rig
-        With a section ``cia402``.
+        Parameters with a section ``cia402``.
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
 
     Returns
     -------
@@ -126,12 +132,6 @@ def wait_for(reached: Callable[[], bool], patience_s: float) -> bool:
             return reached()
         time.sleep(_POLL_S)
     return True
-
-
-_PRESS_STO = (
-    "the motor may still turn: press the wired stop (STO) and keep clear of the beam, then switch "
-    "the drive off and on"
-)
 
 
 def _see_off(sdo: SdoAccess, name: str) -> None:

@@ -1,7 +1,7 @@
-"""Can rigd drive this with torque? The answer of an EDS file, before anything is connected.
+"""Suitability of a drive for torque control, judged by its EDS file before it is connected.
 
-The file is held against the table that the set-up goes by (:mod:`requirements`). What it does not
-tell is left to the drive, which is asked when it is connected.
+The file is compared with the table of :mod:`rigd.devices.cia402._requirements`, which the set-up
+goes by. What it does not state the drive is asked when it is connected.
 """
 
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Grade(Enum):
-    """Of what a file tells of one object."""
+    """Grade of what a file tells of one object."""
 
     FITS = "as needed"
     STANDS_IN = "something else does its work"
@@ -42,7 +42,7 @@ class Grade(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What the file tells of one object, or of the drive as a whole."""
+    """Finding about one object, or about the drive as a whole."""
 
     what: str
     """``6072 Max torque``, or in words."""
@@ -50,7 +50,7 @@ class Finding:
     wanted: str
     grade: Grade
     sentence: str = ""
-    """Of what is refused or doubtful, for the operator: what follows, and the remedy."""
+    """What follows from a refusal or doubt, and the remedy, for the operator."""
     accept: str = ""
     """Name by which the profile may accept it (``cia402.accept_without``)."""
 
@@ -93,7 +93,7 @@ def judge(eds: Eds, rig: "RigParameters | None" = None) -> Judgement:
     eds
         Read for the node id of the profile.
     rig
-        Of a profile with a section ``cia402``, whose values are then compared as well; None: the
+        Parameters of a profile with a section ``cia402``, whose values are compared too; None: the
         drive alone is judged, and what a profile may accept counts as accepted.
     """
     return Judgement(tuple(_Judge(eds, rig).findings()))
@@ -174,7 +174,7 @@ class _Judge:
         return Finding(what, "the file does not tell; the drive will be asked", wanted, Grade.ASK)
 
     def _watchdog(self) -> Finding:
-        """Tell what in the drive takes the torque off when this computer falls silent."""
+        """Judge which watchdog takes the torque off when this computer falls silent."""
         found = self._stands()
         what, wanted = "watchdog", "one of three"
         if found is Watchdog.HEARTBEAT:

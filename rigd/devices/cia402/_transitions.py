@@ -1,4 +1,4 @@
-"""Up to operation enabled at zero torque and down again; and why a drive has left it."""
+"""Transitions of the drive: up to operation enabled, down again, and unexpected ones."""
 
 import time
 from collections.abc import Callable
@@ -30,15 +30,18 @@ _LOOK_AT_THE_BUS: Final = (
 )
 
 
+# Why a drive has left operation
+
+
 def left_operation(name: str, statusword: int) -> DeviceError:
     """Return the error of an enabled drive that is not in operation enabled any more.
 
     Parameters
     ----------
     name
-        Of the drive.
+        Name of the drive, for messages.
     statusword
-        Which names no fault, and which no emergency message explains.
+        Last statusword; it shows no fault, and no emergency message explains it.
     """
     state = state_of(statusword)
     left = (
@@ -64,7 +67,7 @@ def left_operation(name: str, statusword: int) -> DeviceError:
 
 
 _TICKS = 10
-"""In a row; a single lost command is repeated by the next."""
+"""Ticks in a row; a single lost command is repeated by the next."""
 
 
 class TorqueFollowing:
@@ -77,13 +80,13 @@ class TorqueFollowing:
     Parameters
     ----------
     name
-        Of the drive, for messages.
+        Name of the drive, for messages.
     tolerance_percent
-        Of the rated torque; 0 compares nothing.
+        Tolerance in percent of the rated torque; 0 disables the comparison.
     response_s
         Time constant of that lag; 0 for a drive that tells what it was told.
     period_s
-        Between two commands.
+        Time between two commands.
 
     Attributes
     ----------
@@ -96,7 +99,7 @@ class TorqueFollowing:
     ) -> None:
         self._name = name
         self._tolerance = 10.0 * tolerance_percent
-        # Of a command that has stood for a period.
+        # Share of a step that a command reaches after one period.
         self._share = 1.0 - exp(-period_s / response_s) if response_s else 1.0
         self.compares = True
         self.start()
@@ -109,7 +112,7 @@ class TorqueFollowing:
         self._departed = 0
 
     def command(self, per_mille: int) -> None:
-        """Note what the drive is told."""
+        """Note the torque that is commanded."""
         self._commanded = per_mille
         before = self._before = self._last
         self._last = before + self._share * (per_mille - before)
@@ -142,6 +145,8 @@ class TorqueFollowing:
             )
 
 
+# Up and down
+
 _STEPS_UP = (
     (SHUTDOWN, DriveState.READY),
     (SWITCH_ON, DriveState.SWITCHED_ON),
@@ -163,7 +168,7 @@ def step_up(node: Node, stop: Callable[[], bool]) -> None:
     Parameters
     ----------
     node
-        Of the drive.
+        The drive's node.
     stop
         Asked once a period whether to give up.
 

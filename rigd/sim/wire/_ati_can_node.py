@@ -56,7 +56,7 @@ class AtiCanNode:
     rig
         With a section ``ati_can``: base, serial number (FT12345 if empty) and calibration.
     simulated
-        What is measured: one reading for each request.
+        Simulated sensor: one reading for each request.
     send
         Takes identifier and data of a reply.
     log

@@ -11,11 +11,11 @@ from rigd.devices.parameters import WrenchSensor
 COUNTS_PER_UNIT = (1_000_000, 1_000_000)
 """Per N and per N·m, as both sensors of this family that are documented state them."""
 WIRE_ORDER = (0, 2, 4, 1, 3, 5)
-"""In which both protocols send the gauges."""
+"""Order in which both protocols send the gauges."""
 UNIT_NEWTON, UNIT_NEWTON_METRE = 2, 3
 PART_NUMBER = "SI-20-1"
 SERIAL_NUMBER = "FT12345"
-"""Where the profile asks for none."""
+"""Serial number where the profile asks for none."""
 
 # Counts of each gauge (row) under the full range of fx, fy, fz, tx, ty, tz. Three beams carry two
 # gauges each: the even ones feel the forces across the axis and the torque about it, the odd ones
@@ -43,7 +43,7 @@ class AtiGauges:
     Parameters
     ----------
     sensor
-        Its range fixes the gauges' sensitivity.
+        Sensor whose range fixes the gauges' sensitivity.
     counts_per_unit
         Per N and per N·m: the scale of the matrix.
 
@@ -53,7 +53,7 @@ class AtiGauges:
         From gauges to fx, fy, fz, tx, ty, tz, times the counts per unit. Not symmetric, no entry
         zero; each axis divided by its range, its condition number is 3.3.
     counts_per_unit : tuple of int
-        As given.
+        Counts per unit of force and torque, as given.
     quantisation : (6,) float64
         What the rounding of the gauges does at most to each axis, in N and N·m. With the range and
         resolution of the Mini40 SI-20-1 it is less than half the resolution on every axis, and one

@@ -344,7 +344,7 @@ def _request_length(received: bytes, start: int) -> int:
         return 5
     if function == _WRITE:
         return 9 + received[start + 6] if there > 6 else unknown
-    # Of a function that the sensor does not know only the checksum tells where it ends.
+    # A request with an unknown function ends where its checksum holds.
     return unknown if there > _LONGEST_FRAME or _checksum(received[start:]) else there
 
 

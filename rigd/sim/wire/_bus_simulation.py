@@ -1,7 +1,7 @@
-"""The simulated rig between its lines: nodes, clock and faults, without any input or output.
+"""Bus simulation: the rig between its lines, with nodes, clock and faults, but no input or output.
 
 Whatever comes in is handed over with the time it came; what the nodes say goes out through two
-callables. So the same world runs behind sockets and in a test.
+callables. So the same `World` runs behind sockets and in a test.
 """
 
 import heapq
@@ -17,10 +17,13 @@ from rigd.sim import SimulatedRig
 from rigd.sim.wire._faults import LINE_KINDS, SERIAL, EventLog, Fault, FaultError, Line
 
 _MEMORY_SYNCS = 256
-"""Over how many SYNCs the grid's phase is averaged: a single late one hardly moves it."""
+"""SYNCs over which the grid's phase is averaged: a single late one hardly moves it."""
 _FORGET_PERIODS = 100
-"""After so long a silence the next SYNC may come from another host: its phase counts anew."""
+"""Periods of silence after which the next SYNC may come from another host with its own phase."""
 _PATIENCE_NS = 5_000_000_000
+
+
+# Clocks
 
 
 class WallClock:
@@ -40,7 +43,7 @@ class WallClock:
     Attributes
     ----------
     tick : int
-        Where the world is.
+        Tick of the simulated rig.
     """
 
     def __init__(self, period_ns: float, now_ns: int) -> None:
@@ -82,7 +85,7 @@ class WallClock:
 
 
 class LockStep:
-    """One period a SYNC; the world waits for the next one.
+    """One period per SYNC; simulated time waits for the next one.
 
     It does not wait for ever: five seconds after the last SYNC, and at once where nobody is left
     who could send one, time goes on by the wall clock, so that a drive notices a dead host. Before
@@ -119,9 +122,11 @@ class LockStep:
         return passed
 
     def left_alone(self, now_ns: int) -> None:
-        """Wait no longer: nobody is connected any more."""
+        """End the waiting: nobody is connected any more."""
         self._stands_until_ns = min(self._stands_until_ns, now_ns)
 
+
+# Nodes and frames
 
 _SYNC = 0x80
 _SYNC_HEAD = pack_frame(_SYNC)[:4]
@@ -135,7 +140,7 @@ _TRAITS = {
     "no_bit_12": "never_follows",
     "no_watch": "watchless",
 }
-"""What the drive may be like, and by which of its attributes."""
+"""Traits that a fault may give the drive, and the attribute of each."""
 
 
 class Node(Protocol):
@@ -194,7 +199,7 @@ class World:
     Parameters
     ----------
     rig, simulated
-        Of the rig, and what moves.
+        Parameters of the rig, and the plant with its devices.
     lock_step
         One period a SYNC, instead of wall time.
     now_ns

@@ -1,9 +1,8 @@
 """Services of a simulated CANopen node: emergency messages, heartbeats, PDOs.
 
-PDOs of a simulated CANopen node, mapped as its dictionary says.
-
-A mapping is turned into one :class:`struct.Struct` and a list of readers whenever it changes, so
-that a PDO costs a few microseconds when it comes or goes.
+PDOs are mapped as the node's dictionary says. A mapping is turned into one :class:`struct.Struct`
+and a list of readers whenever it changes, so that a PDO costs a few microseconds when it comes or
+goes.
 """
 
 import math
@@ -14,20 +13,22 @@ from struct import Struct
 
 from rigd.sim.wire._object_dictionary import Abort, AbortCode, Entry, ObjectDictionary
 
+# Emergency messages
+
 _FRAME = Struct("<HB5s")
 _GENERIC = 0x01
 _HISTORY = 8
 
 
 class Emergencies:
-    """What is wrong at present, and what was.
+    """Emergency messages: present errors, and the history.
 
     Parameters
     ----------
     objects
         Gets the objects 1001, 1003 and 1014.
     node_id
-        Of the node.
+        Number of the node.
     send
         Takes identifier and data of an EMCY message, where one may be sent.
 
@@ -63,7 +64,7 @@ class Emergencies:
         code
             Error code.
         register
-            Its bits in the error register; the generic bit is added.
+            Bits of the error in the error register; the generic bit is added.
         vendor
             Up to five bytes of the message.
 
@@ -113,6 +114,8 @@ class Emergencies:
             raise Abort(AbortCode.STATE)
 
 
+# Heartbeats
+
 WATCHES = 2
 _TOLERANCE_S = 1e-9
 
@@ -159,7 +162,7 @@ class HeartbeatWatch:
 
     @property
     def node_id(self) -> int:
-        """Who is watched; 0 for nobody."""
+        """Number of the watched node; 0 for none."""
         return _watched(self._entry.value)
 
     def beat(self, now_s: float) -> None:
@@ -190,7 +193,7 @@ def add_watches(
     objects
         Gets the object.
     count
-        How many nodes can be watched; with 0 there is no such object.
+        Number of nodes that can be watched; with 0 there is no such object.
     restarted
         Called after a watch was set anew, and so is not lost.
     """
@@ -215,6 +218,8 @@ def add_watches(
         objects.add_record(0x1016, entries)
     return watches
 
+
+# PDOs
 
 DISABLED = 0x8000_0000
 MAX_ENTRIES = 8
@@ -247,22 +252,22 @@ class Pdo:
     direction
         "r" or "t": what entries must allow in `Entry.mapping`.
     cob_id
-        At power-on, with `DISABLED` or not.
+        COB-ID at power-on, with `DISABLED` or not.
     mapped
         At power-on: index << 16 | sub-index << 8 | bits.
     slots
-        How many entries it can carry at most.
+        Largest number of entries.
     changed
         Called after identifier, type or mapping have changed.
 
     Attributes
     ----------
     can_id : int
-        As it is used; -1 while the PDO is off or empty.
+        Identifier in use; -1 while the PDO is off or empty.
     size : int
         Bytes of the PDO.
     entries : list of Entry
-        What it carries.
+        Objects that it carries.
     """
 
     direction = ""
@@ -371,7 +376,7 @@ class ReceivePdo(Pdo):
     pending : bytes or None
         Received, and waiting for the next SYNC.
     received_s : float or None
-        When the last one came; None before the first.
+        Time of the last one; None before the first.
     applied : bool
         Whether one has taken effect.
     """

@@ -85,12 +85,12 @@ class DriveNode:
     Parameters
     ----------
     rig
-        With a section [cia402].
+        Parameters with a section [cia402].
     simulated
-        What the drive pushes and measures.
+        Plant that the drive pushes and measures.
     advance
         Moves the simulated rig on to this SYNC. It is called at each valid SYNC, in every state,
-        frozen or not: the world moves on.
+        frozen or not: simulated time goes on.
     send
         Takes identifier and data of a frame.
     log
@@ -100,7 +100,7 @@ class DriveNode:
         After how long without a SYNC a drive in operation faults; by default
         `SYNC_TIMEOUT_PERIODS` of its SYNC period.
     file
-        Of the drive that it is to be: it has the objects of that one, with their types, access
+        Device file of the drive it stands for: it has the objects of that one, with types, access
         rights, limits and values at power-on, and no others.
 
     Attributes

@@ -1,9 +1,7 @@
-"""Object dictionary and state machine of the simulated drive.
+"""Object dictionary and state machine of the simulated drive (CiA 402).
 
-What stands in the object dictionary of the simulated drive, besides PDOs and errors.
-
-Torques are in 1/1000 of the rated torque, positions in encoder counts at the output shaft, both in
-the drive's own direction.
+The dictionary holds what the drive has besides PDOs and errors. Torques are in 1/1000 of the rated
+torque, positions in encoder counts at the output shaft, both in the drive's own direction.
 """
 
 import math
@@ -20,6 +18,9 @@ from rigd.sim.wire._object_dictionary import Abort, AbortCode, Entry, ObjectDict
 if TYPE_CHECKING:
     from rigd.sim.wire._object_dictionary import DeviceFile
 
+
+# State machine
+
 RAMP_S = 0.05
 """How long a ramp lasts. In a torque mode there is nothing to ramp: the shaft coasts meanwhile."""
 
@@ -27,7 +28,7 @@ _SWITCH_ON, _ENABLE_VOLTAGE, _NO_QUICK_STOP, _ENABLE_OPERATION = 0x01, 0x02, 0x0
 _FAULT_RESET = 0x80
 
 _STAY_IN_QUICK_STOP = 5
-"""From this value of 605A on."""
+"""Values of 605A from this one on keep the drive in quick stop."""
 
 
 class State(Enum):
@@ -134,7 +135,7 @@ class StateMachine:
             self._enter(State.FAULT)
 
     def tick(self, now_s: float) -> None:
-        """End what takes its time."""
+        """Complete transitions that take time."""
         if self.state not in (State.QUICK_STOP, State.FAULT_REACTION):
             return
         if self._ramp_since_s is None:
@@ -175,6 +176,8 @@ class StateMachine:
             self._entered(left)
 
 
+# Object dictionary
+
 NO_MODE, CYCLIC_SYNCHRONOUS_TORQUE = 0, 10
 
 _DEVICE_TYPE = 0x0002_0192  # a servo drive, by CiA 402
@@ -191,7 +194,7 @@ _NOT_TOLD_BY_ZERO = (0x6072, 0x6080, 0x60E0, 0x60E1)
 """Limits; with one of zero no drive would turn."""
 
 _TORQUE_UNIT_NM = 1e-3
-"""Of object 6076 where the profile does not state one."""
+"""Unit of object 6076 where the profile does not state one."""
 _MAX_SPEED_RPM = 20_000
 
 # 605A without the options that stop by a current or voltage limit.

@@ -1,9 +1,8 @@
-"""Faults to inject: how they are written, what they do to what is sent, and the log of it.
+"""Faults to inject: how they are specified, what they do to frames, and the log of events.
 
-Faults to inject: how they are written, and what they do to what is sent.
-
-``KIND[,key=value…][@SECONDS]``: with ``@`` so long after the drive was first enabled, without at
-once. Times are of the simulated world. A frame meets at most one fault, the oldest that it fits.
+A fault is written as ``KIND[,key=value…][@SECONDS]``: with ``@`` it begins so long after the drive
+was first enabled, without at once. Times are simulated time. A frame meets at most one fault, the
+oldest that it fits.
 """
 
 import json
@@ -19,8 +18,10 @@ from rigd.devices.contracts import DeviceError
 
 
 class WrongUseError(ValueError):
-    """What was asked for cannot be had; the message says why, for the operator."""
+    """A request that cannot be met; the message says why, for the operator."""
 
+
+# Specification of a fault
 
 Value = int | float | str
 Deliver = Callable[[int, bytes, object], None]
@@ -36,7 +37,7 @@ class FaultError(WrongUseError):
 
 @dataclass(frozen=True, slots=True)
 class _Key:
-    """What may stand behind a key, and what counts where the key is left out."""
+    """Values that a key may have, and its default."""
 
     read: Callable[[str], Value]
     says: str
@@ -106,7 +107,7 @@ KINDS: dict[str, dict[str, _Key]] = {
 }
 _MOMENTARY = ("emcy", "jump", "restart", "power_cycle")
 LASTING = tuple(kind for kind in KINDS if kind not in _MOMENTARY)
-"""What goes on until it ends by itself or is ended."""
+"""Kinds that last until they end by themselves or are ended."""
 KINDS["end"] = {"fault": _one_of(*LASTING)}
 
 
@@ -116,7 +117,7 @@ class Fault:
 
     kind: str
     values: Mapping[str, Value]
-    """By key; a key that was left out and has no default is missing."""
+    """Values by key; a key that was left out and has no default is missing."""
     after_s: float | None = None
     """Time after the drive was first enabled; None: at once."""
 
@@ -181,6 +182,9 @@ def _complaint(spec: str, what: str) -> str:
     return f"Fault '{spec}': {what}."
 
 
+# Faults on a line
+
+
 class _Active:
     """A fault of a line, and how much of it is still to come."""
 
@@ -206,7 +210,7 @@ class Line:
     Parameters
     ----------
     sender
-        Whose, for the log.
+        Sender of the frames, for the log.
     deliver
         Takes what gets through.
     postpone
@@ -280,9 +284,11 @@ class Line:
             self._deliver(can_id, data[hit:], origin)
 
 
+# Log of events
+
 _FLUSH_S = 0.2
 _SILENT = ("torque", "sdo write", *LINE_KINDS)
-"""What happens too often to be told on the terminal."""
+"""Events that happen too often to be told on the terminal."""
 
 
 class EventLog:
@@ -291,14 +297,14 @@ class EventLog:
     Parameters
     ----------
     path
-        Of the file of JSON lines, which is new; None for none.
+        Path of the new file of JSON lines; None for none.
     quiet
         Tell nothing on the terminal.
 
     Attributes
     ----------
     time_s : float
-        Simulated time; whoever moves the world sets it.
+        Simulated time; `World` sets it.
 
     Raises
     ------

@@ -1,10 +1,8 @@
-"""Lines of the simulated rig: its end of the CAN bus, and a pseudo-terminal.
+"""Links of the simulated rig: its end of the CAN bus, and a pseudo-terminal for the serial line.
 
-The simulated rig's end of the CAN bus: a Unix socket, or a virtual interface of the kernel.
-
-Both carry the 16 bytes of ``struct can_frame``. On the Unix socket every client hears every other
-one, as on a bus. Nothing here blocks: who does not read loses frames, as a slow CAN controller
-does.
+The bus is a Unix socket (`Hub`) or a virtual interface of the kernel (`VirtualCan`). Both carry the
+16 bytes of ``struct can_frame``. On the Unix socket every client hears every other one, as on a
+bus. Nothing here blocks: who does not read loses frames, as a slow CAN controller does.
 """
 
 import os
@@ -19,6 +17,8 @@ from pathlib import Path
 from rigd.devices.canbus import FRAME_SIZE
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
+
+# Delays of the links
 
 
 def without_transport(rig: RigParameters) -> RigParameters:
@@ -49,8 +49,10 @@ def without_transport(rig: RigParameters) -> RigParameters:
     )
 
 
+# CAN bus
+
 Handlers = dict[int, Callable[[], None]]
-"""What to call when a file descriptor has something to read."""
+"""Functions to call when a file descriptor has something to read."""
 OnFrames = Callable[[list[bytes], object], None]
 """Takes the frames of a sender, in order, and who it is."""
 
@@ -85,9 +87,9 @@ class Hub:
     Parameters
     ----------
     path
-        Of the socket.
+        Path of the socket.
     handlers
-        Of the event loop; kept up to date.
+        Handlers of the event loop, by file descriptor; kept up to date.
     on_frames
         Gets what a client sends.
     on_clients
@@ -117,7 +119,7 @@ class Hub:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         return len(self._clients)
 
     def open(self) -> None:
@@ -354,6 +356,8 @@ def _offer(link: socket.socket, data: bytes) -> int:
         return 0
 
 
+# Serial line
+
 _LINE_BYTES = 4096
 
 
@@ -366,7 +370,7 @@ class PtyLine:
     Parameters
     ----------
     handlers
-        Of the event loop; kept up to date.
+        Handlers of the event loop, by file descriptor; kept up to date.
     on_bytes
         Gets what the host sends.
     on_open

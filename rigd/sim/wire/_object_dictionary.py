@@ -11,6 +11,12 @@ from typing import Final
 from rigd.devices import EdsEntry, EdsError, read_eds
 from rigd.devices.contracts import DeviceError
 
+# Objects
+
+NUMBERS = "bBhHiIqQ"
+_FORMATS = {kind: Struct("<" + kind) for kind in NUMBERS}
+_LONGEST_TEXT = 1024
+
 
 class AbortCode(IntEnum):
     """Why an SDO access failed, as the node tells its client."""
@@ -36,7 +42,7 @@ class Abort(Exception):
     Attributes
     ----------
     code : AbortCode
-        What the client is told.
+        SDO abort code for the client.
     """
 
     def __init__(self, code: AbortCode) -> None:
@@ -44,21 +50,16 @@ class Abort(Exception):
         self.code = code
 
 
-NUMBERS = "bBhHiIqQ"
-_FORMATS = {kind: Struct("<" + kind) for kind in NUMBERS}
-_LONGEST_TEXT = 1024
-
-
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What a device's file says of one sub-index."""
+    """Description of one sub-index in a device's file."""
 
     kind: str
-    """As of an `Entry`."""
+    """Type, as in `Entry`."""
     access: str
     mapping: str
     default: int | None = None
-    """None where the file does not tell."""
+    """Value at power-on; None where the file does not state it."""
     low: int | None = None
     high: int | None = None
     text: bytes = b""
@@ -88,13 +89,13 @@ class Entry:
         Letter of :mod:`struct` for the number ("b", "B", "h", "H", "i", "I", "q", "Q"), or "s" for
         bytes: a text, or a value that nobody here computes with.
     value
-        At power-on.
+        Value at power-on.
     access
         "rw", "ro" or "wo", as seen by SDO.
     mapping
         Into which PDOs it may go: "r", "t", "rt" or none.
     low, high
-        What may be written; by default all that the type holds.
+        Range of values that may be written; by default that of the type.
     text
         The bytes at power-on.
     fixed
@@ -121,7 +122,7 @@ class Entry:
     default: int = field(init=False)
     default_text: bytes = field(init=False)
     bits: int = field(init=False)
-    """Of a number; 0 for bytes, which no PDO carries."""
+    """Bits of a number; 0 for bytes, which no PDO carries."""
     _low: int = field(init=False)
     _high: int = field(init=False)
 
@@ -136,7 +137,7 @@ class Entry:
         Parameters
         ----------
         said
-            Of the file, a number as this one is.
+            Entry of the file, a number as this one is.
         default
             Value at power-on from now on; None leaves it as it is.
         """
@@ -166,7 +167,7 @@ class Entry:
 
     @property
     def most_bytes(self) -> int:
-        """How many bytes may be written at most."""
+        """Largest number of bytes that may be written."""
         if self.kind != "s":
             return self.bits // 8
         return len(self.text) if self.fixed else _LONGEST_TEXT
@@ -259,7 +260,7 @@ class ObjectDictionary:
         Parameters
         ----------
         file
-            What it says, by index and sub-index.
+            Descriptions in the file, by index and sub-index.
         own
             Indices whose values at power-on are not the file's.
         """
@@ -333,6 +334,8 @@ class ObjectDictionary:
                 entry.reset()
 
 
+# SDO server
+
 _HEAD = Struct("<BHB")
 _ABORT = Struct("<BHBI")
 
@@ -353,7 +356,7 @@ class SdoServer:
     Parameters
     ----------
     objects
-        What is read and written.
+        Objects that are read and written.
     reply
         Takes the eight bytes of an answer.
     wrote
@@ -457,8 +460,10 @@ class SdoServer:
         self._wrote(self._index, self._sub, self._objects.write(self._index, self._sub, data))
 
 
+# EDS files
+
 _FIRST_INDEX = 0x1000
-"""Below it stand types and dummies, which nobody can read."""
+"""Lowest index of objects; below it are types and dummies, which cannot be read."""
 _IDENTITY = 0x1018
 _WATCHED, _ONE_NODE = 0x1016, 0x1_0000
 
@@ -484,11 +489,11 @@ _PDO_DIRECTIONS: Final = {"ro": "t", "const": "t", "wo": "r", "rwr": "t", "rww":
 
 @dataclass(frozen=True, slots=True)
 class DeviceFile:
-    """What stands in such a file."""
+    """Content of an EDS or DCF file."""
 
     name: str
     entries: Mapping[tuple[int, int], Description]
-    """By index and sub-index."""
+    """Entries by index and sub-index."""
 
     def numbers(self, first: int, last: int) -> Iterator[int]:
         """Yield how far behind the first one the indices of this range are that there are."""

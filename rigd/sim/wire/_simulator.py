@@ -54,6 +54,9 @@ _LONGEST_SOCKET_NAME = 107
 _STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+# One simulation per rig
+
+
 @contextmanager
 def only_one(rig_name: str) -> Iterator[None]:
     """Refuse to start beside another simulated rig of the same name."""
@@ -107,6 +110,8 @@ def stop_requested() -> Iterator[Callable[[], bool]]:
             signal.signal(number, before[number])
 
 
+# Control socket
+
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 """Answers a request."""
 
@@ -120,9 +125,9 @@ class ControlSocket:
     Parameters
     ----------
     path
-        Of the Unix socket.
+        Path of the Unix socket.
     handlers
-        Of the event loop; kept up to date.
+        Handlers of the event loop, by file descriptor; kept up to date.
     answer
         Takes a request, returns the reply.
     """
@@ -205,13 +210,15 @@ def ask(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
     return reply
 
 
+# The process
+
 _IDLE_S = 0.01
-"""How often the loop looks up while nothing hurries."""
+"""Longest time that the loop waits while nothing is due."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatorOptions:
-    """How a simulated rig is run."""
+    """Options of a simulated rig."""
 
     lock_step: bool = False
     """Move on by one period a SYNC instead of by wall time."""
@@ -433,7 +440,7 @@ class _Process:
         return world
 
     def _sync_timeout_s(self) -> float:
-        """How long the drive bears that no SYNC comes."""
+        """Time after which the drive faults without a SYNC."""
         drive = self._rig.cia402
         assert drive is not None
         if drive.own_watchdog_s:
