@@ -5,7 +5,6 @@ import contextlib
 import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import pytest
 
@@ -338,7 +337,7 @@ def operate(profile, tmp_path, monkeypatch):
     """Make a service on a rig of threads, not connected yet."""
     for module in (control, recorder):
         monkeypatch.setattr(module, "Parent", lambda: _current.parent)
-    monkeypatch.setattr(recorder, "signals", SimpleNamespace(ignore=lambda: None))
+    monkeypatch.setattr(recorder, "ignore_signals", lambda: None)
     monkeypatch.setattr(recorder, "SessionWriter", open_writer)
     monkeypatch.setattr(control, "StopRequest", QuietStop)
     monkeypatch.setattr(control, "collect_no_garbage", lambda: "off")

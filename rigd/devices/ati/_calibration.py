@@ -5,7 +5,7 @@ A force (N after the unit's factor) is ``F_i = unit · Σ_j M_ij g_j / counts_pe
 a block of registers.
 
 The status words of both sensors are put into words, and some of their bits forbid measuring.
-Sources: devices.md 1.1 for NETCANOEM and 2.1 for Digital F/T. They differ in bits 9, 10 and 13.
+Sources: the manuals of NETCANOEM and of Digital F/T. They differ in bits 9, 10 and 13.
 """
 
 from collections.abc import Callable, Sequence
