@@ -3,7 +3,6 @@
 import os
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -73,10 +72,8 @@ def test_terminal_page_and_files_account_for_it(shaken):
 
 
 def test_the_command_tells_it_and_its_exit_code_is_not_0(shaken, monkeypatch, tmp_path, capsys):
-    # The package's function has its module's name.
-    module = import_module("analysis.campaigns._campaign")
-    monkeypatch.setattr(module, "campaign", lambda *_, **__: shaken)
-    monkeypatch.setattr("analysis.report._campaign_write.write_campaign", lambda *_, **__: None)
+    monkeypatch.setattr("analysis.campaigns.campaign", lambda *_, **__: shaken)
+    monkeypatch.setattr("analysis.report.write_campaign", lambda *_, **__: None)
     paths = [each.path for each in shaken.sessions]
     code = campaign_command(paths, shaken.settings, structures=("III",), report=tmp_path / "new")
     assert code == 1
