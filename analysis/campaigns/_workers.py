@@ -11,18 +11,20 @@ import socket
 import threading
 import time
 import warnings
+from collections import deque
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
     CancelledError,
+    Executor,
     Future,
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from analysis.campaigns._experiment import CampaignError
 
@@ -30,6 +32,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
 Result = TypeVar("Result")
+
+_LOOK_S: Final = 2.0
+"""How often is looked whether there are workers at all."""
+
+_HOPELESS: Final = 2
+"""Tasks that end their processes, none being done, from which it is not the tasks' doing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +47,43 @@ class Lost:
     reason: str
 
 
-class Workers(Protocol):
-    """Processes that run tasks side by side."""
+def available_cores() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1
+
+
+def unheard(_number: int) -> None:
+    """Do without progress."""
+
+
+class Workers:
+    """Processes that run tasks side by side, behind an executor of `concurrent.futures`.
+
+    A process that ends by itself (killed for lack of memory, mostly) takes other tasks with it:
+    all that are under way in a pool, or those that wait at the same worker of a cluster. They are
+    tried once more, each alone, so that only the one that ends its process is lost.
+    """
+
+    _died: type[Exception] = BrokenExecutor
+    """By which the executor tells that a task's process ended."""
+    _limit: int | None = None
+    """Tasks under way at once: the fewer, the fewer are tried again."""
+    _lost: str
+    """What to say of a task whose process ended twice."""
+    _hopeless: str | None = None
+    """What to say if that is so of all tasks; None: no more than of each."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
 
     def run(
         self,
         function: Callable[..., Result],
-        arguments: Sequence[tuple[object, ...]],
-        on_done: Callable[[int], None] = ...,
+        arguments: Sequence[tuple[Any, ...]],
+        on_done: Callable[[int], None] = unheard,
     ) -> list[Result | Lost]:
         """Call a function with every tuple of arguments.
 
@@ -68,28 +105,77 @@ class Workers(Protocol):
         CampaignError
             There are no workers any more.
         """
-        ...
+        results: dict[int, Result | Lost] = {}
 
+        def submit(number: int) -> Future[Result]:
+            return self._executor.submit(function, *arguments[number])
 
-def available_cores() -> int:
-    """Cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Linux
-        return os.cpu_count() or 1
+        def done(number: int, result: Result | Lost) -> None:
+            results[number] = result
+            on_done(number)
 
+        waiting = deque(range(len(arguments)))
+        while waiting:
+            with self._telling():
+                suspects = self._try(waiting, submit, done)
+                for number in suspects:
+                    self._renew(alone=True)
+                    if self._try(deque([number]), submit, done):
+                        done(number, Lost(self._lost))
+            if suspects:
+                others = any(not isinstance(result, Lost) for result in results.values())
+                if self._hopeless and not others and (len(results) >= _HOPELESS or not waiting):
+                    raise CampaignError(self._hopeless)
+                self._renew()
+        return [results[number] for number in range(len(arguments))]
 
-def unheard(_number: int) -> None:
-    """Do without progress."""
+    def _try(
+        self,
+        waiting: deque[int],
+        submit: Callable[[int], Future[Result]],
+        done: Callable[[int, Result], None],
+    ) -> list[int]:
+        """Take tasks from those waiting until a process ends; return what was under way then."""
+        under_way: dict[Future[Result], int] = {}
+        suspects: list[int] = []
+        seen = time.monotonic()
+        while under_way or (waiting and not suspects):
+            while waiting and not suspects and len(under_way) != self._limit:
+                try:
+                    under_way[submit(waiting[0])] = waiting[0]
+                except BrokenExecutor:
+                    if not under_way:  # a process that had nothing to do has ended
+                        self._renew()
+                    break
+                waiting.popleft()
+            for future in wait(under_way, _LOOK_S, FIRST_COMPLETED).done:
+                number = under_way.pop(future)
+                try:
+                    result = future.result()
+                except self._died:
+                    suspects.append(number)
+                else:
+                    done(number, result)
+            seen = self._still_there(seen)
+        return suspects
 
+    def _renew(self, *, alone: bool = False) -> None:
+        """Start processes in the place of those that ended, or one for one task."""
 
-# Processes of this machine
+    def _telling(self) -> AbstractContextManager[None]:
+        """Tell as a `CampaignError` what else says that there are no workers any more."""
+        return nullcontext()
+
+    def _still_there(self, seen: float) -> float:
+        """Return when workers were last seen; raise if they are gone for good."""
+        return seen
+
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @contextmanager
-def process_pool(jobs: int) -> Iterator[LocalWorkers]:
+def process_pool(jobs: int) -> Iterator[Workers]:
     """Pool of fresh processes, whose linear algebra has one thread each.
 
     Fresh, because a process with threads (a progress bar is one) cannot be forked safely. They
@@ -98,11 +184,14 @@ def process_pool(jobs: int) -> Iterator[LocalWorkers]:
     """
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    workers = LocalWorkers(jobs)
+    others = set(multiprocessing.active_children())
+    workers = _LocalWorkers(jobs)
     try:
         yield workers
     except BaseException:
-        workers.drop()
+        workers.close(wait=False)
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()
         raise
     finally:
         workers.close()
@@ -113,90 +202,27 @@ def process_pool(jobs: int) -> Iterator[LocalWorkers]:
                 os.environ[name] = value
 
 
-class LocalWorkers:
-    """See `analysis.campaigns._workers.Workers`.
-
-    A process that ends by itself (killed for lack of memory, mostly) breaks its pool, which does
-    not tell by which task. So no more tasks are under way than there are processes, and those are
-    tried once more, each in a pool of its own.
-    """
+class _LocalWorkers(Workers):
+    _lost = "its worker process ended by itself, twice: most often for lack of memory"
+    _hopeless = (
+        "The worker processes ended by themselves, most often for lack of memory: use fewer "
+        "--jobs. A script that calls campaign() must do so under if __name__ == '__main__':"
+    )
 
     def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-        self._others = set(multiprocessing.active_children())
-        self._pool = _pool(jobs)
+        super().__init__(_pool(jobs))
+        self._limit = jobs
 
-    def run(
-        self,
-        function: Callable[..., Result],
-        arguments: Sequence[tuple[Any, ...]],
-        on_done: Callable[[int], None] = unheard,
-    ) -> list[Result | Lost]:
-        """See `analysis.campaigns._workers.Workers.run`."""
-        results: dict[int, Result | Lost] = {}
-        waiting = list(reversed(range(len(arguments))))
+    def _renew(self, *, alone: bool = False) -> None:
+        self.close()
+        self._executor = _pool(1 if alone else self._limit)
 
-        def done(number: int, result: Result | Lost) -> None:
-            results[number] = result
-            on_done(number)
-
-        under_way: dict[Future[Result], int] = {}
-        while waiting or under_way:
-            suspects = []
-            while waiting and len(under_way) < self._jobs:
-                number = waiting.pop()
-                try:
-                    under_way[self._pool.submit(function, *arguments[number])] = number
-                except BrokenExecutor:
-                    waiting.append(number)
-                    if not under_way:  # a process that had nothing to do has ended
-                        self._renew(self._jobs)
-                    break
-            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-                number = under_way.pop(future)
-                try:
-                    done(number, future.result())
-                except BrokenExecutor:
-                    suspects.append(number)
-            if suspects:
-                # The others of a broken pool end as this one did.
-                suspects += under_way.values()
-                under_way.clear()
-                for number in suspects:
-                    done(number, self._again(function, arguments[number]))
-                if all(isinstance(result, Lost) for result in results.values()):
-                    raise CampaignError(
-                        "The worker processes ended by themselves, most often for lack of memory: "
-                        "use fewer --jobs. A script that calls campaign() must do so under "
-                        "if __name__ == '__main__':"
-                    )
-                self._renew(self._jobs)
-        return [results[number] for number in range(len(arguments))]
-
-    def _again(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result | Lost:
-        """Try a task alone."""
-        self._renew(1)
-        try:
-            return self._pool.submit(function, *arguments).result()
-        except BrokenExecutor:
-            return Lost("its worker process ended by itself, twice: most often for lack of memory")
-
-    def _renew(self, jobs: int) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
-        self._pool = _pool(jobs)
-
-    def drop(self) -> None:
-        """End the processes at once."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for worker in set(multiprocessing.active_children()) - self._others:
-            worker.terminate()
-
-    def close(self) -> None:
-        """End the processes when they have done what is under way."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+    def close(self, *, wait: bool = True) -> None:
+        """Begin nothing else, and end the processes when they have done what is under way."""
+        self._executor.shutdown(wait, cancel_futures=True)
 
 
-def _pool(jobs: int) -> ProcessPoolExecutor:
+def _pool(jobs: int | None) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(
         jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_begin
     )
@@ -215,17 +241,14 @@ def _begin() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-# Dask cluster
-
 _CONNECT_S: Final = 5.0
 _WORKERS_S: Final = 10.0
-_LOOK_S: Final = 2.0
 _GONE_S: Final = 30.0
 """How long a cluster may be without any worker: its nannies start them anew in seconds."""
 
 
 @contextmanager
-def dask_cluster(address: str) -> Iterator[DaskWorkers]:
+def dask_cluster(address: str) -> Iterator[Workers]:
     """Workers of a Dask cluster.
 
     They need this package, of the same version, and the session files under the same paths.
@@ -233,7 +256,7 @@ def dask_cluster(address: str) -> Iterator[DaskWorkers]:
     Parameters
     ----------
     address : str
-        Address of the scheduler, such as ``tcp://10.0.0.5:8786``.
+        Of its scheduler, such as ``tcp://10.0.0.5:8786``.
 
     Raises
     ------
@@ -258,95 +281,63 @@ def dask_cluster(address: str) -> Iterator[DaskWorkers]:
             ) from error
         try:
             _check_workers(client, address)
-            with client.as_current():
-                yield DaskWorkers(client, address)
+            yield _DaskWorkers(client, address)
         finally:
             client.close()
 
 
-class DaskWorkers:
-    """See `analysis.campaigns._workers.Workers`."""
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from Dask what is told here in a sentence: what goes wrong, and versions that differ."""
+    log = logging.getLogger("distributed.client")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="(?s).*Mismatched versions")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def _knock(address: str) -> None:
+    """Raise an OSError if nobody listens; Dask's client would go on trying after it has failed."""
+    name = address.rsplit("://", maxsplit=1)[-1]
+    if "://" in address and not address.startswith(("tcp://", "tls://")):
+        return
+    host, _, port = name.rpartition(":")
+    if not (host and port.isdecimal()):
+        raise ValueError("no host and port")
+    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
+
+
+class _DaskWorkers(Workers):
+    """The scheduler tries a task whose worker ended at others, and gives it up after several."""
+
+    _lost = (
+        "every Dask worker that had it ended by itself: most often for lack of memory; see the "
+        "workers' logs"
+    )
 
     def __init__(self, client: Any, address: str) -> None:  # noqa: ANN401 - Dask has no types
-        self._client, self._address = client, address
-
-    def run(
-        self,
-        function: Callable[..., Result],
-        arguments: Sequence[tuple[Any, ...]],
-        on_done: Callable[[int], None] = unheard,
-    ) -> list[Result | Lost]:
-        """See `analysis.campaigns._workers.Workers.run`.
-
-        The scheduler gives a task whose worker ended to another one, and gives it up when it has
-        lost several so; with it those that happened to wait at the same workers. So what it gives
-        up is tried once more, each task by itself.
-        """
-        results: dict[int, Result | Lost] = {}
-
-        def done(number: int, result: Result) -> None:
-            results[number] = result
-            on_done(number)
-
-        for number in self._round(function, dict(enumerate(arguments)), done):
-            if self._round(function, {number: arguments[number]}, done):
-                results[number] = Lost(
-                    "every Dask worker that had it ended by itself: most often for lack of memory; "
-                    "see the workers' logs"
-                )
-                on_done(number)
-        return [results[number] for number in range(len(arguments))]
-
-    def _round(
-        self,
-        function: Callable[..., Result],
-        arguments: Mapping[int, tuple[Any, ...]],
-        done: Callable[[int, Result], None],
-    ) -> list[int]:
-        """Run tasks and tell what they return; return the numbers of those that were given up."""
         # Each call counts, though arguments may be the same.
-        with self._there():
-            futures = {
-                self._client.submit(function, *each, pure=False): i for i, each in arguments.items()
-            }
-        given_up = []
-        seen = time.monotonic()
-        while futures:
-            finished, seen = self._finished(list(futures), seen)
-            for future in finished:
-                number = futures.pop(future)
-                try:
-                    with self._there():
-                        result = future.result()
-                except _distributed().KilledWorker:
-                    given_up.append(number)
-                else:
-                    done(number, result)
-        return given_up
-
-    def _finished(self, futures: Sequence[Any], seen: float) -> tuple[set[Any], float]:
-        """Wait for some, but not for long; return them, and when workers were last seen."""
-        with self._there():
-            try:
-                done = _distributed().wait(futures, _LOOK_S, return_when="FIRST_COMPLETED").done
-            except TimeoutError:
-                done = set()
-            return done, self._still_there(seen)
+        super().__init__(client.get_executor(pure=False))
+        self._client, self._address = client, address
+        self._died = _distributed().KilledWorker
 
     @contextmanager
-    def _there(self) -> Iterator[None]:
-        """Tell in a sentence that the scheduler went away, which Dask does in many ways."""
+    def _telling(self) -> Iterator[None]:
         try:
             yield
-        except (CancelledError, _distributed().comm.CommClosedError) as error:
-            raise CampaignError(self._gone("went away")) from error
-        except Exception as error:
-            if self._client.status == "running" or isinstance(error, CampaignError):
+        except CampaignError:
+            raise
+        except Exception as error:  # Dask has many for a scheduler that went away
+            expected = isinstance(error, CancelledError | _distributed().comm.CommClosedError)
+            if self._client.status == "running" and not expected:
                 raise
             raise CampaignError(self._gone("went away")) from error
 
     def _still_there(self, seen: float) -> float:
-        """Return when workers were last seen; raise if that is too long ago."""
         now = time.monotonic()
         if self._client.status != "running":
             raise CampaignError(self._gone("went away"))
@@ -361,6 +352,10 @@ class DaskWorkers:
             f"The Dask scheduler at {self._address} {what}; look at its log and the workers', and "
             "start the campaign again, or leave --dask out."
         )
+
+
+def _distributed() -> Any:  # noqa: ANN401 - Dask has no types
+    return import_module("distributed")
 
 
 def versions() -> dict[str, str]:
@@ -402,32 +397,3 @@ def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask ha
                 f"The Dask worker at {worker} has {', '.join(other)}: install the versions of this "
                 "machine there, and start it again."
             )
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep from Dask what is told here in a sentence: what goes wrong, and versions that differ."""
-    log = logging.getLogger("distributed.client")
-    level = log.level
-    log.setLevel(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="(?s).*Mismatched versions")
-            yield
-    finally:
-        log.setLevel(level)
-
-
-def _knock(address: str) -> None:
-    """Raise an OSError if nobody listens; Dask's client would go on trying after it has failed."""
-    name = address.rsplit("://", maxsplit=1)[-1]
-    if "://" in address and not address.startswith(("tcp://", "tls://")):
-        return
-    host, _, port = name.rpartition(":")
-    if not (host and port.isdecimal()):
-        raise ValueError("no host and port")
-    socket.create_connection((host.strip("[]"), int(port)), _CONNECT_S).close()
-
-
-def _distributed() -> Any:  # noqa: ANN401 - Dask has no types
-    return import_module("distributed")

@@ -44,11 +44,17 @@ def test_one_task_whose_worker_dies_is_told_and_the_others_are_done():
     assert "memory" in lost.reason
 
 
-def test_the_first_task_of_all_may_be_the_one():
-    with process_pool(2) as pool:
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_the_first_task_of_all_may_be_the_one(jobs):
+    with process_pool(jobs) as pool:
         lost, *others = pool.run(ends_at_zero, [(n,) for n in (0, 1, 2)])
     assert isinstance(lost, Lost)
     assert others == [1, 2]
+
+
+def test_a_second_worker_that_dies_before_anything_is_done_ends_all():
+    with process_pool(1) as pool, pytest.raises(CampaignError, match="worker processes ended"):
+        pool.run(ends_at_zero, [(0,), (0,), (1,)])
 
 
 def test_a_worker_that_ends_with_nothing_to_do_is_replaced():
