@@ -1,6 +1,6 @@
 """p-values and quantiles of the distributions that the analyzer decides by.
 
-From `scipy.special`, not `scipy.stats`, which takes eight times as long to import; and only when
+From `scipy.special`, not `scipy.stats`, which takes four times as long to import; and only when
 one is asked for, since a command that prints its help needs none.
 """
 

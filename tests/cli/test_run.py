@@ -384,7 +384,7 @@ def test_a_dead_supervisor_ends_the_session_safely(start_rigd, patient, tmp_path
     "arguments", [("--help",), ("run", "hold", "--fast", "--duration", "1", "--output", "out")]
 )
 def test_no_process_of_a_session_imports_scipy(tmp_path, arguments):
-    """It would add 0.2 s to the start of every session; what is found first here cannot be."""
+    """It would add 0.15 s of processor time to every start; what is found first here cannot be."""
     (tmp_path / "scipy.py").write_text("raise SystemExit('scipy was imported')\n")
     done = subprocess.run(
         [RIGD, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path,
