@@ -116,15 +116,11 @@ def table3(campaign: Campaign, *, with_paper: bool = False) -> Table:
     rows: list[Row] = []
     for each in campaign.statistics:
         symbol, factor = _TABLE_3[each.parameter]
-        papers = paper.table3().get((each.structure, each.weighting, each.parameter))
-        theirs: dict[str, float | None] = {
-            name: None if papers is None else getattr(papers, name) for name in _STATISTICS
-        }
-        shown = {name: number(getattr(each, name), ".3f", factor) for name in _STATISTICS}
+        theirs: dict[str, float | None] = {}
         if with_paper:
-            shown = {
-                name: _beside(cell, theirs[name], ".4g", factor) for name, cell in shown.items()
-            }
+            papers = paper.table3().get((each.structure, each.weighting, each.parameter))
+            theirs = {name: getattr(papers, name, None) for name in _STATISTICS}
+        shown = {name: number(getattr(each, name), ".3f", factor) for name in _STATISTICS}
         rows.append(
             {
                 "type": each.structure,
@@ -132,11 +128,9 @@ def table3(campaign: Campaign, *, with_paper: bool = False) -> Table:
                 "parameter": Cell(
                     each.parameter, f"{symbol} *{each.at_bounds}" if each.at_bounds else symbol
                 ),
-                **shown,
+                **_beside(shown, theirs, ".4g", factor),
                 "at_bounds": each.at_bounds,
-                **(
-                    {f"paper_{name}": value for name, value in theirs.items()} if with_paper else {}
-                ),
+                **_papers(theirs),
                 "mixture": campaign.homogeneity.mixed,
             }
         )
@@ -177,22 +171,24 @@ def table4(campaign: Campaign, *, with_paper: bool = False) -> Table:
     for quantity, mode, weighting in sorted(
         {key[:3] for key in deviations}, key=lambda key: (*key[:2], weightings.index(key[2]))
     ):
-        fitted = [each for each in types if (quantity, mode, weighting, each) in deviations]
-        theirs = {each: paper.table4().get((each, weighting, quantity, mode)) for each in fitted}
+        its = (quantity, mode, weighting)
         shown = {
-            each: number(deviations[quantity, mode, weighting, each], ".3f") for each in fitted
+            each: number(deviations[*its, each], ".3f")
+            for each in types
+            if (*its, each) in deviations
         }
-        if with_paper:
-            shown = {each: _beside(cell, theirs[each], ".3f") for each, cell in shown.items()}
+        theirs = {
+            each: paper.table4().get((each, weighting, quantity, mode))
+            for each in shown
+            if with_paper
+        }
         rows.append(
             {
                 "quantity": Cell(quantity, _PEAKS[quantity].format(mode)),
                 "mode": mode,
                 "weighting": weighting,
-                **shown,
-                **(
-                    {f"paper_{each}": value for each, value in theirs.items()} if with_paper else {}
-                ),
+                **_beside(shown, theirs, ".3f"),
+                **_papers(theirs),
                 "mixture": campaign.homogeneity.mixed,
             }
         )
@@ -220,14 +216,14 @@ def table5(campaign: Campaign, *, with_paper: bool = False) -> Table:
     """Parameters and performance of the two best nominal models."""
     rows: list[Row] = []
     for model in best_models(campaign.nominal):
-        theirs = paper.table5_wmse().get((model.structure, model.weighting))
-        wmse = number(model.mean_wmse, ".3f")
+        told_wmse = paper.table5_wmse().get((model.structure, model.weighting))
+        theirs = {"wmse": told_wmse} if with_paper else {}
         rows.append(
             {
                 "type": model.structure,
                 "weighting": model.weighting,
                 **{f"{name}": value for name, value in model.parameters.items()},
-                "wmse": _beside(wmse, theirs, ".3f") if with_paper else wmse,
+                **_beside({"wmse": number(model.mean_wmse, ".3f")}, theirs, ".3f"),
                 **{
                     name: value
                     for each in model.deviations
@@ -236,7 +232,7 @@ def table5(campaign: Campaign, *, with_paper: bool = False) -> Table:
                         (f"mdr_magnitude{each.mode}_db", each.magnitude_db),
                     )
                 },
-                **({"paper_wmse": theirs} if with_paper else {}),
+                **_papers(theirs),
                 "mixture": campaign.homogeneity.mixed,
             }
         )
@@ -256,11 +252,22 @@ def table5(campaign: Campaign, *, with_paper: bool = False) -> Table:
     )  # fmt: skip
 
 
-def _beside(shown: Cell, theirs: float | None, form: str, factor: float = 1.0) -> Cell:
-    """Add the paper's number, if it has one."""
-    if theirs is None:
-        return shown
-    return replace(shown, text=f"{shown.text} ({number(theirs, form, factor).text})")
+def _beside(
+    shown: Mapping[str, Cell], theirs: Mapping[str, float | None], form: str, factor: float = 1.0
+) -> dict[str, Entry]:
+    """Add the paper's numbers that there are, in parentheses."""
+    told = {name: number(value, form, factor) for name, value in theirs.items()}
+    return {
+        name: replace(cell, text=f"{cell.text} ({told[name].text})")
+        if theirs.get(name) is not None
+        else cell
+        for name, cell in shown.items()
+    }
+
+
+def _papers(theirs: Mapping[str, float | None]) -> dict[str, Entry]:
+    """Give the paper's numbers to programs, too."""
+    return {f"paper_{name}": value for name, value in theirs.items()}
 
 
 def session_list_table(campaign: Campaign) -> Table:

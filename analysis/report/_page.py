@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import base64
-import platform
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import jinja2
 import matplotlib as mpl
-import numpy as np
 
-import rigd
+from analysis.report._document import versions as computed_by
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -77,9 +75,7 @@ def versions(made_at: datetime) -> Facts:
         "Versions",
         [
             ("report made", made_at.isoformat(timespec="seconds")),
-            ("rigd", rigd.__version__),
-            ("Python", platform.python_version()),
-            ("numpy", np.__version__),
+            *computed_by().items(),
             ("matplotlib", mpl.__version__),
         ],
     )

@@ -99,9 +99,13 @@ def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure
     magnitude.set_ylim(bottom - 5, float(modelled_db.max()) + 5)
     few = style.spread(measured.frequency_hz, _POINTS)
     phase.plot(
-        measured.frequency_hz[few], _phase_deg(seen[few]), ".", markersize=2.0, color=style.GREY
+        measured.frequency_hz[few],
+        style.phase_deg(seen[few]),
+        ".",
+        markersize=2.0,
+        color=style.GREY,
     )
-    phase.plot(band.frequency_hz, _phase_deg(band.response), color=style.BLUE)
+    phase.plot(band.frequency_hz, style.phase_deg(band.response), color=style.BLUE)
     phase.set_ylabel("Phase (°)")
     phase.set_ylim(-60, 240)
     phase.set_yticks((0, 90, 180))
@@ -172,11 +176,6 @@ def _grid(first_hz: float, last_hz: float, peaks_hz: list[float]) -> NDArray[np.
 
 def _db(values: NDArray[np.complex128] | NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(20 * np.log10(np.maximum(np.abs(values), 1e-300)))
-
-
-def _phase_deg(response: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Phase from −90° to 270°: a torque over an angle lies between 0 and 180°, well inside."""
-    return np.asarray(np.degrees(np.angle(response * -1j)) + 90.0)
 
 
 _LOSS_POINTS: Final = 400

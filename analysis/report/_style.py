@@ -198,6 +198,11 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = T
     axes.tick_params(axis="x", which="both", labelbottom=labels)
 
 
+def phase_deg(response: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Phase from −90° to 270°: a torque over an angle lies between 0 and 180°, well inside."""
+    return np.asarray(np.degrees(np.angle(response * -1j)) + 90.0)
+
+
 def limits(*values: NDArray[np.float64]) -> tuple[float, float]:
     """Axis limits round all values with a margin on either side, never empty."""
     low = min(float(v.min()) for v in values)
