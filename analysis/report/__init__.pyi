@@ -1,7 +1,6 @@
 from ._bands import loss_factors as loss_factors
 from ._bands import response_band as response_band
 from ._campaign_document import campaign_document as campaign_document
-from ._campaign_tables import campaign_tables as campaign_tables
 from ._campaign_write import write_campaign as write_campaign
 from ._document import document as document
 from ._document import document_text as document_text
@@ -12,12 +11,13 @@ from ._folder import new_folder as new_folder
 from ._folder import report_folders as report_folders
 from ._folder import write_new as write_new
 from ._frf_figure import frf_figure as frf_figure
-from ._record_page import illustrations as illustrations
+from ._record_figures import FIGURES as FIGURES
+from ._record_figures import illustrations as illustrations
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
 from ._text import analysis_tables as analysis_tables
+from ._text import campaign_tables as campaign_tables
 from ._text import record_text as record_text
 from ._text import summary_table as summary_table
-from ._write import FIGURES as FIGURES
 from ._write import figures_of_paper as figures_of_paper
 from ._write import write_report as write_report

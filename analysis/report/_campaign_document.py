@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
-import platform
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-import rigd
 from analysis.campaigns import headlines
 from analysis.models import STRUCTURES
-from analysis.report._campaign_rows import all_tables
+from analysis.report._campaign_tables import all_tables
+from analysis.report._document import finite, versions
+from analysis.report._table import json_rows
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -34,13 +31,9 @@ def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[s
         single sessions, and the tables by the names of their CSV files. Finite numbers only.
     """
     leading = campaign.homogeneity.leading
-    content: dict[str, Any] = _plain(
+    content: dict[str, Any] = finite(
         {
-            "versions": {
-                "rigd": rigd.__version__,
-                "python": platform.python_version(),
-                "numpy": np.__version__,
-            },
+            "versions": versions(),
             "headlines": headlines(campaign),
             "verdict": None if campaign.verdict is None else asdict(campaign.verdict),
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
@@ -79,7 +72,10 @@ def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[s
                 if estimate.name == each.selected
                 for mode in estimate.modes
             ],
-            **all_tables(campaign, with_paper=with_paper),
+            **{
+                name: json_rows(table)
+                for name, table in all_tables(campaign, with_paper=with_paper).items()
+            },
         }
     )
     return content
@@ -123,14 +119,3 @@ def _of_free(std: Mapping[str, float | None], free: Collection[str]) -> dict[str
 def _mode(session: SessionResult, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
     values = asdict(mode)
     return _name(session, "record", fit.structure) | {"mode": values.pop("number"), **values}
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """Copy a JSON value with null for what is not finite."""
-    if isinstance(value, dict):
-        return {str(key).rstrip("_"): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

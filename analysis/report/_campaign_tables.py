@@ -1,16 +1,15 @@
-"""Tables of a campaign for the terminal and for text files."""
+"""Tables of a campaign, for the terminal, its page, CSV and JSON.
+
+Beside the paper's Tables 3 to 5 its own numbers stand in parentheses, on request.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from rich import box
-from rich.console import Console, Group
-from rich.table import Table as RichTable
-from rich.text import Text
 
 from analysis.campaigns import (
     MIXTURE_MARK,
@@ -22,291 +21,451 @@ from analysis.campaigns import (
     lost_trials,
     percent,
     probability,
-    specimens,
     title,
     told,
     with_unit,
 )
 from analysis.models import STRUCTURES
 from analysis.report import _paper_numbers as paper
-from analysis.report._table import MARK, Column, Table, count, footnotes, number, unreported
-from analysis.report._text import with_spread
+from analysis.report._table import (
+    ABSENT,
+    WORDS,
+    Cell,
+    Column,
+    Table,
+    count,
+    estimate,
+    footnotes,
+    greyed,
+    marked,
+    number,
+    unreported,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    import rich.table
-    from rich.console import RenderableType
-    from rich.table import Table as RichTable
+    from collections.abc import Callable, Collection, Mapping
 
     from analysis.campaigns import (
         Campaign,
-        CampaignVerdict,
         Heterogeneity,
         Homogeneity,
         PooledEstimate,
+        PooledParameter,
+        RankedStructure,
+        SessionResult,
+    )
+    from analysis.report._table import Entry
+
+    Row = Mapping[str, Entry]
+
+_NAMES: Final = (Column("type", "type", WORDS), Column("weights", "weighting", WORDS))
+
+
+def shown_tables(campaign: Campaign) -> tuple[Table, ...]:
+    """Tables of the whole records that terminal and page show, what matters most first."""
+    found = campaign.homogeneity
+    estimates = likely_estimates(campaign)
+    scatter = [homogeneity_table(campaign)] if found.quantities else []
+    return (
+        session_list_table(campaign),
+        *([specimens_table(campaign)] if len(found.specimens) > 1 else []),
+        *(scatter if found.mixed else []),
+        *(pooled_table(campaign, each) for each in estimates[:1]),
+        *([modes_table(campaign)] if campaign.headline and campaign.headline.modes else []),
+        *(pooled_table(campaign, each) for each in estimates[1:]),
+        *([structures_table(campaign)] if campaign.structures else []),
+        *([validation_summary(campaign)] if campaign.validation else []),
+        *([] if found.mixed else scatter),
     )
 
 
-def text_table(title: str) -> RichTable:
-    """Make a table without rows, as wide as its title at least."""
-    return RichTable(
-        min_width=len(title),
-        title=Text(title, style="bold"), title_justify="left", caption_justify="left",
-        box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
+def paper_tables(campaign: Campaign, *, with_paper: bool = False) -> tuple[Table, ...]:
+    """Tables 3 to 5, if there are Welch fits; on request with the paper's own numbers beside."""
+    if not campaign.nominal:
+        return ()
+    return tuple(make(campaign, with_paper=with_paper) for make in (table3, table4, table5))
+
+
+def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Table]:
+    """Every table of the files by its name, without those that are empty."""
+    made = (
+        *paper_tables(campaign, with_paper=with_paper),
+        session_list_table(campaign),
+        sessions_welch_table(campaign),
+        sessions_record_table(campaign),
+        structures_table(campaign),
+        *([specimens_table(campaign)] if len(campaign.homogeneity.specimens) > 1 else []),
+        homogeneity_table(campaign),
+        pooled_table(campaign),
+        modes_table(campaign),
+        validation_table(campaign),
+    )
+    return {table.name: table for table in made if table.rows}
+
+
+_STATISTICS: Final = ("mean", "median", "std", "min", "max")
+_TABLE_3: Final = {"zeta": ("ζ (10⁻⁴)", 1e4), "alpha": ("α", 1.0), "gamma": ("γ (10⁻¹)", 10.0),
+                   "lambda": ("λ", 1.0)}  # fmt: skip
+"""Heading and factor of each parameter, the powers of ten of the paper's Table 3."""
+_ON_THE_EDGE: Final = "*n: in n sessions on the edge of the range searched."
+_IN_PARENTHESES: Final = "In parentheses: the paper's."
+
+
+def table3(campaign: Campaign, *, with_paper: bool = False) -> Table:
+    """Statistics of the parameters."""
+    rows: list[Row] = []
+    for each in campaign.statistics:
+        symbol, factor = _TABLE_3[each.parameter]
+        theirs: dict[str, float | None] = {}
+        if with_paper:
+            papers = paper.table3().get((each.structure, each.weighting, each.parameter))
+            theirs = {name: getattr(papers, name, None) for name in _STATISTICS}
+        shown = {name: number(getattr(each, name), ".3f", factor) for name in _STATISTICS}
+        rows.append(
+            {
+                "type": each.structure,
+                "weighting": each.weighting,
+                "parameter": Cell(
+                    each.parameter, f"{symbol} *{each.at_bounds}" if each.at_bounds else symbol
+                ),
+                **_beside(shown, theirs, ".4g", factor),
+                "at_bounds": each.at_bounds,
+                **_papers(theirs),
+                "mixture": campaign.homogeneity.mixed,
+            }
+        )
+    return Table(
+        "table3",
+        title(
+            f"Parameters over {len(campaign.sessions)} sessions (Table 3)",
+            campaign.homogeneity,
+        ),
+        (
+            *_NAMES,
+            Column("parameter", "parameter", WORDS),
+            *(Column(name, name) for name in _STATISTICS),
+        ),
+        tuple(rows),
+        (
+            *([_ON_THE_EDGE] if any(each.at_bounds for each in campaign.statistics) else []),
+            *([_IN_PARENTHESES] if with_paper else []),
+        ),
+        grouped=True,
+    )
+
+
+_PEAKS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{} (dB)"}
+
+
+def table4(campaign: Campaign, *, with_paper: bool = False) -> Table:
+    """Mean deviation of the resonant peaks; types in columns, as in the paper."""
+    types = list(dict.fromkeys(model.structure for model in campaign.nominal))
+    weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
+    deviations = {
+        (quantity, each.mode, model.weighting, model.structure): getattr(each, quantity)
+        for quantity in _PEAKS
+        for model in campaign.nominal
+        for each in model.deviations
+    }
+    rows: list[Row] = []
+    for quantity, mode, weighting in sorted(
+        {key[:3] for key in deviations}, key=lambda key: (*key[:2], weightings.index(key[2]))
+    ):
+        its = (quantity, mode, weighting)
+        shown = {
+            each: number(deviations[*its, each], ".3f")
+            for each in types
+            if (*its, each) in deviations
+        }
+        theirs = {
+            each: paper.table4().get((each, weighting, quantity, mode))
+            for each in shown
+            if with_paper
+        }
+        rows.append(
+            {
+                "quantity": Cell(quantity, _PEAKS[quantity].format(mode)),
+                "mode": mode,
+                "weighting": weighting,
+                **_beside(shown, theirs, ".3f"),
+                **_papers(theirs),
+                "mixture": campaign.homogeneity.mixed,
+            }
+        )
+    return Table(
+        "table4",
+        title(
+            "Mean deviation of the resonant peaks from the nominal model's (MDR, Table 4)",
+            campaign.homogeneity,
+        ),
+        (
+            Column("peak", "quantity", WORDS),
+            Column("weights", "weighting", WORDS),
+            *(Column(f"type {each}", each) for each in types),
+        ),
+        tuple(rows),
+        (
+            "A nominal model has the mean of the sessions' parameters.",
+            *([_IN_PARENTHESES] if with_paper else []),
+        ),
+        grouped=True,
+    )
+
+
+def table5(campaign: Campaign, *, with_paper: bool = False) -> Table:
+    """Parameters and performance of the two best nominal models."""
+    rows: list[Row] = []
+    for model in best_models(campaign.nominal):
+        told_wmse = paper.table5_wmse().get((model.structure, model.weighting))
+        theirs = {"wmse": told_wmse} if with_paper else {}
+        rows.append(
+            {
+                "type": model.structure,
+                "weighting": model.weighting,
+                **{f"{name}": value for name, value in model.parameters.items()},
+                **_beside({"wmse": number(model.mean_wmse, ".3f")}, theirs, ".3f"),
+                **{
+                    name: value
+                    for each in model.deviations
+                    for name, value in (
+                        (f"mdr_omega{each.mode}_rad_s", each.frequency_rad_s),
+                        (f"mdr_magnitude{each.mode}_db", each.magnitude_db),
+                    )
+                },
+                **_papers(theirs),
+                "mixture": campaign.homogeneity.mixed,
+            }
+        )
+    return Table(
+        "table5",
+        title(
+            "The two best nominal models (Table 5; their peaks are in Table 4)",
+            campaign.homogeneity,
+        ),
+        (
+            *_NAMES, Column("α", "alpha", ".3f"), Column("ζ (10⁻⁵)", "zeta", ".2f", 1e5),
+            Column("λ", "lambda", ".3f"), Column("γ (10⁻²)", "gamma", ".2f", 1e2),
+            Column("WMSE ((N·m/rad)²)", "wmse"),
+        ),
+        tuple(rows),
+        (_IN_PARENTHESES,) if with_paper else (),
     )  # fmt: skip
 
 
-_CAPTION: Final = "Sessions, as their files state them"
-_COLUMNS: Final = {
-    "file": "file",
-    "start_utc": "recorded (UTC)",
-    "specimen": "specimen",
-    "operator": "operator",
-    "note": "note",
-    "used": "used",
-}
-"""Key in CSV and JSON → heading."""
-
-_ABSENT: Final = "–"
-
-
-def session_list_rows(campaign: Campaign) -> list[dict[str, Any]]:
-    """List all files, those that were left out behind the others.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    """
-    return [
-        {
-            "file": str(each.path),
-            "start_utc": said.start_utc if said else "",
-            "specimen": said.label if said else "",
-            "operator": said.operator if said else "",
-            "note": said.note if said else "",
-            "used": used,
-        }
-        for used, group in ((True, campaign.sessions), (False, campaign.failures))
-        for each in group
-        for said in (each.experiment,)
-    ]
+def _beside(
+    shown: Mapping[str, Cell], theirs: Mapping[str, float | None], form: str, factor: float = 1.0
+) -> dict[str, Entry]:
+    """Add the paper's numbers that there are, in parentheses."""
+    told = {name: number(value, form, factor) for name, value in theirs.items()}
+    return {
+        name: replace(cell, text=f"{cell.text} ({told[name].text})")
+        if theirs.get(name) is not None
+        else cell
+        for name, cell in shown.items()
+    }
 
 
-def session_list_text(campaign: Campaign) -> rich.table.Table:
-    """Make the table for the terminal."""
-    table = text_table(_CAPTION)
-    for heading in _COLUMNS.values():
-        table.add_column(heading)
-    for cells in _cells(campaign):
-        table.add_row(*map(Text, cells))
-    return table
+def _papers(theirs: Mapping[str, float | None]) -> dict[str, Entry]:
+    """Give the paper's numbers to programs, too."""
+    return {f"paper_{name}": value for name, value in theirs.items()}
 
 
 def session_list_table(campaign: Campaign) -> Table:
-    """Make the table for the page."""
-    return Table(
-        name="session_list",
-        caption=_CAPTION,
-        columns=tuple(Column(heading, key, numeric=False) for key, heading in _COLUMNS.items()),
-        rows=tuple(_cells(campaign)),
-    )
+    """All files, those that were left out behind the others."""
 
+    def said(text: str) -> Cell:
+        return Cell(text, text or ABSENT)
 
-def _cells(campaign: Campaign) -> list[tuple[str, ...]]:
-    paths = [each.path for each in campaign.sessions]
-    paths += [each.path for each in campaign.failures]
-    return [
+    headings = ("file", "recorded (UTC)", "specimen", "operator", "note", "used")
+    keys = ("file", "start_utc", "specimen", "operator", "note", "used")
+    return Table.of(
+        "session_list",
+        "Sessions, as their files state them",
+        [Column(heading, key, WORDS) for heading, key in zip(headings, keys, strict=True)],
         (
-            path.name,
-            *(str(row[key]) or _ABSENT for key in ("start_utc", "specimen", "operator", "note")),
-            "yes" if row["used"] else "no",
-        )
-        for path, row in zip(paths, session_list_rows(campaign), strict=True)
-    ]
-
-
-_FACTORS: Final = {"zeta": ("ζ (1e-4)", 1e4), "alpha": ("α", 1.0), "gamma": ("γ (1e-1)", 10.0),
-                   "lambda": ("λ", 1.0)}  # fmt: skip
-"""Heading and factor of each parameter, the powers of ten of the paper's Table 3."""
-_STATISTICS: Final = ("mean", "median", "std", "min", "max")
-NO_VERDICT: Final = (
-    "No verdict on the whole records: it takes two sessions that determine a structure's damping."
-)
-NOT_POOLED: Final = (
-    "in grey: not pooled, since fewer than two sessions determine its damping, or not all tried it"
-)
-
-
-def campaign_tables(campaign: Campaign, *, with_paper: bool = False) -> RenderableType:
-    """Return the verdict, what it rests on, and the paper's Tables 3 to 5."""
-    parts: list[RenderableType] = []
-    if campaign.verdict is not None:
-        parts.extend((verdict_text(campaign.verdict), ""))
-    else:
-        for sentence in without_verdict(campaign):
-            parts.extend((Text(sentence, style="bold"), ""))
-    parts.extend((session_list_text(campaign), ""))
-    found = campaign.homogeneity
-    if len(found.specimens) > 1:
-        parts.extend((specimens_text_table(found), ""))
-    if found.mixed:
-        parts.extend((scatter_text_table(found), ""))
-    withheld = campaign.verdict.withheld if campaign.verdict else ()
-    for estimate in likely_estimates(campaign):
-        parts.extend((pooled_table(estimate, campaign, withheld), ""))
-    if campaign.structures:
-        parts.extend((candidates_table(campaign), ""))
-    if campaign.validation:
-        parts.extend((validation_table(campaign), ""))
-    if campaign.nominal:
-        parts.extend(
             (
-                statistics_table(campaign, with_paper=with_paper), "",
-                peaks_table(campaign, with_paper=with_paper), "",
-                best_table(campaign, with_paper=with_paper), "",
+                Cell(str(each.path), each.path.name),
+                said(its.start_utc if its else ""),
+                said(its.label if its else ""),
+                said(its.operator if its else ""),
+                said(its.note if its else ""),
+                used,
             )
-        )  # fmt: skip
-    parts.extend(
-        Text(f"Warning: {session.path.name}: {warning}", style="yellow")
-        for session in campaign.sessions
-        for warning in session.warnings
+            for used, group in ((True, campaign.sessions), (False, campaign.failures))
+            for each in group
+            for its in (each.experiment,)
+        ),
     )
-    return Group(*parts)
 
 
-def without_verdict(campaign: Campaign) -> list[str]:
-    """Say what a verdict would have said first, and why there is none."""
-    asked = any(each.record_estimates for each in campaign.sessions)
-    return [
-        *specimens(campaign.homogeneity),
-        *([NO_VERDICT] if asked else []),
-        *lost_trials(campaign.lost_trials, campaign.trials),
+def sessions_welch_table(campaign: Campaign) -> Table:
+    """Every session's fits by the paper's route, and the nominal models' distance from it."""
+    rows = [
+        {
+            "file": str(session.path),
+            "type": fit.structure,
+            "weighting": fit.weighting,
+            **fit.parameters,
+            "cost": fit.cost,
+            "at_bounds": " ".join(fit.at_bounds),
+            **{f"nominal_{name}": value for name, value in asdict(model.indices[place]).items()},
+        }
+        for place, session in enumerate(campaign.sessions)
+        for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
     ]
+    return _for_programs("sessions_welch", rows)
 
 
-def tables_text(campaign: Campaign, *, with_paper: bool = False, width: int = 120) -> str:
-    """Return the same as plain text, with the files that were left out."""
-    console = Console(width=width, color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(campaign_tables(campaign, with_paper=with_paper))
-        for failure in campaign.failures:
-            console.print(Text(f"Left out: {failure.message}"))
-    return capture.get()
+def sessions_record_table(campaign: Campaign) -> Table:
+    """Every session's whole-record fits."""
+    rows = [
+        {
+            "file": str(session.path),
+            "type": each.structure,
+            "uniform": each.uniform,
+            **each.parameters,
+            **{
+                f"{name}_std": value if name in each.free else None
+                for name, value in each.std.items()
+            },
+            "cost": each.cost,
+            "degrees_of_freedom": each.degrees_of_freedom,
+            "bic": each.bic,
+            "at_bounds": " ".join(each.at_bounds),
+        }
+        for session in campaign.sessions
+        for each in session.record_estimates
+    ]
+    return _for_programs("sessions_record", rows)
 
 
-def statistics_table(campaign: Campaign, *, with_paper: bool) -> RichTable:
-    """Table 3; the paper's numbers follow in parentheses."""
-    count = len(campaign.sessions)
-    table = text_table(title(f"Parameters over {count} sessions (Table 3)", campaign.homogeneity))
-    for heading in ("type", "weights", "parameter", *_STATISTICS):
-        table.add_column(heading, justify="right" if heading in _STATISTICS else "left")
-    for place, each in enumerate(campaign.statistics):
-        heading, factor = _FACTORS[each.parameter]
-        told = paper.table3().get((each.structure, each.weighting, each.parameter))
-        cells = []
-        for name in _STATISTICS:
-            text = f"{factor * getattr(each, name):.3f}"
-            if with_paper and told is not None:
-                text += f" ({factor * getattr(told, name):.4g})"
-            cells.append(text)
-        rest = f" *{each.at_bounds}" if each.at_bounds else ""
-        following = campaign.statistics[place + 1 : place + 2]
-        table.add_row(
-            each.structure, each.weighting, heading + rest, *cells,
-            end_section=not following or following[0].structure != each.structure,
-        )  # fmt: skip
-    notes = ["in parentheses: the paper's"] if with_paper else []
-    if any(each.at_bounds for each in campaign.statistics):
-        notes.append("*n: in n sessions on the edge of the range searched")
-    table.caption = "; ".join(notes) or None
-    return table
+def _for_programs(name: str, rows: list[dict[str, Any]]) -> Table:
+    """Make a table of files only."""
+    return Table(name, "", (), tuple(rows))
 
 
-def peaks_table(campaign: Campaign, *, with_paper: bool) -> RichTable:
-    """Table 4: mean deviation of the resonant peaks from those of the nominal models."""
-    table = text_table(
-        title(
-            "Mean deviation of the resonant peaks from the nominal model's (Table 4)",
-            campaign.homogeneity,
-        )
+NOT_POOLED: Final = (
+    "In grey: not pooled, since fewer than two sessions determine its damping, or not all tried it."
+)
+
+
+def structures_table(campaign: Campaign) -> Table:
+    """All structures on all whole records together, those pooled first, the lowest BIC first."""
+
+    def row(each: RankedStructure) -> Row:
+        grey: Callable[[Cell], Cell] = (lambda cell: cell) if each.pooled else greyed
+        return {
+            "type": Cell(each.structure, each.name),
+            "uniform": each.uniform,
+            "fitted": grey(count(each.fitted)),
+            "sessions": grey(count(each.determined)),
+            "bic_above_lowest": grey(number(each.bic_above_lowest, ".1f")),
+            "misfit": grey(number(each.misfit)),
+            "selected_alone": grey(count(each.selected_alone)),
+            "pooled": each.pooled,
+        }
+
+    return Table(
+        "structures",
+        title("Structures on the whole records of all sessions together", campaign.homogeneity),
+        (
+            Column("type", "type", WORDS),
+            Column("sessions fitted", "fitted"),
+            Column("that determine it", "sessions"),
+            Column("that select it alone", "selected_alone"),
+            Column("BIC above the lowest", "bic_above_lowest"),
+            Column("residual (noise = 1)", "misfit"),
+        ),
+        tuple(map(row, campaign.structures)),
+        (
+            "Damping and the modes' offsets are the specimen's, one value for all sessions (and a "
+            "scatter between them, where they differ); settings of the rig are each session's.",
+            *(() if all(each.pooled for each in campaign.structures) else (NOT_POOLED,)),
+        ),
+        selected=0 if campaign.pooled else None,
     )
-    for heading in ("type", "weights"):
-        table.add_column(heading)
-    modes = len(campaign.nominal[0].deviations)
-    for quantity in ("ω{} (rad/s)", "M{} (dB)"):
-        for mode in range(1, modes + 1):
-            table.add_column(quantity.format(mode), justify="right")
-    for model in campaign.nominal:
-        cells = []
-        for quantity in ("frequency_rad_s", "magnitude_db"):
-            for deviation in model.deviations:
-                value = getattr(deviation, quantity)
-                text = f"{value:.3f}" if math.isfinite(value) else _ABSENT
-                key = (model.structure, model.weighting, quantity, deviation.mode)
-                if with_paper and key in paper.table4():
-                    text += f" ({paper.table4()[key]:.3f})"
-                cells.append(text)
-        last = model.weighting == campaign.nominal[-1].weighting
-        table.add_row(model.structure, model.weighting, *cells, end_section=last)
-    table.caption = "in parentheses: the paper's" if with_paper else None
-    return table
 
 
-def best_table(campaign: Campaign, *, with_paper: bool) -> RichTable:
-    """Table 5: parameters and weighted error of the two best nominal models."""
-    table = text_table(
-        title("The two best nominal models (Table 5; peaks in Table 4)", campaign.homogeneity)
+def specimens_table(campaign: Campaign) -> Table:
+    """Specimens as the files state them, the one of this campaign first."""
+    specimens = campaign.homogeneity.specimens
+    return Table(
+        "specimens",
+        "Specimens, as the files state them",
+        (
+            Column("this report's", "here", WORDS),
+            *(Column(key, key, WORDS) for key in in_dispute(specimens)),
+            Column("files", "files"),
+            Column("their names", "names", WORDS),
+        ),
+        tuple(
+            {
+                **{key: Cell(value, told(key, value)) for key, value in each.facts.items()},
+                "files": len(each.paths),
+                "here": each is specimens[0],
+                "names": Cell(
+                    " ".join(path.name for path in each.paths),
+                    ", ".join(path.name for path in each.paths),
+                ),
+            }
+            for each in specimens
+        ),
+        selected=0,
     )
-    for heading in ("type", "weights", "α", "ζ (1e-5)", "λ", "γ (1e-2)", "WMSE ((N·m/rad)²)"):
-        table.add_column(heading, justify="left" if heading in ("type", "weights") else "right")
-    for model in best_models(campaign.nominal):
-        values = model.parameters
-        told = paper.table5_wmse().get((model.structure, model.weighting))
-        table.add_row(
-            model.structure, model.weighting, f"{values['alpha']:.3f}",
-            f"{1e5 * values['zeta']:.2f}", f"{values['lambda']:.3f}",
-            f"{1e2 * values['gamma']:.2f}",
-            f"{model.mean_wmse:.3f}" + (f" ({told:.3f})" if with_paper and told else ""),
-        )  # fmt: skip
-    return table
 
 
-def verdict_text(verdict: CampaignVerdict) -> Text:
-    """Write the verdict, one sentence a line, and what would tell more."""
-    first, *others = verdict.sentences
-    text = Text(first, style="bold")
-    for sentence in others:
-        text.append(f"\n{sentence}", style="not bold")
-    if verdict.experiments:
-        text.append("\nWhat would tell more:", style="not bold")
-        for advice in verdict.experiments:
-            text.append(f"\n  {advice}", style="not bold")
-    return text
+def homogeneity_table(campaign: Campaign) -> Table:
+    """Scatter of each mode and parameter between sessions."""
+    found = campaign.homogeneity
+
+    def row(each: Heterogeneity) -> Row:
+        _, factor, _ = label(each.quantity)
+        return {
+            "quantity": Cell(
+                each.quantity, _marked(with_unit(each.quantity), each.quantity, found)
+            ),
+            "sessions": len(each.values),
+            "mean": number(each.mean, f".{_digits(each)}f", factor),
+            "between_std": number(each.between_std, ".2g", factor),
+            "between_in_own_std": each.own_stds,
+            "cochran_q": each.cochran_q,
+            "i_squared": replace(number(each.i_squared), text=percent(each.i_squared)),
+            "chance": _chance(each.chance),
+            "mixture": each.mixed,
+        }
+
+    return Table(
+        "homogeneity",
+        f"Sessions compared{f', all by type {found.structure}' if found.structure else ''}",
+        (
+            Column("quantity", "quantity", WORDS), Column("sessions", "sessions"),
+            Column("mean", "mean"), Column("between sessions", "between_std"),
+            Column("in own std", "between_in_own_std", ".3g"),
+            Column("Cochran's Q", "cochran_q", ".3g"),
+            Column("I²", "i_squared"), Column("p", "chance"),
+        ),
+        tuple(map(row, found.quantities)),
+        (
+            "Between sessions: scatter beyond their own uncertainties. I²: share of the variance "
+            "that is such scatter. p: probability of so much by the uncertainties alone.",
+            *([MIXTURE_NOTE] if found.mixed else []),
+        ),
+    )  # fmt: skip
 
 
-def candidates_table(campaign: Campaign) -> RichTable:
-    """All structures fitted, those pooled first, the lowest BIC first."""
-    table = text_table(
-        title("Structures on the whole records of all sessions together", campaign.homogeneity)
-    )
-    table.add_column("type")
-    for heading in ("fitted", "determined", "BIC above the lowest", "residual (noise = 1)",
-                    "selected alone"):  # fmt: skip
-        table.add_column(heading, justify="right")
-    for each in campaign.structures:
-        bic = each.bic_above_lowest
-        table.add_row(
-            each.name, str(each.fitted), str(each.determined),
-            _ABSENT if bic is None else f"{bic:.1f}", f"{each.misfit:.4g}",
-            str(each.selected_alone), style="" if each.pooled else "dim",
-        )  # fmt: skip
-    table.caption = (
-        "in how many sessions it was fitted, determines its damping, and has the lowest BIC alone"
-    )
-    if not all(each.pooled for each in campaign.structures):
-        table.caption += f"; {NOT_POOLED}"
-    return table
+def _digits(each: Heterogeneity) -> int:
+    """Decimals that show the scatter, or what a session states as its uncertainty."""
+    _, factor, _ = label(each.quantity)
+    seen = factor * max(each.between_std, min(std for _, _, std in each.values))
+    return min(max(1 - math.floor(math.log10(seen)), 0), 9)
+
+
+def _chance(chance: float) -> Cell:
+    return replace(number(chance), text=probability(chance))
+
+
+def _marked(text: str, quantity: str, found: Homogeneity) -> str:
+    return f"{text} {MIXTURE_MARK}" if found.is_mixed(quantity) else text
 
 
 def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
@@ -315,178 +474,230 @@ def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
     return list(found.values())
 
 
-def role(estimate: PooledEstimate, campaign: Campaign) -> str:
-    """Say what an estimate shown is for."""
-    if estimate is campaign.headline:
-        return "freest structure"
-    return "lowest BIC, conditional on its being the true one"
-
-
 def used(estimate: PooledEstimate, campaign: Campaign) -> str:
     """Say of how many sessions an estimate is, and of how many it is not."""
     every = len(campaign.sessions)
     return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
 
 
-def pooled_table(
-    estimate: PooledEstimate, campaign: Campaign, withheld: Collection[str] = ()
-) -> RichTable:
-    """Pooled whole-record estimate of one structure; orders withheld and mixtures are marked."""
-    found = campaign.homogeneity
-    table = text_table(
-        title(
-            f"Pooled whole-record estimate, type {estimate.name}, {used(estimate, campaign)} "
-            f"({role(estimate, campaign)}); residual {estimate.misfit:.4g} times the noise",
-            found,
-        )
-    )
-    table.add_column("parameter")
-    for heading in ("pooled ±std", "95 % interval", "one session's std", "between sessions", "p"):
-        table.add_column(heading, justify="right")
-    doubtful = unreported(STRUCTURES[estimate.structure], withheld)
-    for each in estimate.parameters:
-        _, factor, _ = label(each.name)
-        low, high = (factor * end for end in each.interval)
-        digits = max(2 - math.floor(math.log10(max(high - low, 1e-12))), 0)
-        marked = each.name in doubtful
-        marks = (MARK if marked else "") + (MIXTURE_MARK if found.is_mixed(each.name) else "")
-        table.add_row(
-            f"{with_unit(each.name)} {marks}".rstrip(),
-            with_spread(factor * each.value, factor * each.std),
-            f"{low:.{digits}f} … {high:.{digits}f}",
-            f"{factor * each.within_std:.2g}", f"{factor * each.between_std:.2g}",
-            probability(each.chance), style="dim" if marked else "",
-        )  # fmt: skip
-    notes = footnotes(withheld) if doubtful else ()
-    if any(found.is_mixed(each.name) for each in estimate.parameters):
-        notes = (*notes, MIXTURE_NOTE)
-    table.caption = " ".join(notes) or None
-    return table
+def pooled_table(campaign: Campaign, only: PooledEstimate | None = None) -> Table:
+    """Pooled whole-record estimates, the headline's first, then the lowest BIC first.
 
-
-def validation_table(campaign: Campaign) -> RichTable:
-    """Errors of left-out sessions, the best model first."""
-    table = text_table("Each session predicted from the others: rms error of the torque, %")
-    for heading in ("method", "type", "weights"):
-        table.add_column(heading)
-    for heading in ("sessions", "mean", "worst", "own fit"):
-        table.add_column(heading, justify="right")
-    for method, structure, weighting, errors in by_model(campaign.validation):
-        values = 100 * np.array([each.error for each in errors])
-        own = [each.own_error for each in errors if each.own_error is not None]
-        table.add_row(
-            method, structure, weighting or "", f"{values.size} of {campaign.trials}",
-            f"{values.mean():.2f}", f"{values.max():.2f}",
-            f"{100 * float(np.mean(own)):.2f}" if own else _ABSENT,
-        )  # fmt: skip
+    Parameters
+    ----------
+    campaign : Campaign
+    only : PooledEstimate, optional
+        The one to be shown. Without it, as in the files, all of them, and behind them what is not
+        pooled, without values.
+    """
+    withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    found, headline = campaign.homogeneity, campaign.headline
+    columns = (
+        Column("parameter", "parameter", WORDS),
+        Column("pooled", "value"), Column("std", "std", spread=True),
+        Column("95 % from", "low_95"), Column("to", "high_95"),
+        Column("one session's std", "within_std"), Column("between sessions", "between_std"),
+        Column("p", "chance"),
+    )  # fmt: skip
+    if only is None:
+        pooled = sorted(campaign.pooled, key=lambda each: each is not headline)
+        rows = [
+            _pooled_row(estimate, each, campaign, withheld)
+            for estimate in pooled
+            for each in estimate.parameters
+        ]
+        rows += [
+            {
+                "type": each.structure,
+                "uniform": each.uniform,
+                "name": each.name,
+                "headline": False,
+                "sessions": each.determined,
+                "misfit": each.misfit,
+                "parameter": parameter,
+                "reported": False,
+            }
+            for each in campaign.structures
+            if not each.pooled
+            for parameter in STRUCTURES[each.structure].free
+        ]
+        return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
+    role = "freest structure"
+    if only is not headline:
+        role = "lowest BIC, conditional on its being the true one"
     notes = [
-        "own fit: of the session's own whole-record fit, noise included",
-        *lost_trials(campaign.lost_trials, campaign.trials),
+        "One session's std: what a session states as its own. Between sessions: scatter beyond "
+        "that. p: probability of so much scatter by the sessions' own uncertainties alone. "
+        f"Residual {only.misfit:.4g} times the noise."
     ]
-    table.caption = ". ".join(notes)
-    return table
-
-
-_SPECIMENS: Final = "Specimens, as the files state them"
-_SCATTER_NOTE: Final = (
-    "Between sessions: scatter beyond their own uncertainties. I²: share of the variance that is "
-    "such scatter. p: probability of so much by the uncertainties alone."
-)
-
-
-def specimens_text_table(found: Homogeneity) -> rich.table.Table:
-    """Specimens that the files state, the one of this campaign first."""
-    table = text_table(_SPECIMENS)
-    for heading in _specimen_headings(found):
-        table.add_column(heading)
-    for row in _specimen_cells(found):
-        table.add_row(*row)
-    return table
-
-
-def specimens_table(found: Homogeneity) -> Table:
-    """Make the same for the page."""
-    headings = _specimen_headings(found)
+    if unreported(STRUCTURES[only.structure], withheld):
+        notes += footnotes(withheld)
+    if any(found.is_mixed(each.name) for each in only.parameters):
+        notes.append(MIXTURE_NOTE)
     return Table(
-        name="specimens",
-        caption=_SPECIMENS,
-        columns=tuple(Column(heading, heading, numeric=False) for heading in headings),
-        rows=tuple(_specimen_cells(found)),
-        selected=0,
+        f"pooled_{only.name.replace(', ', '_').replace(' ', '_')}",
+        title(f"Pooled over {used(only, campaign)}: type {only.name} ({role})", found),
+        columns,
+        tuple(_pooled_row(only, each, campaign, withheld) for each in only.parameters),
+        tuple(notes),
     )
 
 
-def _specimen_headings(found: Homogeneity) -> tuple[str, ...]:
-    return ("specimen", *in_dispute(found.specimens), "files", "their names")
+def _pooled_row(
+    pooled: PooledEstimate, each: PooledParameter, campaign: Campaign, withheld: Collection[str]
+) -> Row:
+    found = campaign.homogeneity
+    _, factor, _ = label(each.name)
+    value, std, low, high = estimate((each.value, each.std, *each.interval), each.std, factor)
+    reported = each.name not in unreported(STRUCTURES[pooled.structure], withheld)
+    if not reported:
+        value = marked(value)
+    else:
+        # Let the eye stop at what can be used only.
+        value = greyed(value) if found.is_mixed(each.name) else replace(value, strong=True)
+    return {
+        "type": pooled.structure,
+        "uniform": pooled.uniform,
+        "name": pooled.name,
+        "headline": pooled is campaign.headline,
+        "sessions": pooled.sessions,
+        "bic": pooled.bic,
+        "misfit": pooled.misfit,
+        "parameter": Cell(each.name, _marked(with_unit(each.name), each.name, found)),
+        "value": value,
+        "std": std,
+        "low_95": low,
+        "high_95": high,
+        "within_std": number(each.within_std, ".2g", factor),
+        "between_std": number(each.between_std, ".2g", factor),
+        "chance": _chance(each.chance),
+        "next_low_95": each.next_interval[0],
+        "next_high_95": each.next_interval[1],
+        "reported": reported,
+        "mixture": found.is_mixed(each.name),
+    }
 
 
-def _specimen_cells(found: Homogeneity) -> list[tuple[str, ...]]:
-    keys = in_dispute(found.specimens)
-    return [
-        (
-            f"{place}" if place > 1 else "1 (this report)",
-            *(told(key, each.facts[key]) for key in keys),
-            str(len(each.paths)),
-            ", ".join(path.name for path in each.paths),
+def modes_table(campaign: Campaign) -> Table:
+    """Modes over all sessions, of the structure that the numbers are of."""
+    found = campaign.homogeneity
+    rows: list[Row] = []
+    for mode in campaign.headline.modes if campaign.headline else ():
+        shown: dict[str, Entry] = {"number": mode.number}
+        for name, std, between, factor in (
+            ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
+            ("damping_ratio", "damping_ratio_std", "damping_ratio_between_std", 100.0),
+        ):
+            its = getattr(mode, std)
+            mean, shown[std] = estimate((getattr(mode, name), its), its, factor)
+            text = _marked(mean.text, f"{name}_{mode.number}", found)
+            shown[name] = replace(mean, text=text)
+            shown[between] = number(getattr(mode, between), ".2g", factor)
+        rows.append(
+            {
+                **{name: shown[name] for name in asdict(mode)},
+                "frequency_mixture": found.is_mixed(f"frequency_hz_{mode.number}"),
+                "damping_ratio_mixture": found.is_mixed(f"damping_ratio_{mode.number}"),
+            }
         )
-        for place, each in enumerate(found.specimens, start=1)
-    ]
-
-
-def scatter_text_table(found: Homogeneity) -> rich.table.Table:
-    """Scatter of each mode and parameter between sessions."""
-    table = text_table(_scatter(found))
-    table.add_column("quantity")
-    for heading in ("sessions", "mean", "between sessions", "in own std", "Q", "I²", "p"):
-        table.add_column(heading, justify="right")
-    for each in found.quantities:
-        _, factor, _ = label(each.quantity)
-        table.add_row(
-            _name(each), str(len(each.values)), f"{factor * each.mean:.{_digits(each)}f}",
-            f"{factor * each.between_std:.2g}", f"{each.own_stds:.3g}", f"{each.cochran_q:.3g}",
-            percent(each.i_squared), probability(each.chance),
-        )  # fmt: skip
-    table.caption = MIXTURE_NOTE
-    return table
-
-
-def scatter_table(found: Homogeneity) -> Table:
-    """Make the same for the page."""
+    mixed = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
     return Table(
-        name="homogeneity",
-        caption=_scatter(found),
-        columns=(
-            Column("quantity", "quantity", numeric=False), Column("sessions", "sessions"),
-            Column("mean", "mean"), Column("between sessions", "between_std"),
-            Column("in own std", "between_in_own_std"), Column("Cochran's Q", "cochran_q"),
-            Column("I²", "i_squared"), Column("p", "chance"),
+        "pooled_modes",
+        title("Modes of the beam on a motor that stands still, mean of the sessions", found),
+        (
+            Column("mode", "number"),
+            Column("frequency (Hz)", "frequency_hz"),
+            Column("std", "frequency_std_hz", spread=True),
+            Column("between sessions", "frequency_between_std_hz"),
+            Column("damping ratio (%)", "damping_ratio"),
+            Column("std", "damping_ratio_std", spread=True),
+            Column("between sessions", "damping_ratio_between_std"),
         ),
-        rows=tuple(
-            (
-                _name(each), count(len(each.values)),
-                number(each.mean, f".{_digits(each)}f", label(each.quantity)[1]),
-                number(each.between_std, ".2g", label(each.quantity)[1]),
-                number(each.own_stds, ".3g"), number(each.cochran_q, ".3g"),
-                replace(number(each.i_squared, ".3g"), text=percent(each.i_squared)),
-                replace(number(each.chance, ".2g"), text=probability(each.chance)),
-            )
-            for each in found.quantities
+        tuple(rows),
+        (MIXTURE_NOTE,) if mixed else (),
+    )
+
+
+def validation_table(campaign: Campaign) -> Table:
+    """Errors of each session predicted from the others, then the trials that were lost."""
+    rows: list[dict[str, Any]] = [
+        {
+            "file": str(each.path),
+            "method": each.method,
+            "type": each.name,
+            "weighting": each.weighting,
+            "error": each.error,
+            "own_error": each.own_error,
+            "lost": None,
+        }
+        for each in campaign.validation
+    ]
+    rows += [{"file": str(each.path), "lost": each.reason} for each in campaign.lost_trials]
+    return _for_programs("validation", rows)
+
+
+def validation_summary(campaign: Campaign) -> Table:
+    """Error of each model over the sessions that it was to predict, the best model first."""
+    rows: list[Row] = []
+    for method, name, weighting, errors in by_model(campaign.validation):
+        values = [each.error for each in errors]
+        own = [each.own_error for each in errors if each.own_error is not None]
+        rows.append(
+            {
+                "method": method,
+                "type": name,
+                "weighting": weighting or "",
+                "sessions": f"{len(values)} of {campaign.trials}",
+                "error": float(np.mean(values)),
+                "worst": max(values),
+                "own_error": float(np.mean(own)) if own else None,
+            }
+        )
+    return Table(
+        "validation",
+        "Each session predicted from the others: rms error of the torque",
+        (
+            Column("method", "method", WORDS), *_NAMES, Column("sessions", "sessions"),
+            Column("mean (%)", "error", ".2f", 100.0), Column("worst (%)", "worst", ".2f", 100.0),
+            Column("session's own fit (%)", "own_error", ".2f", 100.0),
         ),
-        notes=(_SCATTER_NOTE, *([MIXTURE_NOTE] if found.mixed else [])),
+        tuple(rows),
+        (
+            "The session's own whole-record fit has the noise in it, too: nothing predicts better.",
+            *lost_trials(campaign.lost_trials, campaign.trials),
+        ),
     )  # fmt: skip
 
 
-def _scatter(found: Homogeneity) -> str:
-    by = f", all by type {found.structure}" if found.structure else ""
-    return f"Sessions compared{by}"
+def sessions_table(campaign: Campaign) -> Table:
+    """Every session with its own verdict, then those left out."""
+    leading = campaign.homogeneity.leading
+    groups = leading.groups if leading else ()
+    group_of = {name: f"{place}" for place, names in enumerate(groups, 1) for name in names}
 
+    def row(session: SessionResult) -> tuple[str, ...]:
+        verdict = session.verdict
+        found = [each.kind for each in verdict.findings] if verdict else []
+        return (
+            session.path.name,
+            f"type {session.selected}" if session.selected else ABSENT,
+            ABSENT if verdict is None else "noise" if verdict.adequate else "more than noise",
+            ", ".join(dict.fromkeys(found)) or ABSENT,
+        )
 
-def _name(each: Heterogeneity) -> str:
-    return f"{with_unit(each.quantity)} {MIXTURE_MARK if each.mixed else ''}".rstrip()
-
-
-def _digits(each: Heterogeneity) -> int:
-    """Decimals that show the scatter, or what a session states as its uncertainty."""
-    _, factor, _ = label(each.quantity)
-    seen = factor * max(each.between_std, min(std for _, _, std in each.values))
-    return min(max(1 - math.floor(math.log10(seen)), 0), 9)
+    left_out = [(each.path.name, "left out", ABSENT, each.message) for each in campaign.failures]
+    return Table.of(
+        "sessions",
+        "Sessions, and what each says by itself",
+        (
+            Column("file", "file", WORDS), Column("selects", "selected", WORDS),
+            Column("what is left", "left", WORDS),
+            Column("found beside the beam", "findings", WORDS),
+            Column("group" if groups else "", "group", WORDS),
+        ),
+        (
+            (*cells, group_of.get(cells[0], ABSENT))
+            for cells in (*map(row, campaign.sessions), *left_out)
+        ),
+        (f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else (),
+    )  # fmt: skip

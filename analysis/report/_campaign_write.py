@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from analysis.report._campaign_document import campaign_document
-from analysis.report._campaign_rows import all_tables, csv_text
+from analysis.report._campaign_tables import all_tables
 from analysis.report._document import document_text
-from analysis.report._folder import OutputError, write_new
+from analysis.report._folder import write_new
+from analysis.report._table import csv_text
+from analysis.report._text import campaign_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from analysis.campaigns import Campaign
-
-_CROWDED: Final = frozenset({"figure5_signals", "figure6_nominal", "figure8_best"})
 
 
 def write_campaign(
@@ -45,39 +44,29 @@ def write_campaign(
 
     Raises
     ------
-    OutputError
-        A file cannot be written.
+    OutputExistsError, OutputError
+        A file exists, or cannot be written.
     """
     from analysis.report import _style as style
     from analysis.report._campaign_page import campaign_page
-    from analysis.report._campaign_tables import tables_text
-    from analysis.report._html import drawing, photograph, svg_text
+    from analysis.report._page import Picture
 
-    shown = {}
+    pictures = []
     for name, (draw, description) in _figures(campaign).items():
         with style.styled():
             figure = draw()
-            png = io.BytesIO()
-            figure.savefig(png, format="png")
-            svg = svg_text(figure)
-        _write_bytes(folder / f"{name}.png", png.getvalue())
-        write_new(folder / f"{name}.svg", svg)
-        # Of many sessions' responses a picture is the smaller one.
-        shown[name] = (
-            photograph(png.getvalue(), name, description)
-            if name in _CROWDED
-            else drawing(svg, name, description)
-        )
+            png = style.save(figure, folder / f"{name}.png")
+            svg = style.save_svg(figure, folder / f"{name}.svg")
+        pictures.append(Picture(name, description, png, svg))
         on_step(f"figure {name}")
-    for name, rows in all_tables(campaign, with_paper=with_paper).items():
-        write_new(folder / f"{name}.csv", csv_text(rows))
+    for name, table in all_tables(campaign, with_paper=with_paper).items():
+        write_new(folder / f"{name}.csv", csv_text(table))
     text = document_text(campaign_document(campaign, with_paper=with_paper))
     write_new(folder / "campaign.json", text)
-    write_new(folder / "tables.txt", tables_text(campaign, with_paper=with_paper))
+    write_new(folder / "tables.txt", campaign_text(campaign, with_paper=with_paper))
     made_at = datetime.now().astimezone()
-    write_new(
-        folder / "report.html", campaign_page(campaign, shown, made_at, with_paper=with_paper)
-    )
+    page = campaign_page(campaign, pictures, made_at, with_paper=with_paper)
+    write_new(folder / "report.html", page)
 
 
 def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
@@ -132,11 +121,3 @@ def _signals(campaign: Campaign) -> Figure:
 
     record = load_record(campaign.sessions[0].path)
     return signals_figure(analyse(record, replace(campaign.settings, types=())))
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    try:
-        with path.open("xb") as stream:
-            stream.write(content)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error

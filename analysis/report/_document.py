@@ -25,20 +25,18 @@ from analysis.report._bands import loss_factors, response_band, supported_band_h
 from analysis.report._table import unreported
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from analysis.identify import RecordFit
-    from analysis.paper import WelchAnalysis
-    from rigd.spectral import FrequencyResponse
-
-    IndexValues = dict[str, float | None]
     from collections.abc import Collection, Mapping, Sequence
 
-    from analysis.identify import DampingSize
-    from analysis.paper import FittedModel
+    from numpy.typing import NDArray
+
+    from analysis.identify import DampingSize, RecordFit
+    from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._bands import LossFactor
     from analysis.results import Subject
+    from rigd.spectral import FrequencyResponse
+
+    IndexValues = dict[str, float | None]
 
 NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 """Indices of a fit without a measured response beside it."""
@@ -99,7 +97,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
         the document has them of the paper's route,
         with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
         selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
-        not finite, as `analysis.report._document` takes them. What is not reported is flagged, not
+        not finite, as `finite` takes them. What is not reported is flagged, not
         left out: ``withheld`` of a fit names its parameters that the data do not support,
         ``visible`` of a mode says whether the record shows it. ``indices`` are against Welch's
         response, as those of the paper's fits, ``indices_whole_record`` against the ratio of the
@@ -246,15 +244,11 @@ def document(
         ``errors``: lists of objects that name their file.
         Finite numbers only.
     """
-    of_records = [_record_entries(subject) for subject in subjects]
+    of_records = [record_entries(subject) for subject in subjects]
     withheld = {subject.record.path: subject.unsupported for subject in subjects}
-    content: dict[str, Any] = _finite(
+    content: dict[str, Any] = finite(
         {
-            "versions": {
-                "rigd": rigd.__version__,
-                "python": platform.python_version(),
-                "numpy": np.__version__,
-            },
+            "versions": versions(),
             "files": [
                 *(_file(analysis) for analysis in analyses),
                 *(
@@ -310,10 +304,6 @@ def document_text(content: Mapping[str, Any], *, ascii_only: bool = False) -> st
         Whether other characters are escaped, for a stream that may have any encoding.
     """
     return json.dumps(content, indent=2, ensure_ascii=ascii_only, allow_nan=False) + "\n"
-
-
-def _record_entries(subject: Subject) -> dict[str, Any]:
-    return record_entries(subject)
 
 
 def _file(analysis: WelchAnalysis) -> dict[str, Any]:
@@ -414,12 +404,24 @@ def _name(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
     }
 
 
-def _finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """Copy a JSON value with null for numbers that are not finite and plain numbers for numpy's."""
+def versions() -> dict[str, str]:
+    """Of what computed the results."""
+    return {
+        "rigd": rigd.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+    }
+
+
+def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+    """Copy a JSON value with null for numbers that are not finite and plain numbers for numpy's.
+
+    Keys lose the underscore by which an attribute is told from a word of Python (``lambda_``).
+    """
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {str(key).rstrip("_"): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

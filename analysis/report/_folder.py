@@ -92,8 +92,8 @@ def new_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def write_new(path: Path, text: str) -> None:
-    """Write a new text file in UTF-8, with the folders it needs.
+def write_new(path: Path, content: str | bytes) -> None:
+    """Write a new file, text in UTF-8, with the folders it needs.
 
     Raises
     ------
@@ -103,9 +103,11 @@ def write_new(path: Path, text: str) -> None:
     check_new_file(path, "The file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # File names may hold bytes that are no text; as escapes they are text, and JSON.
-        with path.open("x", encoding="utf-8", errors="backslashreplace") as stream:
-            stream.write(text)
+        with path.open("xb") as stream:
+            if isinstance(content, str):
+                # File names may hold bytes that are no text; as escapes they are text, and JSON.
+                content = content.encode("utf-8", "backslashreplace")
+            stream.write(content)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error
 

@@ -137,7 +137,7 @@ def _panel(
     for label, frequency_hz, response, look in curves:
         known = np.isfinite(response) & (response != 0)
         at_hz, values = frequency_hz[known], response[known]
-        magnitude_db, phase_deg = 20 * np.log10(np.abs(values)), _phase_deg(values)
+        magnitude_db, phase_deg = 20 * np.log10(np.abs(values)), style.phase_deg(values)
         (handles[label],) = magnitude.plot(
             *style.envelope(at_hz, magnitude_db, _COLUMNS, logarithmic=True), **look
         )
@@ -152,11 +152,6 @@ def _panel(
             for axes in (magnitude, phase):
                 axes.axvline(peak.frequency_hz, color="#B8B8B8", linewidth=0.6, zorder=0.5)
     return handles
-
-
-def _phase_deg(response: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Phase from −90° to 270°: a torque over an angle lies between 0 and 180°, well inside."""
-    return np.asarray(np.degrees(np.angle(response * -1j)) + 90.0)
 
 
 def _scores(axes: Axes, models: list[FittedModel], lines: dict[str, dict[str, Any]]) -> None:

@@ -1,18 +1,21 @@
-"""Tables of a record: whole-record fits, structures, Welch fits, damping by amplitude."""
+"""Tables of a record: whole-record fits, structures, damping by amplitude; the paper's route."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
+from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
+from analysis.paper import LARGEST_SHIFT
 from analysis.report._bands import NORMAL_95
 from analysis.report._table import (
     ABSENT,
     MARK,
+    WORDS,
     Cell,
     Column,
-    Number,
+    Entry,
     Table,
     count,
     estimate,
@@ -24,9 +27,10 @@ from analysis.report._table import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
-    from analysis.identify import Headline, Quantity, RecordFit, Size
+    from analysis.identify import Headline, Quantity, Size
+    from analysis.models import Structure
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.results import Subject
 
@@ -58,16 +62,15 @@ _MARKED: Final = (
 def modes_table(subject: Subject) -> Table:
     """Frequencies and damping ratios; modes that do not show, or are doubtful, are marked."""
     told = subject.headline
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[tuple[Entry, ...]] = []
     for mode in told.modes:
         f, ratio = mode.frequency_hz, mode.damping_ratio
-        row = (
-            count(mode.number),
-            *estimate((f.value, f.std), f.std),
-            *estimate((ratio.value, ratio.std, *_ends(ratio)), ratio.std, 100.0),
-        )
-        rows.append(row if ratio.flag is None else (marked(row[0]), *map(greyed, row[1:])))
-    return Table(
+        cells = (*estimate((f.value, f.std), f.std), *_told(ratio, 100.0))
+        if ratio.flag is None:
+            rows.append((mode.number, *cells))
+        else:
+            rows.append((marked(count(mode.number)), *map(greyed, cells)))
+    return Table.of(
         "modes",
         f"Modes of the beam on a motor that stands still: type {told.name}",
         (
@@ -79,7 +82,7 @@ def modes_table(subject: Subject) -> Table:
             Column("95 % from (%)", "damping_ratio_low"),
             Column("to (%)", "damping_ratio_high"),
         ),
-        tuple(rows),
+        rows,
         _reasons(mode.damping_ratio for mode in told.modes),
     )
 
@@ -87,20 +90,20 @@ def modes_table(subject: Subject) -> Table:
 def parameters_table(subject: Subject) -> Table:
     """All parameters with their uncertainty; those with a flag are marked, with the reason."""
     told = subject.headline
-    return Table(
+    return Table.of(
         "parameters",
         f"Parameters, type {told.name}",
         (
-            Column("Parameter", "parameter", numeric=False),
-            Column("Meaning", "meaning", numeric=False),
-            Column("Unit shown", "unit_shown", numeric=False),
+            Column("Parameter", "parameter", WORDS),
+            Column("Meaning", "meaning", WORDS),
+            Column("Unit shown", "unit_shown", WORDS),
             Column("Value", "value_si"),
             Column("std", "std_si"),
             Column("95 % from", "low_si"),
             Column("to", "high_si"),
-            Column("Remark", "remark", numeric=False),
+            Column("Remark", "remark", WORDS),
         ),
-        tuple(_parameter_row(told, name, each) for name, each in told.parameters.items()),
+        (_parameter_row(told, name, each) for name, each in told.parameters.items()),
         (
             "std is one standard deviation; intervals of ζ, γ, ρ/EI and EI are symmetric in the "
             "logarithm. The CSV file has SI units.",
@@ -112,12 +115,12 @@ def parameters_table(subject: Subject) -> Table:
 def sizes_table(subject: Subject) -> Table:
     """Loss factors of either damping where they are uncorrelated with its order."""
     told = subject.headline
-    return Table(
+    return Table.of(
         "damping_sizes",
         "Loss factor of either damping at the frequency where it depends least on its order",
         (
-            Column("Damping", "damping", numeric=False),
-            Column("Quantity", "quantity", numeric=False),
+            Column("Damping", "damping", WORDS),
+            Column("Quantity", "quantity", WORDS),
             Column("at ω (rad/s)", "omega_rad_s"),
             Column("Value", "value"),
             Column("std", "std"),
@@ -125,7 +128,7 @@ def sizes_table(subject: Subject) -> Table:
             Column("95 % from", "low"),
             Column("to", "high"),
         ),
-        tuple(_size_row(told, each) for each in told.sizes),
+        (_size_row(told, each) for each in told.sizes),
         (
             "Coefficient and order are strongly correlated; a loss factor is known far better than "
             "either.",
@@ -140,7 +143,7 @@ def condition_table(subject: Subject) -> Table | None:
     if simpler is None:
         return None
     taken = " and ".join(f"{PARAMETERS[name][0]} = {at:g}" for name, at in simpler.fixed.items())
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[tuple[Entry, ...]] = []
     for name, each in simpler.parameters.items():
         symbol, _meaning, unit, factor = _described(name)
         free = told.parameters[name]
@@ -152,12 +155,12 @@ def condition_table(subject: Subject) -> Table | None:
                 *estimate((free.value, *_ends(free)), free.std, factor),
             )
         )
-    return Table(
+    return Table.of(
         "on_condition",
         f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which would do",
         (
-            Column("Parameter", "parameter", numeric=False),
-            Column("Unit shown", "unit_shown", numeric=False),
+            Column("Parameter", "parameter", WORDS),
+            Column("Unit shown", "unit_shown", WORDS),
             Column("Then", "value_si"),
             Column("95 % from", "low_si"),
             Column("to", "high_si"),
@@ -165,7 +168,7 @@ def condition_table(subject: Subject) -> Table | None:
             Column("95 % from", "free_low_si"),
             Column("to", "free_high_si"),
         ),
-        tuple(rows),
+        rows,
         ("The intervals on the left hold only if what is taken for granted is true.",),
     )
 
@@ -174,14 +177,14 @@ def correlations_table(subject: Subject) -> Table:
     """Correlations of the determined parameters of the selected fit."""
     fit = subject.fit
     symbols = [_symbol(name) for name in fit.determined]
-    return Table(
+    return Table.of(
         "correlations",
         f"Correlations of the parameters, type {subject.headline.name}",
         (
-            Column("Parameter", "parameter", numeric=False),
+            Column("Parameter", "parameter", WORDS),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
         ),
-        tuple(
+        (
             (symbol, *(_correlation(i == j, value) for j, value in enumerate(row)))
             for i, (symbol, row) in enumerate(zip(symbols, fit.correlation.tolist(), strict=True))
         ),
@@ -189,7 +192,7 @@ def correlations_table(subject: Subject) -> Table:
     )
 
 
-def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Cell, ...]:
+def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Entry, ...]:
     symbol, meaning, unit, factor = _described(name)
     shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
     if each.flag is not None:
@@ -198,7 +201,7 @@ def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Cell, ...
     return (symbol, meaning, unit, *shown, "fixed" if fixed else each.flag or "")
 
 
-def _size_row(told: Headline, each: Size) -> tuple[Cell, ...]:
+def _size_row(told: Headline, each: Size) -> tuple[Entry, ...]:
     size, internal = each.size, each.damping == "internal"
     symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
     flag = size.flag
@@ -206,15 +209,17 @@ def _size_row(told: Headline, each: Size) -> tuple[Cell, ...]:
         # Without its frequency a size is the coefficient for an order that was only assumed.
         flag = flag or told.parameters["zeta" if internal else "gamma"].flag
         symbol = symbol[0]
-    at = number(each.omega_rad_s, ".4g")
-    shown = [
-        *estimate((size.value, size.std), size.std),
-        number(None if size.std is None else size.std / size.value, "#.2g", 100.0),
-        *estimate(_ends(size), size.std),
-    ]
+    value, std, low, high = _told(size)
+    relative = number(None if size.std is None else size.std / size.value, "#.2g", 100.0)
+    others: tuple[Cell, ...] = (std, relative, low, high)
     if flag is not None:
-        shown = [marked(shown[0]), *map(greyed, shown[1:])]
-    return (each.damping, symbol, at, *shown)
+        value, others = marked(value), tuple(map(greyed, others))
+    return (each.damping, symbol, each.omega_rad_s, value, *others)
+
+
+def _told(each: Quantity, factor: float = 1.0) -> tuple[Cell, ...]:
+    """Show a quantity, its standard deviation and the ends of its interval."""
+    return estimate((each.value, each.std, *_ends(each)), each.std, factor)
 
 
 def _ends(quantity: Quantity) -> tuple[float | None, float | None]:
@@ -245,7 +250,8 @@ def _correlation(own: bool, value: float) -> Cell:
     return replace(shown, strong=True)
 
 
-_DAMPING = ("zeta", "alpha", "gamma", "lambda")
+_DAMPING: Final = ("zeta", "alpha", "gamma", "lambda")
+_ON_THE_EDGE: Final = "* rests on the edge of the range searched: the data do not determine it."
 
 
 def structures_table(subject: Subject) -> Table:
@@ -254,46 +260,42 @@ def structures_table(subject: Subject) -> Table:
     withheld = subject.unsupported
     delta_bic = subject.verdict.delta_bic
     status = dict(subject.headline.structures)
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[tuple[Entry, ...]] = []
     for name, fit in subject.fits.items():
         its = status.get(name, "")
+        damping = _damping_cells(
+            fit.structure, fit.parameters, fit.std, withheld=withheld, at_bounds=fit.at_bounds
+        )
         rows.append(
             (
                 name,
                 its,
-                *_damping(fit, withheld, excluded=its == "excluded"),
-                *([number(delta_bic[name], ".4g")] if delta_bic else []),
-                number(fit.cost / fit.degrees_of_freedom, ".4g"),
-                count(fit.free_parameters),
-                number(fit.cost),
-                number(fit.cost - lowest),
-                count(fit.degrees_of_freedom),
+                *(map(_left_out, damping) if its == "excluded" else damping),
+                *([delta_bic[name]] if delta_bic else []),
+                fit.cost / fit.degrees_of_freedom,
+                fit.free_parameters,
+                fit.cost,
+                fit.cost - lowest,
+                fit.degrees_of_freedom,
                 " ".join(sorted(unreported(fit.structure, withheld))),
             )
         )
-    return Table(
+    return Table.of(
         "structures",
         "All structures on the whole record",
         (
-            Column("Type", "type", numeric=False),
-            Column("", "status", numeric=False),
-            *(
-                column
-                for parameter in _DAMPING
-                for column in (
-                    Column(_heading(parameter), parameter),
-                    Column("std", f"{parameter}_std"),
-                )
-            ),
+            Column("Type", "type", WORDS),
+            Column("", "status", WORDS),
+            *_damping_columns(),
             *([Column("ΔBIC", "delta_bic")] if delta_bic else []),
             Column("Residual", "cost_per_degree_of_freedom"),
             Column("Free", "free_parameters"),
             Column("", "cost"),
             Column("", "cost_above_lowest"),
             Column("", "degrees_of_freedom"),
-            Column("", "not_reported", numeric=False),
+            Column("", "not_reported", WORDS),
         ),
-        tuple(rows),
+        rows,
         (
             *footnotes(withheld),
             "ΔBIC: Bayesian information criterion above the lowest; 10 is clear. Residual: its "
@@ -306,22 +308,41 @@ def structures_table(subject: Subject) -> Table:
     )
 
 
-def _damping(fit: RecordFit, withheld: Collection[str], *, excluded: bool) -> list[Number]:
+def _left_out(cell: Cell) -> Cell:
+    """Keep a number for programs only."""
+    return cell if cell.value is None else replace(cell, text=ABSENT, doubtful=True)
+
+
+def _damping_columns() -> list[Column]:
     """Value and standard deviation of each parameter of the damping."""
-    doubtful = unreported(fit.structure, withheld)
-    shown: list[Number] = []
+    return [
+        column
+        for name in _DAMPING
+        for column in (
+            Column(_heading(name), name), Column("std", f"{name}_std", spread=True),
+        )
+    ]  # fmt: skip
+
+
+def _damping_cells(
+    structure: Structure,
+    parameters: Mapping[str, float],
+    std: Mapping[str, float | None] | None,
+    *,
+    withheld: Collection[str] = (),
+    at_bounds: Collection[str] = (),
+) -> list[Cell]:
+    """Fill these columns: what is fixed has no standard deviation, what is absent has a dash."""
+    doubtful = unreported(structure, withheld)
+    shown: list[Cell] = []
     for name in _DAMPING:
-        if not fit.structure.has(name):
+        if not structure.has(name):
             shown += [number(None), number(None)]
             continue
-        std = fit.std[name]
-        free = name in fit.structure.free
-        cells = estimate((fit.parameters[name], std if free else None), std, PARAMETERS[name][3])
-        held = "*" if name in fit.at_bounds else ""
-        value, spread = replace(cells[0], text=cells[0].text + held), cells[1]
-        if excluded:
-            shown += [replace(each, text=ABSENT, doubtful=True) for each in (value, spread)]
-            continue
+        its_std = std[name] if std is not None and name in structure.free else None
+        value, spread = estimate((parameters[name], its_std), its_std, PARAMETERS[name][3])
+        if name in at_bounds:
+            value = replace(value, text=f"{value.text}*")
         shown += [marked(value), greyed(spread)] if name in doubtful else [value, spread]
     return shown
 
@@ -332,9 +353,9 @@ def _heading(name: str) -> str:
     return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
 
 
-_FACTORS = {"zeta": 1e5, "alpha": 1.0, "gamma": 1e2, "lambda": 1.0}
-_HEADINGS = {"zeta": "ζ (1e-5)", "alpha": "α", "gamma": "γ (1e-2)", "lambda": "λ"}
-_COEFFICIENT = {"zeta": "zeta", "alpha": "zeta", "gamma": "gamma", "lambda": "gamma"}
+_NAMES: Final = (Column("Type", "type", WORDS), Column("Weights", "weighting", WORDS))
+_INDICES: Final = ("mse", "wmse", "md")
+_INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 
 
 def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
@@ -346,82 +367,171 @@ def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) ->
     withheld : collection of str
         Orders that the whole record does not support: they are marked.
     """
-    return Table(
+    fits = [model.fit for model in analysis.models]
+    return Table.of(
         "welch_fits",
         "Fits to Welch's estimate, as in the paper",
+        (*_NAMES, *_damping_columns(), *(Column(name.upper(), name) for name in _INDICES)),
         (
-            Column("Type", "type", numeric=False),
-            Column("Weights", "weighting", numeric=False),
-            *(
-                column
-                for name, heading in _HEADINGS.items()
-                for column in (Column(heading, name), Column("std", f"{name}_std"))
-            ),
-            Column("MSE", "mse"),
-            Column("WMSE", "wmse"),
-            Column("MD", "md"),
+            (
+                *_names(model),
+                *_damping_cells(
+                    fit.structure, fit.parameters, fit.std, withheld=withheld,
+                    at_bounds=fit.at_bounds,
+                ),
+                *(getattr(model.indices, name) for name in _INDICES),
+            )
+            for fit, model in zip(fits, analysis.models, strict=True)
         ),
-        tuple(_fit_row(model, withheld) for model in analysis.models),
         (
             *footnotes(withheld),
-            "MSE and WMSE in (N·m/rad)², MD in N·m/rad. std is the scatter of the measured "
-            "response about the model. The bias of Welch's estimate on a chirp, which the window "
-            "smears at the resonances, is not in it and is often larger: the whole-record fits "
-            "above do not have it.",
+            f"{_INDEX_UNITS} std (±): one standard deviation, from the scatter of the response "
+            "about the model. The bias of Welch's estimate on a chirp, which the window "
+            "smears at the resonances, is not in it and is often larger: whole-record fits do not "
+            "have it.",
+            *([_ON_THE_EDGE] if any(fit.at_bounds for fit in fits) else []),
         ),
-    )
+        grouped=True,
+    )  # fmt: skip
+
+
+def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
+    """Mean and standard deviation over the files of each fit's parameters and indices."""
+    rows: list[tuple[Entry, ...]] = []
+    for models in zip(*(analysis.models for analysis in analyses), strict=True):
+        fits = [model.fit for model in models]
+        parameters, indices = (
+            {key: [values[key] for values in of_files] for key in keys}
+            for keys, of_files in (
+                (_DAMPING, [fit.parameters for fit in fits]),
+                (_INDICES, [asdict(model.indices) for model in models]),
+            )
+        )
+        rows.append(
+            (
+                *_names(models[0]),
+                *_damping_cells(
+                    fits[0].structure,
+                    {name: fmean(values) for name, values in parameters.items()},
+                    {name: _stdev(values) for name, values in parameters.items()},
+                ),
+                *(
+                    cell
+                    for values in indices.values()
+                    for cell in estimate((fmean(values), _stdev(values)), _stdev(values))
+                ),
+            )
+        )
+    return Table.of(
+        "welch_summary",
+        f"Mean ± standard deviation over {len(analyses)} files",
+        (
+            *_NAMES,
+            *_damping_columns(),
+            *(
+                column
+                for name in _INDICES
+                for column in (
+                    Column(name.upper(), name), Column("std", f"{name}_std", spread=True),
+                )
+            ),
+        ),
+        rows,
+        (_INDEX_UNITS,),
+        grouped=True,
+    )  # fmt: skip
+
+
+def _stdev(values: list[float]) -> float:
+    return stdev(values) if len(values) > 1 else math.nan
+
+
+def _names(model: FittedModel) -> tuple[str, str]:
+    return model.fit.structure.name, model.fit.weighting
 
 
 def peaks_table(analysis: WelchAnalysis) -> Table:
     """Measured resonant peaks, and by how much those of each model lie off them."""
-    count = len(analysis.peaks)
-    measured: tuple[Cell, ...] = (
-        "measured",
-        "",
-        *(number(2 * math.pi * p.frequency_hz if p else None, ".3f") for p in analysis.peaks),
-        *(number(p.magnitude_db if p else None, ".3f") for p in analysis.peaks),
+    modes = range(1, len(analysis.peaks) + 1)
+    measured = (
+        *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
+        *(p.magnitude_db if p else None for p in analysis.peaks),
     )
-    rows: list[tuple[Cell, ...]] = [
-        (
-            model.fit.structure.name,
-            model.fit.weighting,
-            *(number(d.frequency_rad_s if d else None, ".3f") for d in model.deviations),
-            *(number(d.magnitude_db if d else None, ".3f") for d in model.deviations),
-        )
-        for model in analysis.models
-    ]
-    return Table(
+    return Table.of(
         "welch_peaks",
         "Resonant peaks of Welch's estimate, and deviations of the models' peaks from them",
         (
-            Column("Type", "type", numeric=False),
-            Column("Weights", "weighting", numeric=False),
-            *(Column(f"ω{n} (rad/s)", f"omega_{n}_rad_s") for n in range(1, count + 1)),
-            *(Column(f"M{n} (dB)", f"magnitude_{n}_db") for n in range(1, count + 1)),
+            *_NAMES,
+            *(Column(f"ω{n} (rad/s)", f"omega_{n}_rad_s", ".3f") for n in modes),
+            *(Column(f"M{n} (dB)", f"magnitude_{n}_db", ".3f") for n in modes),
         ),
-        (measured, *rows),
+        (
+            ("measured", "", *measured),
+            *(
+                (
+                    *_names(model),
+                    *(d.frequency_rad_s if d else None for d in model.deviations),
+                    *(d.magnitude_db if d else None for d in model.deviations),
+                )
+                for model in analysis.models
+            ),
+        ),
         ("First row: the peaks; below: absolute deviations, as in the paper's Table 4.",),
+        selected=0,
+        grouped=True,
     )
 
 
-def _fit_row(model: FittedModel, withheld: Collection[str]) -> tuple[Cell, ...]:
-    fit = model.fit
-    doubtful = unreported(fit.structure, withheld)
-    shown: list[Cell] = []
-    for name, factor in _FACTORS.items():
-        cells: tuple[Number, ...] = (number(None), number(None))
-        if name in fit.structure.free:
-            std = None if fit.std is None else fit.std[name]
-            cells = estimate((fit.parameters[name], std), std, factor)
-        elif _COEFFICIENT[name] in fit.structure.free:
-            cells = (number(fit.parameters[name], "g", factor), number(None))
-        shown += (marked(cells[0]), greyed(cells[1])) if name in doubtful else cells
-    indices = model.indices
-    return (
-        fit.structure.name,
-        fit.weighting,
-        *shown,
-        *(number(value) for value in (indices.mse, indices.wmse, indices.md)),
+_LEFT: Final = "‡"
+
+
+def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
+    """Frequencies and damping ratios of the modes from each model's poles; None without any.
+
+    What is not the antenna's is marked, or left out.
+    """
+    models = analysis.models
+    modes = max((len(model.modes) for model in models), default=0)
+    if not modes:
+        return None
+
+    def cells(model: FittedModel, name: str, form: str, factor: float = 1.0) -> list[Cell]:
+        made = []
+        for mode, followed in zip(model.modes, model.followed, strict=True):
+            cell = number(getattr(mode, name) if mode.damping_ratio < 1 else None, form, factor)
+            if cell.value is not None and not followed:
+                cell = greyed(replace(cell, text=cell.text + _LEFT))
+            made.append(cell)
+        return made or [number(None)] * modes
+
+    shown = [each for model in models for each in zip(model.modes, model.followed, strict=True)]
+    vibrates = [mode.damping_ratio < 1 for mode, _ in shown]
+    notes = ["From the poles of the fitted model; ξ is the damping ratio."]
+    if any(not followed and mode.damping_ratio < 1 for mode, followed in shown):
+        notes.append(
+            f"{_LEFT} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the fit does "
+            "not follow this resonance. The number belongs to its curve, not to the antenna."
+        )
+    if not all(vibrates) or not all(model.modes for model in models):
+        notes.append(f"{ABSENT} damped so strongly by this fit that nothing vibrates.")
+    return Table.of(
+        "welch_modes",
+        "Modes of the fits to Welch's estimate",
+        (
+            *_NAMES,
+            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, modes + 1)),
+            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, modes + 1)),
+        ),
+        (
+            (
+                *_names(model),
+                *cells(model, "frequency_hz", ".4f"),
+                *cells(model, "damping_ratio", ".4g", 100.0),
+            )
+            for model in models
+        ),
+        notes,
+        grouped=True,
     )
 
 
@@ -430,30 +540,18 @@ def amplitude_tables(subject: Subject) -> tuple[Table, ...]:
     found = subject.verdict.damping_with_amplitude
     if not found:
         return ()
-    rows = tuple(
-        (
-            count(at.mode),
-            number(at.tip_amplitude_m, ".3g", 1e3),
-            *estimate(
-                (
-                    at.damping_ratio,
-                    at.std,
-                    at.damping_ratio - NORMAL_95 * at.std,
-                    at.damping_ratio + NORMAL_95 * at.std,
-                ),
-                at.std,
-                100.0,
-            ),
-        )
-        for at in found
-    )
+    rows: list[tuple[Entry, ...]] = []
+    for at in found:
+        ratio, std, half = at.damping_ratio, at.std, NORMAL_95 * at.std
+        shown = estimate((ratio, std, ratio - half, ratio + half), std, 100.0)
+        rows.append((at.mode, at.tip_amplitude_m, *shown))
     return (
-        Table(
+        Table.of(
             "damping_with_amplitude",
             "Damping of free vibration against the amplitude, air drag included",
             (
                 Column("Mode", "mode"),
-                Column("Tip amplitude (mm)", "tip_amplitude_m"),
+                Column("Tip amplitude (mm)", "tip_amplitude_m", ".3g", 1e3),
                 Column("Damping ratio (%)", "damping_ratio"),
                 Column("std (%)", "damping_ratio_std"),
                 Column("95 % from (%)", "damping_ratio_low"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.report._folder import OutputError, OutputExistsError
+from analysis.report._text import tables_text
 from rigd.session import read_session, read_timings
 from rigd.view import (
     GREEN,
@@ -358,7 +359,6 @@ def write_rerun_file(analysis: WelchAnalysis, path: Path) -> None:
     rigd.session.SessionError
         If the session file cannot be read any more.
     """
-    from analysis.report._write import tables_text
     from rigd.view import draw_session, recorded_blueprint
 
     session = read_session(analysis.record.path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from analysis.report import _style as style
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from analysis.identify import Plant, RecordFit
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
+
+    Look = dict[str, Any]
+    Line = tuple[NDArray[np.float64], Look]
 
 _PERIODS_SHOWN: Final = 12
 _SHORTEST_S: Final = 0.3
@@ -155,56 +160,76 @@ def signals_figure(record: Record, fit: RecordFit, highest_hz: float) -> Figure:
         wspace=0.2, height_ratios=(1.1, 1.3, 0.8, 1.2),
     )  # fmt: skip
     angle, whole, rest = (figure.add_subplot(grid[row, :]) for row in range(3))
-    reference_mrad, angle_mrad = 1e3 * record.reference_rad, 1e3 * record.angle_rad
-    angle.plot(
-        *style.envelope(record.time_s, reference_mrad), color=style.ORANGE, label="reference angle"
+    of_angle = (
+        (1e3 * record.reference_rad, {"color": style.ORANGE, "label": "reference angle"}),
+        (1e3 * record.angle_rad, _THIN | {"color": style.PURPLE, "label": "measured angle"}),
     )
-    angle.plot(
-        *style.envelope(record.time_s, angle_mrad), color=style.PURPLE, linewidth=0.7,
-        label="measured angle",
-    )  # fmt: skip
-    angle.set_title("Motor angle", pad=14)
-    angle.set_ylabel("Angle (mrad)")
-    angle.set_ylim(style.limits(reference_mrad, angle_mrad))
-    whole.plot(
-        *style.envelope(record.time_s, torque.measured), color=style.GREY, linewidth=1.0,
-        label="measured torque",
-    )  # fmt: skip
-    whole.plot(
-        *style.envelope(record.time_s, torque.modelled), color=style.BLUE, linewidth=0.6,
-        label="modelled torque",
-    )  # fmt: skip
-    whole.set_title("Coupling torque")
-    whole.set_ylabel("Torque (N·m)")
-    whole.set_ylim(style.limits(torque.measured, torque.modelled))
-    rest.plot(
-        *style.envelope(record.time_s, torque.residual), color=style.VERMILION, linewidth=0.7,
-        label="residual",
-    )  # fmt: skip
-    rest.set_title("Residual, measured − modelled")
-    rest.set_ylabel("Torque (N·m)")
-    rest.set_ylim(style.limits(torque.residual))
+    of_torque = (
+        (torque.measured, _MEASURED | {"label": "measured torque"}),
+        (torque.modelled, _MODELLED | {"label": "modelled torque"}),
+    )
+    _whole(angle, record, of_angle, "Motor angle", _ANGLE, pad=14)
+    _whole(whole, record, of_torque, "Coupling torque", _TORQUE)
+    _whole(rest, record, ((torque.residual, _RESIDUAL),), _LEFT, _TORQUE)
     rest.set_xlabel("Time (s)", labelpad=1)
     for axes in (angle, whole, rest):
-        axes.set_xlim(record.time_s[0], record.time_s[-1])
         axes.tick_params(labelbottom=axes is rest)
     mark(angle, moments)
+    compared = (torque.measured, torque.modelled, torque.residual)
     for column, moment in enumerate(moments):
         axes = figure.add_subplot(grid[3, column])
-        times_s = record.time_s[moment.samples]
-        axes.plot(times_s, torque.measured[moment.samples], color=style.GREY, linewidth=2.6)
-        axes.plot(times_s, torque.modelled[moment.samples], color=style.BLUE, linewidth=1.0)
-        axes.plot(times_s, torque.residual[moment.samples], color=style.VERMILION, linewidth=0.8)
-        enlarge(axes, column + 1, moment)
+        _detail(axes, record, zip(compared, _CLOSE, strict=True), column, moment, _TORQUE)
         axes.set_xlabel("Time (s)", labelpad=1)
-        if column == 0:
-            axes.set_ylabel("Torque (N·m)")
     handles = [handle for axes in (angle, whole, rest) for handle in axes.get_lines()]
     figure.legend(
         handles, [str(handle.get_label()) for handle in handles], loc="upper right",
         bbox_to_anchor=(0.985, 0.93), ncols=5, borderaxespad=0.0,
     )  # fmt: skip
     return figure
+
+
+_ANGLE: Final = "Angle (mrad)"
+_TORQUE: Final = "Torque (N·m)"
+_LEFT: Final = "Residual, measured − modelled"
+_THIN: Final[Look] = {"linewidth": 0.7}
+_MEASURED: Final[Look] = {"color": style.GREY, "linewidth": 1.0}
+_MODELLED: Final[Look] = {"color": style.BLUE, "linewidth": 0.6}
+_RESIDUAL: Final[Look] = {"color": style.VERMILION, "linewidth": 0.7, "label": "residual"}
+_CLOSE: Final[tuple[Look, ...]] = (
+    {"color": style.GREY, "linewidth": 2.6},
+    {"color": style.BLUE, "linewidth": 1.0},
+    {"color": style.VERMILION, "linewidth": 0.8},
+)
+"""Measured and modelled torque and what is left, in a detail."""
+
+
+def _whole(
+    axes: Axes,
+    record: Record,
+    lines: Iterable[Line],
+    title: str,
+    label: str,
+    pad: float | None = None,
+) -> None:
+    """Draw signals over the whole record."""
+    drawn = tuple(lines)
+    for values, look in drawn:
+        axes.plot(*style.envelope(record.time_s, values), **look)
+    axes.set_title(title, pad=pad)
+    axes.set_ylabel(label)
+    axes.set_ylim(style.limits(*(values for values, _ in drawn)))
+    axes.set_xlim(record.time_s[0], record.time_s[-1])
+
+
+def _detail(
+    axes: Axes, record: Record, lines: Iterable[Line], column: int, moment: Moment, label: str
+) -> None:
+    """Draw one stretch of signals; the first panel of a row says what they are."""
+    for values, look in lines:
+        axes.plot(record.time_s[moment.samples], values[moment.samples], **look)
+    enlarge(axes, column + 1, moment)
+    if column == 0:
+        axes.set_ylabel(label)
 
 
 def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
@@ -226,42 +251,27 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
         4, columns, left=0.06, right=0.985, top=0.88, bottom=0.065, hspace=0.58, wspace=0.17,
         height_ratios=(1.25, 1.0, 1.25, 1.0),
     )  # fmt: skip
-
     reference_mrad, angle_mrad = 1e3 * record.reference_rad, 1e3 * record.angle_rad
-    angle = figure.add_subplot(grid[0, :])
-    angle.plot(
-        *style.envelope(record.time_s, reference_mrad), color=style.ORANGE, label="reference"
+    angle, torque = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[2, :])
+    of_angle = (
+        (reference_mrad, {"color": style.ORANGE, "label": "reference"}),
+        (angle_mrad, _THIN | {"color": style.BLUE, "label": "measured"}),
     )
-    angle.plot(
-        *style.envelope(record.time_s, angle_mrad), color=style.BLUE, linewidth=0.7,
-        label="measured",
-    )  # fmt: skip
-    angle.set_title("(a) Motor angle", pad=14)
-    angle.set_ylabel("Angle (mrad)")
-    angle.set_ylim(style.limits(reference_mrad, angle_mrad))
+    _whole(angle, record, of_angle, "(a) Motor angle", _ANGLE, pad=14)
     angle.legend(loc="lower right", bbox_to_anchor=(1.0, 1.07), ncols=2, borderaxespad=0.0)
-    torque = figure.add_subplot(grid[2, :])
-    torque.plot(*style.envelope(record.time_s, record.torque_nm), color=style.GREEN, linewidth=0.7)
-    torque.set_title("(b) Coupling torque", pad=14)
-    torque.set_ylabel("Torque (N·m)")
-    torque.set_ylim(style.limits(record.torque_nm))
+    green = {"color": style.GREEN}
+    of_torque = ((record.torque_nm, _THIN | green),)
+    _whole(torque, record, of_torque, "(b) Coupling torque", _TORQUE, pad=14)
     for axes in (angle, torque):
-        axes.set_xlim(record.time_s[0], record.time_s[-1])
         axes.set_xlabel("Time (s)", labelpad=1)
         mark(axes, moments)
-
+    near = ((reference_mrad, {"color": style.ORANGE}), (angle_mrad, {"color": style.BLUE}))
     for column, moment in enumerate(moments):
-        times_s = record.time_s[moment.samples]
         above = figure.add_subplot(grid[1, column])
-        above.plot(times_s, reference_mrad[moment.samples], color=style.ORANGE)
-        above.plot(times_s, angle_mrad[moment.samples], color=style.BLUE)
+        _detail(above, record, near, column, moment, _ANGLE)
         below = figure.add_subplot(grid[3, column])
-        below.plot(times_s, record.torque_nm[moment.samples], color=style.GREEN, linewidth=0.9)
-        for axes in (above, below):
-            enlarge(axes, column + 1, moment)
-        if column == 0:
-            above.set_ylabel("Angle (mrad)")
-            below.set_ylabel("Torque (N·m)")
+        look = green | {"linewidth": 0.9}
+        _detail(below, record, ((record.torque_nm, look),), column, moment, _TORQUE)
         below.set_xlabel("Time (s)", labelpad=1)
     return figure
 
@@ -297,37 +307,19 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
         wspace=0.17, height_ratios=(1.7, 1.0),
     )  # fmt: skip
     whole = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
-    top = figure.add_subplot(whole[0])
-    top.plot(
-        *style.envelope(record.time_s, measured), color=style.GREY, linewidth=1.0, label="measured"
-    )
-    top.plot(
-        *style.envelope(record.time_s, modelled), color=style.BLUE, linewidth=0.6,
-        label="modelled",
-    )  # fmt: skip
-    top.set_title("Whole record", pad=14)
-    top.set_ylabel("Torque (N·m)")
-    top.set_ylim(style.limits(measured, modelled))
+    top, middle = figure.add_subplot(whole[0]), figure.add_subplot(whole[1])
+    of_torque = ((measured, _MEASURED), (modelled, _MODELLED))
+    _whole(top, record, of_torque, "Whole record", _TORQUE, pad=14)
     top.tick_params(labelbottom=False)
-    middle = figure.add_subplot(whole[1])
-    middle.plot(*style.envelope(record.time_s, residual), color=style.VERMILION, linewidth=0.7)
-    middle.set_title("Residual, measured − modelled")
-    middle.set_ylabel("Torque (N·m)")
-    middle.set_ylim(style.limits(residual))
+    _whole(middle, record, ((residual, _RESIDUAL),), _LEFT, _TORQUE)
     middle.set_xlabel("Time (s)", labelpad=1)
-    for axes in (top, middle):
-        axes.set_xlim(record.time_s[0], record.time_s[-1])
     mark(top, moments)
+    looks = (_CLOSE[0], _CLOSE[1] | {"linewidth": 1.1}, _CLOSE[2])
+    close = tuple(zip((measured, modelled, residual), looks, strict=True))
     for column, moment in enumerate(moments):
         axes = figure.add_subplot(grid[1, column])
-        times_s = record.time_s[moment.samples]
-        axes.plot(times_s, measured[moment.samples], color=style.GREY, linewidth=2.6)
-        axes.plot(times_s, modelled[moment.samples], color=style.BLUE, linewidth=1.1)
-        axes.plot(times_s, residual[moment.samples], color=style.VERMILION, linewidth=0.8)
-        enlarge(axes, column + 1, moment)
+        _detail(axes, record, close, column, moment, _TORQUE)
         axes.set_xlabel("Time (s)", labelpad=1)
-        if column == 0:
-            axes.set_ylabel("Torque (N·m)")
     handles = [*top.get_lines()[:2], middle.get_lines()[0]]
     figure.legend(
         handles, ["measured", "modelled", "residual"], loc="upper right",

@@ -1,4 +1,7 @@
-"""A table once, for HTML and for CSV: each number in full, and as it is shown."""
+"""A table, described once, and what it is on the terminal, in CSV and in JSON.
+
+For a page the template's macro `table` makes it, from the same cells.
+"""
 
 from __future__ import annotations
 
@@ -11,48 +14,88 @@ from typing import TYPE_CHECKING, Final
 from analysis.models import COEFFICIENT_OF
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
+
+    import rich.table
 
     from analysis.models import Structure
 
 ABSENT: Final = "–"
+WORDS: Final = ""
+"""Format of a column that holds no numbers."""
+
+Value = str | float | bool | None
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
-    """A number of a table.
+class Cell:
+    """A cell whose text is not its column's business.
 
     Attributes
     ----------
-    value : float or None
-        In SI units and in full; None if it is not known.
+    value : str, float, bool or None
+        As programs read it: in SI units and in full; None if it is not known.
     text : str
-        As it is shown, in the unit that the table states.
+        As people see it, in the unit that the table states.
     strong : bool
         Whether the eye should stop at it.
     doubtful : bool
         Whether it is not reported: shown in grey, as the data do not support it.
     """
 
-    value: float | None
+    value: Value
     text: str
     strong: bool = False
     doubtful: bool = False
 
+    @property
+    def is_number(self) -> bool:
+        """Whether the value is a number."""
+        return isinstance(self.value, int | float) and not isinstance(self.value, bool)
 
-Cell = Number | str
+
+Entry = Cell | Value
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: heading as people read it, and as programs do (name with unit).
+    """A column that people see.
 
-    Without a heading it is in the file only: it tells programs what people see otherwise.
+    Attributes
+    ----------
+    heading : str
+        Without one the column is in the files only.
+    key : str
+        Its name, with the SI unit, for programs: header in CSV, key in JSON.
+    form : str
+        Format of its numbers; `WORDS` of a column of words.
+    factor : float
+        By which a number in SI units is multiplied to be shown.
+    spread : bool
+        Whether it is the standard deviation of the column before it, where it stands behind a ±
+        on the terminal, which is narrow.
     """
 
     heading: str
     key: str
-    numeric: bool = True
+    form: str = ".4g"
+    factor: float = 1.0
+    spread: bool = False
+
+    @property
+    def numeric(self) -> bool:
+        """Whether it holds numbers."""
+        return self.form != WORDS
+
+    def shown(self, entry: Entry) -> Cell:
+        """Return the cell that people see of an entry."""
+        if isinstance(entry, Cell):
+            return entry
+        if isinstance(entry, bool):
+            return Cell(entry, "yes" if entry else "no")
+        if isinstance(entry, str):
+            return Cell(entry, entry)
+        return count(entry) if isinstance(entry, int) else number(entry, self.form, self.factor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,62 +105,141 @@ class Table:
     Attributes
     ----------
     name : str
-        Of its CSV file, without the ending.
+        Of its CSV file, without the ending, and of the list of its rows in JSON.
     caption : str
     columns : tuple of Column
-        The first one names the rows.
-    rows : tuple of tuple of Cell
+        Those that people see, in their order; the first one names the rows.
+    rows : tuple of mapping of str to Entry
+        By the columns' keys. What a row holds beside them is for programs only. A row may lack
+        what does not exist for it.
     notes : tuple of str
         Sentences under it.
     selected : int or None
         Row that is marked.
+    grouped : bool
+        Whether rows with the same first cell belong together, and are ruled off on the terminal.
     """
 
     name: str
     caption: str
     columns: tuple[Column, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[Mapping[str, Entry], ...]
     notes: tuple[str, ...] = ()
     selected: int | None = None
+    grouped: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        caption: str,
+        columns: Sequence[Column],
+        rows: Iterable[Sequence[Entry]],
+        notes: Sequence[str] = (),
+        *,
+        selected: int | None = None,
+        grouped: bool = False,
+    ) -> Table:
+        """Make a table whose rows have their entries in the order of the columns."""
+        keys = [column.key for column in columns]
+        by_key = tuple(dict(zip(keys, row, strict=True)) for row in rows)
+        return cls(name, caption, tuple(columns), by_key, tuple(notes), selected, grouped)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of all columns, as the rows have them."""
+        return tuple(
+            dict.fromkeys(key for row in self.rows for key in row)
+            or (column.key for column in self.columns)
+        )
+
+    @property
+    def shown_columns(self) -> tuple[Column, ...]:
+        """The columns that have a heading."""
+        return tuple(column for column in self.columns if column.heading)
+
+    @property
+    def shown_rows(self) -> tuple[tuple[Cell, ...], ...]:
+        """Cells of the columns that have a heading."""
+        return tuple(
+            tuple(column.shown(row.get(column.key, "")) for column in self.shown_columns)
+            for row in self.rows
+        )
 
 
 def csv_text(table: Table) -> str:
-    """Write a table as CSV: keys as header, numbers in SI units and full precision."""
+    """Write a table as CSV: keys as header, numbers in SI units and full precision.
+
+    What is not known is an empty field.
+    """
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([column.key for column in table.columns])
-    for row in table.rows:
-        writer.writerow([_plain(cell) for cell in row])
+    writer = csv.DictWriter(buffer, table.keys, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(json_rows(table))
     return buffer.getvalue()
 
 
-def number(value: float | None, form: str = ".4g", factor: float = 1.0) -> Number:
+def json_rows(table: Table) -> list[dict[str, Value]]:
+    """Return the rows as plain values by their keys; None for what is not known or not finite."""
+    return [{key: _plain(entry) for key, entry in row.items()} for row in table.rows]
+
+
+def _plain(entry: Entry) -> Value:
+    value = entry.value if isinstance(entry, Cell) else entry
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def terminal_table(table: Table) -> rich.table.Table:
+    """Make a table for the terminal, at least as wide as its title."""
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    shown = RichTable(
+        title=Text(table.caption, style="bold"), title_justify="left",
+        caption=Text("\n".join(table.notes)) if table.notes else None, caption_justify="left",
+        min_width=len(table.caption),
+        box=box.SIMPLE_HEAD, padding=(0, 1), header_style="bold", show_edge=False, pad_edge=False,
+    )  # fmt: skip
+    spreads = [column.spread for column in table.shown_columns]
+    for column in table.shown_columns:
+        if not column.spread:
+            shown.add_column(Text(column.heading), justify="right" if column.numeric else "left")
+    rows = table.shown_rows
+    for place, row in enumerate(rows):
+        cells: list[Text] = []
+        for cell, spread in zip(row, spreads, strict=True):
+            if not spread:
+                cells.append(Text(cell.text, style="dim italic" if cell.doubtful else ""))
+            elif cell.value:
+                # No space follows the ±, so that a narrow terminal breaks the line before it.
+                cells[-1].append(f" ±{cell.text}")
+        ends = table.grouped and row[0].text != rows[min(place + 1, len(rows) - 1)][0].text
+        shown.add_row(*cells, end_section=ends, style="bold" if place == table.selected else "")
+    return shown
+
+
+def number(value: float | None, form: str = ".4g", factor: float = 1.0) -> Cell:
     """Show `value` times `factor` in a format; a dash if it is not known or not finite."""
     if value is None or not math.isfinite(value):
-        return Number(None, ABSENT)
-    return Number(float(value), f"{factor * value:{form}}".replace("-", "−"))
+        return Cell(None, ABSENT)
+    return Cell(float(value), f"{factor * value:{form}}".replace("-", "−"))
 
 
-def count(value: int) -> Number:
+def count(value: int) -> Cell:
     """Show a whole number."""
-    return Number(value, str(value))
+    return Cell(value, str(value))
 
 
 def estimate(
     values: Sequence[float | None], std: float | None, factor: float = 1.0
-) -> tuple[Number, ...]:
+) -> tuple[Cell, ...]:
     """Show numbers that are uncertain by `std`, all to its second digit."""
     if std is None or not math.isfinite(std) or std <= 0:
         return tuple(number(value, ".5g", factor) for value in values)
     decimals = max(1 - math.floor(math.log10(factor * std)), 0)
     form = f".{decimals}f" if decimals <= 7 else ".4g"
     return tuple(number(value, form, factor) for value in values)
-
-
-def _plain(cell: Cell) -> str:
-    if isinstance(cell, str):
-        return cell
-    return "" if cell.value is None else repr(cell.value)
 
 
 MARK: Final = "†"
@@ -146,14 +268,14 @@ def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str
     )
 
 
-def marked(number: Number) -> Number:
+def marked(cell: Cell) -> Cell:
     """Mark a number that is not reported; a dash needs no mark."""
-    return greyed(number if number.value is None else replace(number, text=number.text + MARK))
+    return greyed(cell if cell.value is None else replace(cell, text=cell.text + MARK))
 
 
-def greyed(number: Number) -> Number:
+def greyed(cell: Cell) -> Cell:
     """Show a number in grey, such as what belongs to one that is marked."""
-    return replace(number, doubtful=number.value is not None)
+    return replace(cell, doubtful=cell.value is not None)
 
 
 def footnotes(withheld: Collection[str]) -> tuple[str, ...]:

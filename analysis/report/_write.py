@@ -5,34 +5,19 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
+from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
-from analysis.report._folder import OutputError, write_new
-from analysis.report._html import drawing, photograph, svg_text
-from analysis.report._record_page import NAMES, illustrations, page
-from analysis.report._record_tables import (
-    amplitude_tables,
-    condition_table,
-    correlations_table,
-    modes_table,
-    parameters_table,
-    peaks_table,
-    sizes_table,
-    structures_table,
-    welch_fits_table,
-)
+from analysis.report._folder import write_new
 from analysis.report._table import Table, csv_text
+from analysis.report._text import as_text, record_text, tables_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
-    from rich.console import RenderableType
-
     from analysis.paper import WelchAnalysis
-    from analysis.report._html import Markup
     from analysis.results import Subject
 
-FIGURES: Final = NAMES
 _WELCH_FIGURE: Final = "frf"
 _WELCH_DESCRIPTION: Final = (
     "Frequency response by Welch's method, as in the paper, with the fits of each type and "
@@ -61,67 +46,58 @@ def write_html_report(
 
     Raises
     ------
-    OutputError
-        If a file cannot be written.
+    OutputExistsError, OutputError
+        If a file exists, or cannot be written.
     """
     from analysis.report import _style as style
+    from analysis.report._page import Picture
+    from analysis.report._record_figures import illustrations
+    from analysis.report._record_page import record_page
 
-    drawings = []
+    pictures = []
     with style.styled():
         for shown in illustrations(subject):
             target = folder / "figures" / f"{shown.name}.png"
-            try:
-                target.parent.mkdir(exist_ok=True)
-                style.save(shown.figure, target)
-            except OSError as error:
-                raise OutputError(
-                    f"{target} cannot be written: {error.strerror or error}."
-                ) from error
-            svg = svg_text(shown.figure)
-            write_new(target.with_suffix(".svg"), svg)
-            drawings.append(drawing(svg, shown.name, shown.description))
+            png = style.save(shown.figure, target)
+            svg = style.save_svg(shown.figure, target.with_suffix(".svg"))
+            pictures.append(Picture(shown.name, shown.description, png, svg))
             on_step(f"figure {shown.name}")
-    modes, tables, of_paper = report_tables(subject)
-    for table in (modes, *tables, *of_paper):
+    modes, of_record, of_paper = report_tables(subject)
+    for table in (modes, *of_record, *of_paper):
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
-    paper: list[Markup | Table] = [
-        *_welch_figure(folder, shown=subject.welch is not None),
-        *of_paper,
-    ]
+    welch = folder / f"{_WELCH_FIGURE}.png"
+    paper_pictures = []
+    if subject.welch is not None and welch.exists():
+        name = f"welch_{_WELCH_FIGURE}"
+        paper_pictures = [Picture(name, _WELCH_DESCRIPTION, welch.read_bytes())]
     made_at = made_at or datetime.now().astimezone()
-    write_new(folder / "report.html", page(subject, drawings, modes, tables, paper, made_at))
+    text = record_page(subject, pictures, modes, of_record, made_at, paper_pictures, of_paper)
+    write_new(folder / "report.html", text)
 
 
 def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Make the table of modes, those of the whole-record fits, and those of the paper's route."""
-    condition = condition_table(subject)
-    tables = (
-        sizes_table(subject),
-        parameters_table(subject),
+    condition = tables.condition_table(subject)
+    of_record = (
+        tables.sizes_table(subject),
+        tables.parameters_table(subject),
         *(() if condition is None else (condition,)),
-        correlations_table(subject),
-        *amplitude_tables(subject),
-        structures_table(subject),
+        tables.correlations_table(subject),
+        *tables.amplitude_tables(subject),
+        tables.structures_table(subject),
     )
     welch = subject.welch
     of_paper = (
-        () if welch is None else (welch_fits_table(welch, subject.unsupported), peaks_table(welch))
+        ()
+        if welch is None
+        else (tables.welch_fits_table(welch, subject.unsupported), tables.peaks_table(welch))
     )
-    return modes_table(subject), tables, of_paper
-
-
-def _welch_figure(folder: Path, *, shown: bool) -> list[Markup]:
-    picture = folder / f"{_WELCH_FIGURE}.png"
-    if not shown or not picture.exists():
-        return []
-    return [photograph(picture.read_bytes(), f"welch_{_WELCH_FIGURE}", _WELCH_DESCRIPTION)]
+    return tables.modes_table(subject), of_record, of_paper
 
 
 _FIGURES: Final = ("signals", "frf", "torque")
 _FIGURES_BESIDE_RECORD: Final = ("frf",)
 """Of the paper's route, where the whole-record fit has signals and torque of its own."""
-
-TEXT_WIDTH: Final = 120
 
 
 def write_report(
@@ -146,8 +122,8 @@ def write_report(
 
     Raises
     ------
-    OutputError
-        If a file cannot be written.
+    OutputExistsError, OutputError
+        If a file exists, or cannot be written.
     """
     if analysis is not None:
         _draw(
@@ -176,19 +152,12 @@ def _draw(
 ) -> None:
     from analysis.report import _style as style
     from analysis.report._frf_figure import frf_figure
-    from analysis.report._signal_figures import paper_signals_figure as signals_figure
-    from analysis.report._signal_figures import torque_figure
+    from analysis.report._signal_figures import paper_signals_figure, torque_figure
 
-    drawn = {"signals": signals_figure, "frf": frf_figure, "torque": torque_figure}
+    drawn = {"signals": paper_signals_figure, "frf": frf_figure, "torque": torque_figure}
     for name in names:
         with style.styled():
-            figure = drawn[name](analysis)
-            try:
-                style.save(figure, folder / f"{name}.png")
-            except OSError as error:
-                raise OutputError(
-                    f"{folder / name}.png cannot be written: {error.strerror or error}."
-                ) from error
+            style.save(drawn[name](analysis), folder / f"{name}.png")
         on_step(f"figure {name}")
 
 
@@ -196,24 +165,4 @@ def _text(analysis: WelchAnalysis | None, subject: Subject | None) -> str:
     """Return the tables of the paper's route, or without it those of the whole record."""
     if analysis is not None:
         return tables_text(analysis, () if subject is None else subject.withheld)
-    if subject is None:
-        return ""
-    from analysis.report._text import record_text
-
-    return _as_text(record_text(subject))
-
-
-def tables_text(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> str:
-    """Return the tables as plain text, with orders marked that the data do not support."""
-    from analysis.report._text import analysis_tables
-
-    return _as_text(analysis_tables(analysis, withheld))
-
-
-def _as_text(shown: RenderableType) -> str:
-    from rich.console import Console
-
-    console = Console(width=TEXT_WIDTH, color_system=None, force_terminal=False)
-    with console.capture() as capture:
-        console.print(shown)
-    return capture.get()
+    return "" if subject is None else as_text(record_text(subject))

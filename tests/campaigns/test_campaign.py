@@ -15,8 +15,8 @@ from analysis.campaigns._validation import forecasts, left_out_errors
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.report._campaign_document import campaign_document
-from analysis.report._campaign_tables import campaign_tables, tables_text
 from analysis.report._campaign_write import write_campaign
+from analysis.report._text import campaign_tables, campaign_text
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     assert structure.startswith("The numbers are those of type VI: damping by the material (")
     assert not found.homogeneity.mixed
     assert any("they repeat" in sentence for sentence in verdict.sentences)
-    assert "\nThe numbers are those of type VI: damping" in tables_text(found)
+    assert "\nThe numbers are those of type VI: damping" in campaign_text(found)
     document = campaign_document(found)
     assert document["verdict"]["structure"] == "III"
     *each, shared = document["headlines"]
@@ -216,8 +216,8 @@ def test_indices_of_a_whole_record_estimate_are_of_its_response(done):
 def test_the_paper_s_numbers_stand_beside_only_on_request(done):
     found, _ = done
     assert campaign_tables(found)
-    assert "the paper's" not in tables_text(found)
-    assert "(1.33)" in tables_text(found, with_paper=True)
+    assert "the paper's" not in campaign_text(found)
+    assert "(1.33)" in campaign_text(found, with_paper=True)
 
 
 def test_no_session_left(tmp_path, settings):

@@ -15,8 +15,9 @@ from analysis.campaigns._homogeneity import Homogeneity, groups, homogeneity
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_figures import pooled_figure
 from analysis.report._campaign_page import campaign_page
-from analysis.report._campaign_rows import all_tables
-from analysis.report._campaign_tables import tables_text
+from analysis.report._campaign_tables import all_tables
+from analysis.report._table import json_rows
+from analysis.report._text import campaign_text
 from rigd.beam import undamped_frequencies_rad_s
 
 STIFFER = 1.03
@@ -149,7 +150,7 @@ def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):
     assert structure.startswith("The numbers are those of type VI")
     assert "type III has the lowest BIC" in structure
     assert not any("they repeat" in each for each in mixture.verdict.sentences)
-    assert tables_text(mixture).startswith("The files are not of one specimen")
+    assert campaign_text(mixture).startswith("The files are not of one specimen")
 
 
 def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
@@ -170,11 +171,11 @@ def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
 
 def test_what_agrees_is_not_marked_as_a_mixture(mixture):
     """Both beams are damped alike; their stiffness is not the same."""
-    rows = [row for row in all_tables(mixture)["pooled"] if row["type"] == "III"]
+    rows = [row for row in json_rows(all_tables(mixture)["pooled"]) if row["type"] == "III"]
     mixed = {row["parameter"] for row in rows if row["mixture"]}
     assert "density_over_stiffness" in mixed
     assert not mixed & {"zeta", "gamma", "delay_s"}
-    text = tables_text(mixture)
+    text = campaign_text(mixture)
     assert "ρ/EI (10⁻³ s²/m⁴) ‡" in text
     assert "ζ (10⁻⁵ s^α) ‡" not in text
     assert "(Table 3), of a mixture" in text
@@ -188,7 +189,7 @@ def test_page_and_json_tell_it_too(mixture):
     assert content["groups"]["files"] == [["0.mcap", "1.mcap"], ["stiff20.mcap", "stiff21.mcap"]]
     assert [row["files"] for row in content["specimens"]] == [4, 1]
     assert {row["mixture"] for row in content["table3"]} == {True}
-    page = campaign_page(mixture, {}, datetime.now(UTC), with_paper=False)
+    page = campaign_page(mixture, (), datetime.now(UTC), with_paper=False)
     assert page.index("The files are not of one specimen") < page.index("type VI: damping")
     for name in ("specimens", "homogeneity"):
         assert f'id="{name}"' in page
@@ -203,11 +204,11 @@ def test_a_structure_that_none_selects_nor_determines_has_its_row(mixture):
     assert four.determined < 2
     assert four.bic_above_lowest > 1000
     assert sum(each.selected_alone for each in mixture.structures) == 4
-    tables = all_tables(mixture)
+    tables = {name: json_rows(table) for name, table in all_tables(mixture).items()}
     (written,) = (row for row in tables["structures"] if row["type"] == "IV")
     assert (written["fitted"], written["selected_alone"]) == (4, 0)
     pooled = [row for row in tables["pooled"] if row["type"] == "IV"]
     assert [row["parameter"] for row in pooled] == ["zeta", "alpha"]
     assert {(row.get("value"), row["reported"]) for row in pooled} == {(None, False)}
-    (line,) = (each for each in tables_text(mixture).splitlines() if each.startswith("IV "))
+    (line,) = (each for each in campaign_text(mixture).splitlines() if each.startswith("IV "))
     assert line.split()[1:3] == ["4", str(four.determined)]

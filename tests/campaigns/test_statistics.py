@@ -15,7 +15,7 @@ from analysis.campaigns._statistics import (
 )
 from analysis.models import STRUCTURES, FrequencyResponseModel
 from analysis.paper._route import Peak, resonant_peaks
-from analysis.report import _campaign_rows as paper
+from analysis.report import _paper_numbers as paper
 from rigd.beam import transfer
 
 DATA = Path(__file__).parents[1] / "data"

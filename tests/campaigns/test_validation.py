@@ -14,7 +14,7 @@ from analysis.identify import BAND_HZ
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_figures import validation_figure
 from analysis.report._campaign_page import campaign_page
-from analysis.report._campaign_tables import tables_text
+from analysis.report._text import campaign_text
 
 
 def ends_at_one(path, tried, band_hz):
@@ -55,10 +55,10 @@ def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
 
 
 def test_terminal_page_and_files_account_for_it(shaken):
-    lines = tables_text(shaken).splitlines()
+    lines = campaign_text(shaken).splitlines()
     (row,) = (line for line in lines if line.startswith("record   III "))
     assert "3 of 4" in row
-    page = campaign_page(shaken, {}, datetime.now(UTC), with_paper=False)
+    page = campaign_page(shaken, (), datetime.now(UTC), with_paper=False)
     assert "3 of 4" in page
     assert f"Not predicted from the others: {shaken.lost_trials[0].path}: its worker" in page
     content = campaign_document(shaken)
@@ -101,4 +101,4 @@ def test_what_was_found_is_kept_though_all_workers_go(make_session):
 def test_nothing_is_said_where_nothing_was_asked(short_sessions, settings):
     found = campaign(short_sessions[:2], settings, structures=(), jobs=1)
     assert (found.trials, found.validation, found.lost_trials) == (0, (), ())
-    assert "predicted" not in tables_text(found)
+    assert "predicted" not in campaign_text(found)

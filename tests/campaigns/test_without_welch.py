@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,9 @@ from analysis.campaigns import campaign
 from analysis.campaigns._campaign import _of_one_experiment
 from analysis.campaigns._session import SessionFailure, SessionTask, analyse_session
 from analysis.models import WelchSettings
-from analysis.report._campaign_tables import tables_text
+from analysis.report._campaign_page import campaign_page
 from analysis.report._campaign_write import write_campaign
+from analysis.report._text import campaign_text
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def found(make_file, tmp_path_factory):
     paths = [
         make_file(
             folder / f"{seed}.mcap", seed, excitation="multisine", specimen="A", operator="Eve",
-            note="[clamp] new",
+            note="[clamp] <b>new</b>",
         )
         for seed in range(2)
     ]  # fmt: skip
@@ -53,9 +55,12 @@ def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
 
 
 def test_sessions_are_listed_with_what_their_files_say(found):
-    line = next(each for each in tables_text(found).splitlines() if each.startswith("0.mcap "))
-    for said in ("A", "Eve", "[clamp] new", "yes"):
+    line = next(each for each in campaign_text(found).splitlines() if each.startswith("0.mcap "))
+    for said in ("A", "Eve", "[clamp] <b>new</b>", "yes"):
         assert said in line
+    page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper=False)
+    assert "[clamp] &lt;b&gt;new&lt;/b&gt;" in page
+    assert "<b>" not in page
 
 
 def test_an_odd_session_is_set_aside_and_does_not_cost_the_others_theirs(make_session):

@@ -59,7 +59,7 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert len(of_paper) == 12
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
     assert (best["type"], best["weighting"]) == ("VI", "omega")
-    for word in ("verdict", "fits", "resonant peaks", "modes", "session.report", "fits.json"):
+    for word in ("verdict", "Fits", "Resonant peaks", "Modes of", "session.report", "fits.json"):
         assert word in result.stdout
     assert (report / "tables.txt").read_text().splitlines()[0] in result.stdout
     # Welch's windows bias the damping by a third; the whole record tells the plant's.
@@ -86,7 +86,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     assert names == [
         (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
     ]  # fmt: skip
-    assert "resonant peaks" in result.stderr
+    assert "Resonant peaks" in result.stderr
     assert (tmp_path / "out" / "signals.png").exists()
 
 

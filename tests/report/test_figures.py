@@ -10,6 +10,7 @@ from analysis.models import WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
 from analysis.report import _style as style
+from analysis.report._folder import OutputExistsError
 from analysis.report._frf_figure import frf_figure
 from analysis.report._signal_figures import best_model, torque_figure
 from analysis.report._signal_figures import paper_signals_figure as signals_figure
@@ -141,6 +142,6 @@ def test_an_envelope_keeps_extremes_and_bounds_the_points():
 def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
     target = tmp_path / "a.png"
     target.write_bytes(b"mine")
-    with style.styled(), pytest.raises(FileExistsError):
+    with style.styled(), pytest.raises(OutputExistsError):
         style.save(style.new_figure(4, 3, "a", "b"), target)
     assert target.read_bytes() == b"mine"

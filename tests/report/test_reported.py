@@ -15,12 +15,16 @@ from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._bands import excited_band_hz, supported_band_hz
 from analysis.report._document import document
-from analysis.report._record_page import damping_sentences, illustrations, page
-from analysis.report._table import MARK, Number, csv_text, unreported
-from analysis.report._text import record_text
-from analysis.report._write import report_tables, tables_text
+from analysis.report._page import Picture
+from analysis.report._record_figures import illustrations
+from analysis.report._record_page import record_page
+from analysis.report._sentences import damping_sentences
+from analysis.report._table import MARK, Cell, csv_text, unreported
+from analysis.report._text import record_text, tables_text
+from analysis.report._write import report_tables
 
 ALPHA = frozenset({"alpha"})
+PICTURES = (Picture("one", "A figure.", b""), Picture("two", "Another one.", b""))
 REASON = "order 1 on another beam explains as much"
 
 
@@ -44,26 +48,27 @@ def test_an_order_takes_its_coefficient_with_it():
 
 def test_tables_mark_every_such_number_and_no_other(careful):
     modes, (_sizes, parameters, _correlations, structures), (welch, _peaks) = report_tables(careful)
-    shown = {row[0]: row for row in parameters.rows}
+    shown = {row["parameter"]: row for row in parameters.rows}
     for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
-        number = shown[symbol][3]
+        number = shown[symbol]["value_si"]
         assert (number.value, number.doubtful) == (careful.fit.parameters[name], True)
         assert MARK in number.text
-        assert shown[symbol][-1] == REASON
-    assert [cell.value for cell in shown["α"][5:7]] == [0.9, 1.2]
-    assert shown["λ"][3].value == careful.fit.parameters["lambda"]
-    assert MARK not in shown["λ"][3].text
-    for table, first in ((structures, 2), (welch, 2)):
+        assert shown[symbol]["remark"] == REASON
+    assert [shown["α"][end].value for end in ("low_si", "high_si")] == [0.9, 1.2]
+    assert shown["λ"]["value_si"].value == careful.fit.parameters["lambda"]
+    assert MARK not in shown["λ"]["value_si"].text
+    unsupported = ("zeta", "zeta_std", "alpha", "alpha_std")
+    for table in (structures, welch):
         for row in table.rows:
-            doubtful = [cell.doubtful for cell in row if isinstance(cell, Number)]
-            known = [cell.value is not None for cell in row[first : first + 4]]
-            assert doubtful[:4] == known  # of zeta and alpha, value and std
-            assert not any(doubtful[4:])
+            cells = {key: cell for key, cell in row.items() if isinstance(cell, Cell)}
+            assert cells.keys() >= {*unsupported, "gamma", "lambda"}
+            for key, cell in cells.items():
+                assert cell.doubtful == (key in unsupported and cell.value is not None)
         assert any(MARK in note and "α" in note and "λ" not in note for note in table.notes)
     by_type = {row["type"]: row for row in csv.DictReader(csv_text(structures).splitlines())}
     assert by_type["VI"]["not_reported"] == "alpha zeta"
     assert float(by_type["VI"]["alpha"]) == careful.fit.parameters["alpha"]
-    assert [row[0].text for row in modes.rows] == ["1", "2", f"3{MARK}"]
+    assert [row[0].text for row in modes.shown_rows] == ["1", "2", f"3{MARK}"]
     assert "does not show" in modes.notes[0]
 
 
@@ -76,11 +81,11 @@ def test_of_absent_damping_no_fit_tells_the_order(record_subject):
     assert not subject.withheld
     assert subject.unsupported == {"lambda"}
     _modes, (*_others, structures), (welch, _peaks) = report_tables(subject)
-    for table, first, of_type in ((structures, 2, 0), (welch, 2, 0)):
+    for table in (structures, welch):
         assert any(MARK in note and "λ" in note for note in table.notes)
         for row in table.rows:
-            marks = [MARK in cell.text for cell in row[first : first + 8 : 2]]
-            external = row[of_type] not in ("I", "IV")
+            marks = [MARK in row[name].text for name in ("zeta", "alpha", "gamma", "lambda")]
+            external = row["type"] not in ("I", "IV")
             assert marks == [False, False, external, external]
     for fit in document([subject.welch], subjects=[subject])["fits"]:
         assert fit["withheld"] == ([] if fit["type"] in ("I", "IV") else ["gamma", "lambda"])
@@ -90,13 +95,13 @@ def test_nothing_is_marked_where_all_is_supported(record_subject):
     modes, tables, of_paper = report_tables(record_subject)
     for table in (modes, *tables, *of_paper):
         assert MARK not in csv_text(table) + "".join(table.notes)
-        assert not any(c.doubtful for row in table.rows for c in row if isinstance(c, Number))
+        assert not any(cell.doubtful for row in table.shown_rows for cell in row)
 
 
 def test_page_terminal_and_text_tables_show_the_mark(careful):
     modes, tables, of_paper = report_tables(careful)
     made_at = datetime(2026, 1, 1, tzinfo=UTC)
-    text = page(careful, ["", ""], modes, tables, of_paper, made_at)
+    text = record_page(careful, PICTURES, modes, tables, made_at, (), of_paper)
     alpha = careful.fits["VI"].parameters["alpha"]
     cells = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
     assert len(cells) == 2  # among the parameters, and among the structures

@@ -7,8 +7,17 @@ from rich.console import Console
 from analysis.models import WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report._text import summary_table, with_spread
-from analysis.report._write import tables_text
+from analysis.report._table import (
+    WORDS,
+    Cell,
+    Column,
+    Table,
+    csv_text,
+    estimate,
+    json_rows,
+    terminal_table,
+)
+from analysis.report._text import as_text, summary_table, tables_text
 from rigd.beam import modes
 
 
@@ -21,12 +30,14 @@ from rigd.beam import modes
         (1234.5, 300.0, "1234 ±300"),
         (1.0, 0.0, "1"),
         (0.123456789, None, "0.12346"),
-        (2.0, 1e-9, "2 ±1.0e-09"),
+        (2.0, 1e-9, "2 ±1e−09"),
         (3.0, float("nan"), "3"),
     ],
 )
 def test_a_value_shows_the_digits_its_spread_leaves(value, std, text):
-    assert with_spread(value, std) == text
+    columns = (Column("value", "value"), Column("std", "std", spread=True))
+    table = Table.of("name", "", columns, [estimate((value, std), std)])
+    assert as_text(terminal_table(table)).split("\n")[2].strip() == text
 
 
 def rows(text, *starts):
@@ -51,7 +62,7 @@ def test_the_tables_hold_every_fit_with_its_numbers(paper_analysis):
     assert [float(cell) for cell in measured[4:]] == pytest.approx(
         [peak.magnitude_db for peak in paper_analysis.peaks], abs=1e-3
     )
-    assert "standard deviation" in text
+    assert "standard deviation" in " ".join(text.split())
 
 
 def test_absent_and_fixed_parameters_are_told_apart(paper_analysis):
@@ -121,3 +132,36 @@ def test_modes_that_left_their_resonance_are_marked(paper_analysis):
     assert marked[2] == "8.5000‡"
     assert marked[5] == f"{last[5]}‡"
     assert "‡ more than 10 % off" in " ".join(text.split())
+
+
+def test_one_table_is_shown_in_its_units_and_written_in_full():
+    """A file's name may look like markup, a value may be missing, unknown or for programs only."""
+    columns = (
+        Column("file", "file", WORDS), Column("ζ (1e-5)", "zeta", ".2f", 1e5),
+        Column("std", "zeta_std", ".2f", 1e5, spread=True), Column("used", "used", WORDS),
+    )  # fmt: skip
+    rows = (
+        {"file": Cell("/a/[b]x[/b]", "[b]x[/b]"), "zeta": 1.23456789e-5, "zeta_std": 1e-7,
+         "used": True, "cost": 3},
+        {"file": "y", "zeta": math.nan, "used": False, "cost": 4},
+    )  # fmt: skip
+    table = Table("name", "A table", columns, rows, ("[i] note",))
+    _, head, _, first, second, note, *_ = as_text(terminal_table(table)).split("\n")
+    assert head.split() == ["file", "ζ", "(1e-5)", "used"]
+    assert first.split() == ["[b]x[/b]", "1.23", "±0.01", "yes"]
+    assert second.split() == ["y", "–", "no"]
+    assert note.strip() == "[i] note"
+    assert csv_text(table).splitlines() == [
+        "file,zeta,zeta_std,used,cost", "/a/[b]x[/b],1.23456789e-05,1e-07,True,3", "y,,,False,4",
+    ]  # fmt: skip
+    assert json_rows(table) == [
+        {"file": "/a/[b]x[/b]", "zeta": 1.23456789e-5, "zeta_std": 1e-7, "used": True, "cost": 3},
+        {"file": "y", "zeta": None, "used": False, "cost": 4},
+    ]
+
+
+def test_rows_that_belong_together_are_ruled_off():
+    columns = (Column("type", "type", WORDS), Column("n", "n"))
+    table = Table.of("name", "", columns, [("I", 1), ("I", 2), ("II", 3)], grouped=True)
+    lines = [line.strip() for line in as_text(terminal_table(table)).splitlines()]
+    assert [line.split() for line in lines[2:]] == [["I", "1"], ["I", "2"], [], ["II", "3"]]
