@@ -157,7 +157,7 @@ class Window:
 def test_the_window_goes_on_to_whatever_takes_the_place_of_its_view(view, monkeypatch, capsys):
     second, third = replace(view, server=2), replace(view, server=3, grpc_port=1234)
     there = iter([[view], [view], [second], [], [], [third], [third], [third]])
-    monkeypatch.setattr("rigd.daemon._client.find_views", lambda rig: next(there))
+    monkeypatch.setattr("rigd.daemon.find_views", lambda rig: next(there))
     monkeypatch.setattr("time.sleep", lambda _: None)
     window = Window(looks=8)
     assert _follow(window, view) == 0
@@ -190,7 +190,7 @@ def test_the_view_of_a_daemon_is_found_through_it_where_its_files_cannot_be_read
 
 
 def test_a_daemon_whose_view_is_about_to_begin_is_named(rigd_here, monkeypatch):
-    monkeypatch.setattr("rigd.daemon._client.daemons", lambda: {"sim": True})
+    monkeypatch.setattr("rigd.daemon.daemons", lambda: {"sim": True})
     done = rigd_here("live")
     assert done.returncode == 1
     assert "The daemon of the rig sim has no live view at the moment" in done.stderr

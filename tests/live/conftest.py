@@ -385,7 +385,8 @@ def own_port():
 
     When its server is replaced, Rerun's own may have gone to a publisher of another test.
     """
-    return f"from rigd.live import _server as outlet; outlet.GRPC_PORT = {20_000 + os.getpid() % 10_000}"
+    port = 20_000 + os.getpid() % 10_000
+    return f"from rigd.live import _server as outlet; outlet.GRPC_PORT = {port}"
 
 
 @pytest.fixture

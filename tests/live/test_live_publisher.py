@@ -98,7 +98,8 @@ def test_two_rigs_have_a_view_each(publisher, start_producer, start_publisher, a
     own = publisher.ports
     # The port was free when it was looked at, and taken a moment later.
     race = f"outlet.free_port = lambda _: {publisher.address.grpc_port}" if at_once else "pass"
-    other = start_publisher(start_producer(), first=f"from rigd.live import _server as outlet; {race}")
+    first = f"from rigd.live import _server as outlet; {race}"
+    other = start_publisher(start_producer(), first=first)
     assert not other.ports & own
     assert all(accepts(port) for port in other.ports | own)
 
@@ -190,7 +191,8 @@ def test_a_frozen_server_is_waited_for_by_nobody(start_producer, start_publisher
 def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher, receive, own_port):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
-        producer, first=f"from rigd.live import _feed as feed; feed._MOST_STALLED_LOOKS = 20; {own_port}"
+        producer,
+        first=f"from rigd.live import _feed as feed; feed._MOST_STALLED_LOOKS = 20; {own_port}",
     )
     frozen = publisher.server_pid
     os.kill(frozen, signal.SIGSTOP)
