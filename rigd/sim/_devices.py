@@ -52,7 +52,7 @@ class SimulatedRig:
         if rig.simulation is None:
             raise DeviceError(
                 "The profile has no section [simulation], which a simulated rig needs; copy it "
-                "from hw_profiles/sim.toml."
+                "from that of rigd profiles show sim."
             )
         weights: tuple[float, ...] = (1.0,)
         self.records_per_period = 1
