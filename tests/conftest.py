@@ -192,7 +192,7 @@ def rigd_here(tmp_path, monkeypatch):
     no_crew = StopRequest(), contextlib.nullcontext()
     for command in ("run", "identify"):
         monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
-    monkeypatch.setattr("rigd.runtime._signals.ignore", lambda **_: None)  # of the test runner
+    monkeypatch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
 
     return partial(run_here, app)
 
