@@ -14,7 +14,7 @@ print("through")
 """
 A_FEW = """
 import logging
-from rigd.daemon import log
+from rigd.daemon import _log as log
 from rigd.daemon._log import NAME, Log
 
 log._FLUSH_S = 60.0  # the machine may stand still for longer than a daemon would wait
