@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify import LOGARITHMIC, ResponseGrid
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from analysis.identify import RecordAnalysis
@@ -83,7 +84,6 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     return float(edges_hz[loud[0] * _BLOCK]), float(edges_hz[(loud[-1] + 1) * _BLOCK - 1])
 
 
-NORMAL_95: Final = 1.959963984540054
 _QUARTER_TURN: Final = np.pi / 2
 _GRADIENT_NAMES: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",

@@ -21,7 +21,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from analysis.identify import fast_length
 from analysis.report import _style as style
-from analysis.report._bands import NORMAL_95, loss_factors, response_band, supported_band_hz
+from analysis.report._bands import loss_factors, response_band, supported_band_hz
+from analysis.statistics import NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
 

@@ -8,7 +8,6 @@ from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
 from analysis.paper import LARGEST_SHIFT
-from analysis.report._bands import NORMAL_95
 from analysis.report._table import (
     ABSENT,
     MARK,
@@ -25,6 +24,7 @@ from analysis.report._table import (
     number,
     unreported,
 )
+from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import pickle
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,23 +16,9 @@ from rigd.profile._load import profile_of
 
 
 @pytest.fixture
-def refuse(tmp_path, sim_toml):
+def refuse(complaints_of, sim_toml):
     """Change the shipped profile, load it, and return the lines of the complaint."""
-
-    def attempt(*changes: tuple[str, str]) -> list[str]:
-        text = sim_toml
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new, 1)
-        path = tmp_path / "rig.toml"
-        path.write_text(text, encoding="utf-8")
-        with pytest.raises(ProfileError) as caught:
-            load_profile(path)
-        lines = str(caught.value).splitlines()
-        assert all(line.startswith(f"{path}: ") for line in lines)
-        return [line.removeprefix(f"{path}: ") for line in lines]
-
-    return attempt
+    return partial(complaints_of, sim_toml)
 
 
 INERTIA = 'inertia_kg_m2 = { value = 2.0e-3, source = "assumed" }'

@@ -7,28 +7,18 @@ import pytest
 
 from rigd.control import check_stability, close_loop
 from rigd.excitation import chirp
-from rigd.profile import ProfileError, load_profile
+from rigd.profile import load_profile
 from rigd.runner._planning import plan_session
 
 HW_PROFILES = Path(__file__).parents[2] / "hw_profiles"
 
 
 @pytest.fixture
-def refuse(tmp_path):
+def refuse(complaints_of):
     """Change a shipped profile, load it, and return the lines of the complaint."""
 
     def attempt(name: str, *changes: tuple[str, str]) -> list[str]:
-        text = (HW_PROFILES / f"{name}.toml").read_text("utf-8")
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new, 1)
-        path = tmp_path / "rig.toml"
-        path.write_text(text, encoding="utf-8")
-        with pytest.raises(ProfileError) as caught:
-            load_profile(path)
-        lines = str(caught.value).splitlines()
-        assert all(line.startswith(f"{path}: ") for line in lines)
-        return [line.removeprefix(f"{path}: ") for line in lines]
+        return complaints_of((HW_PROFILES / f"{name}.toml").read_text("utf-8"), *changes)
 
     return attempt
 
