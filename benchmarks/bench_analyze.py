@@ -17,6 +17,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigd.runtime import use_one_thread
+
 RUNS = 5
 GOAL_S = 6.0
 GOAL_MB = 1000
@@ -108,8 +110,7 @@ def steps(session: Path, folder: Path) -> dict[str, float]:
 
 def main() -> None:
     """Print costs, their ratios to the peers, and the steps."""
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # as the command sets them
+    use_one_thread()  # as the command does
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         session = Path(sys.argv[1]) if len(sys.argv) > 1 else recorded_session(folder)

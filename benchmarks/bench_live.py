@@ -17,11 +17,11 @@ from pathlib import Path
 
 from rigd.bench import Measurement, figures, measurement
 from rigd.bench import _loops as loops
-from rigd.engine import LIVE, SINGLE_THREADED, Phase
+from rigd.engine import LIVE, Phase
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
 from rigd.runner import Order
-from rigd.runtime import StopRequest
+from rigd.runtime import StopRequest, use_one_thread
 from rigd.session import read_session
 
 RATE_HZ = 1000.0
@@ -124,7 +124,7 @@ def main() -> None:
     """Print every round, then the medians."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
     rounds = int(sys.argv[2]) if len(sys.argv) > 2 else 5
-    os.environ.update(SINGLE_THREADED)
+    use_one_thread()
     ratios, costs = [], []
     for _ in range(rounds):
         p99 = {}

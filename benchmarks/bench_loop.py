@@ -18,8 +18,8 @@ from rigd.bench import HELD, HIGHEST_HZ, Figures, Measurement, core_of, cores_be
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
 from rigd.checks import settings_granted
-from rigd.engine import SINGLE_THREADED
 from rigd.profile import load_profile
+from rigd.runtime import use_one_thread
 
 RATE_HZ = 1000.0
 TRIES = 3
@@ -117,7 +117,7 @@ def main() -> None:
     """Print every round, then the ratios."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
     count = int(sys.argv[2]) if len(sys.argv) > 2 else 3
-    os.environ.update(SINGLE_THREADED)
+    use_one_thread()
     granted = settings_granted(load_profile("sim").realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     if not cyclictest.installed():

@@ -12,8 +12,9 @@ def main() -> None:
     signal.signal(signal.SIGINT, _end)
     _fill_standard_descriptors()
     from rigd.cli.app import main as run
-    from rigd.runtime import let_pass
+    from rigd.runtime import let_pass, use_one_thread
 
+    use_one_thread()
     try:
         run()
     finally:

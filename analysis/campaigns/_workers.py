@@ -27,6 +27,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from analysis.campaigns._experiment import CampaignError
+from rigd.runtime import SINGLE_THREADED, use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -171,9 +172,6 @@ class Workers:
         return seen
 
 
-_ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
-
 @contextmanager
 def process_pool(jobs: int) -> Iterator[Workers]:
     """Pool of fresh processes, whose linear algebra has one thread each.
@@ -182,8 +180,8 @@ def process_pool(jobs: int) -> Iterator[Workers]:
     ignore Ctrl-C, which is the caller's to handle, and end with the caller however he ends. Work
     that is under way is dropped when the context is left by an exception.
     """
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    before = {name: os.environ.get(name) for name in SINGLE_THREADED}
+    use_one_thread()
     others = set(multiprocessing.active_children())
     workers = _LocalWorkers(jobs)
     try:

@@ -27,7 +27,7 @@ from analysis.cli.welch_options import (
     choice,
     welch_settings,
 )
-from rigd.runtime import raise_on
+from rigd.runtime import raise_on, use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -113,9 +113,7 @@ app.add_typer(export_app, name="export")
 def main() -> None:
     """Entry point of the command."""
     raise_on(signal.SIGINT)
-    # Threads gain nothing on matrices as small as a fit's, and cost a tenth of the time.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    use_one_thread()
     _quieten_libraries()
     with standard_streams():
         try:

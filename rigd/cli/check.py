@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -107,9 +106,6 @@ def reset(
 
 def _openable_profile(name: str) -> "Profile":
     """Load a profile whose devices this installation can open; any other ends the command."""
-    from rigd.engine import SINGLE_THREADED
-
-    os.environ.update(SINGLE_THREADED)
     from rigd.devices import UnknownDeviceError, check_selection
 
     profile = profile_named(name)
@@ -151,9 +147,6 @@ def bench(
     Example: rigd bench --seconds 10
     """
     raise_on(signal.SIGTERM, signal.SIGHUP)
-    from rigd.engine import SINGLE_THREADED
-
-    os.environ.update(SINGLE_THREADED)
     rig_profile = profile_named(profile)
     from rigd.bench import as_json as document_of
     from rigd.bench import report_lines

@@ -1,7 +1,6 @@
 """``rigd serve``, ``status``, ``stop``, ``tare``, ``zero``: the daemon, and requests to it."""
 
 import json
-import os
 import signal
 import sys
 import time
@@ -53,9 +52,6 @@ def serve(
 
     Example: rigd serve --profile antenna_can --output /data/sessions
     """
-    from rigd.engine import SINGLE_THREADED
-
-    os.environ.update(SINGLE_THREADED)
     from rigd.daemon import AddressError, UnknownGroupError, run_daemon
     from rigd.devices import UnknownDeviceError
     from rigd.profile import ProfileError

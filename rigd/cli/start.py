@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -60,13 +59,12 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.engine import SINGLE_THREADED, ChildError
+    from rigd.engine import ChildError
     from rigd.runner import Crew
     from rigd.runtime import StopRequest
 
     stop = StopRequest()
     stop.catch()
-    os.environ.update(SINGLE_THREADED)
     try:
         return stop, Crew(live=live)
     except OSError as error:

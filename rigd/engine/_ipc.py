@@ -25,11 +25,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rigd.engine._shared_state import Word
-from rigd.runtime import held_back
+from rigd.runtime import SINGLE_THREADED, held_back
 
-SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment in which numpy starts no threads: they gain nothing on matrices as small as ours,
-and would disturb the loop."""
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
 _KILLED_GRACE_S = 2.0

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rigd.devices import Reality
 from rigd.engine._ring import ReferenceSpec
-from rigd.engine._shared_state import ChannelSpecs
+from rigd.engine._topics import ChannelSpecs
 from rigd.profile import Profile, RealtimeSettings
 
 

@@ -8,8 +8,9 @@ from rigd.devices import Devices, LineHealth
 from rigd.engine._cycle import Cycle
 from rigd.engine._ipc import Pulse
 from rigd.engine._ring import Ring
-from rigd.engine._shared_state import CONTROL, UNKNOWN, Board, Channels, Word
+from rigd.engine._shared_state import UNKNOWN, Board, Word
 from rigd.engine._timing import Clock, Metronome
+from rigd.engine._topics import CONTROL, Channels
 from rigd.session import Status, pack_control_into, pack_sample_into, pack_timing_into
 
 

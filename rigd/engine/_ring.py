@@ -22,10 +22,11 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 HEADER_SIZE = 64
 _WRITTEN, _READ = 0, 1
@@ -206,7 +207,7 @@ class ReferenceSpec:
     ticks: int
 
 
-def put_reference(fd: int, reference_rad: NDArray[np.float64]) -> ReferenceSpec:
+def put_reference(fd: int, reference_rad: "NDArray[np.float64]") -> ReferenceSpec:
     """Place a reference, shape (n,), in the memory of `fd`.
 
     Raises
@@ -217,7 +218,7 @@ def put_reference(fd: int, reference_rad: NDArray[np.float64]) -> ReferenceSpec:
     size = _SIZE * reference_rad.size
     reserve(fd, size)
     with mmap.mmap(fd, size) as memory:
-        memory[:] = reference_rad.astype(np.float64).tobytes()
+        memory[:] = reference_rad.astype("float64").tobytes()
     return ReferenceSpec(fd, reference_rad.size)
 
 

@@ -16,8 +16,9 @@ from rigd.engine._cycle import Cycle, Rest, Standstill, observe_rest
 from rigd.engine._ipc import Parent
 from rigd.engine._publish import Display, SampleLog
 from rigd.engine._realtime import page_faults
-from rigd.engine._shared_state import Channels, Event, Level, Phase, Stop, Word, write_event
+from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
 from rigd.engine._timing import SUSPENDED_S, Clock, Metronome, SuspendWatch
+from rigd.engine._topics import Channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import BY_NAME, LOOK_EVERY, OVERLOADED

@@ -1,4 +1,4 @@
-"""Shared state of a rig's processes: words, events and topics, and the memory that holds them.
+"""Shared state of a rig's processes: words that tell where each of them is, and events.
 
 Words
     `Board` holds a few words by which processes tell each other where they are. Each word has one
@@ -8,23 +8,19 @@ Events
     What the control process has to say, as fixed-size records in a ring of their own. The loop must
     not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
     event into the file, the supervisor shows it to the operator.
-Topics
-    What the control process publishes: one table, `TOPICS`, from which the shared memory is laid
-    out, by which the recorder logs, and with which ``rigd status`` compares the rates it sees.
+
+What is published, and the memory that holds all of it, is in `_topics`. This module imports nothing
+heavy, for the processes of a rig are started before anything else.
 """
 
 import contextlib
 import mmap
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from math import ceil
 from typing import Literal, Self
 
-from rigd.engine._ring import Ring, RingSpec, reserve
-from rigd.safety import BUFFERED_S
-from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
+from rigd.engine._ring import Ring, reserve
 
 # Words
 
@@ -192,120 +188,3 @@ def read_events(block: bytes) -> list[Event]:
         text = block[start : start + size].decode(errors="replace")
         events.append(Event(t_ns, LEVELS[level], text))
     return events
-
-
-# Topics
-
-HURRIED_BUFFERED_S = 160.0
-"""What the rings hold under the virtual clock, instead of `BUFFERED_S`: there a session passes in a
-second, and the live view lags."""
-_EVENTS = 256
-
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One kind of record, and its way."""
-
-    name: str
-    """Its channel in the file."""
-    record_size: int
-    """Bytes."""
-    every: int
-    """Ticks of the record from one to the next; 0: whenever there is something to say."""
-    logged: bool
-    """The recorder writes each of them into the file."""
-    live: bool
-    """The live publisher looks at them, as far as it can keep up."""
-    ages_only: bool = False
-    """Not under the virtual clock, where no reading has an age."""
-
-    def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
-        """Return how many records its ring holds."""
-        return ceil(rate_hz * buffered_s / self.every) if self.every else _EVENTS
-
-    def expected_hz(self, rate_hz: float) -> float | None:
-        """Return the records a second of a recorded session; None where the rate is not fixed."""
-        return rate_hz / self.every if self.every else None
-
-
-EVENT = Topic("/rig/event", EVENT_SIZE, every=0, logged=True, live=True)
-CONTROL = Topic("/rig/control", CONTROL_SIZE, every=10, logged=True, live=False)
-TIMING = Topic("/rig/timing", TIMING_SIZE, every=1, logged=True, live=True, ages_only=True)
-SAMPLE = Topic("/rig/sample", SAMPLE_SIZE, every=1, logged=True, live=True)
-
-TOPICS = (EVENT, CONTROL, TIMING, SAMPLE)
-"""The samples last: what explains a sample is in the file no later than the sample."""
-
-
-# Memory of a rig
-
-DESCRIPTORS = len(TOPICS) + 2
-"""File descriptors of shared memory, for :func:`create_channels`."""
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelSpecs:
-    """What a child process needs to attach."""
-
-    rings: tuple[RingSpec, ...]
-    """All rings, in the order of :data:`TOPICS`."""
-    board_fd: int
-
-
-@dataclass(frozen=True, slots=True)
-class Channels:
-    """The rings, in the order of :data:`TOPICS`, and the board."""
-
-    events: Ring
-    controls: Ring
-    timings: Ring
-    samples: Ring
-    board: Board
-    reference_fd: int = -1
-    """Where the supervisor places the reference of a session."""
-
-    @property
-    def rings(self) -> tuple[Ring, ...]:
-        """All rings, in the order of the table."""
-        return (self.events, self.controls, self.timings, self.samples)
-
-    @property
-    def specs(self) -> ChannelSpecs:
-        """Descriptors and layout to hand to a child process."""
-        return ChannelSpecs(tuple(ring.spec for ring in self.rings), self.board.fd)
-
-    def ask_to_stop(self) -> None:
-        """Ask the control process to stop, unless that was done before."""
-        if self.board[Word.STOP] == Stop.NO:
-            self.board[Word.STOP] = Stop.OPERATOR
-
-    def clear(self) -> None:
-        """Forget what the last session left; only while no recorder is at work."""
-        for ring in self.rings:
-            ring.discard()
-
-    def close(self) -> None:
-        """Unmap the memory; the descriptors stay open."""
-        for ring in self.rings:
-            ring.close()
-        self.board.close()
-
-
-def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:
-    """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory."""
-    *for_rings, for_board, for_reference = fds
-    rings = [
-        Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
-        for topic, fd in zip(TOPICS, for_rings, strict=True)
-    ]
-    return _together(rings, Board.create(for_board), for_reference)
-
-
-def attach_channels(specs: ChannelSpecs) -> Channels:
-    """Attach in a child process to what the supervisor made."""
-    return _together([Ring(spec) for spec in specs.rings], Board(specs.board_fd))
-
-
-def _together(rings: Sequence[Ring], board: Board, reference_fd: int = -1) -> Channels:
-    events, controls, timings, samples = rings
-    return Channels(events, controls, timings, samples, board, reference_fd)

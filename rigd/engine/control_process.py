@@ -28,8 +28,9 @@ from rigd.engine._publish import Display
 from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine._ring import map_reference
 from rigd.engine._session_sequence import Procedure, SessionEnd
-from rigd.engine._shared_state import Channels, Event, Phase, Word, attach_channels, write_event
+from rigd.engine._shared_state import Event, Phase, Word, write_event
 from rigd.engine._timing import Clock, Metronome, RealClock, VirtualClock
+from rigd.engine._topics import Channels, attach_channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import LOOK_EVERY

@@ -16,19 +16,16 @@ from pathlib import Path
 from rigd.engine._ipc import Message, Parent
 from rigd.engine._jobs import RecorderJob
 from rigd.engine._realtime import Precedence
-from rigd.engine._shared_state import (
+from rigd.engine._shared_state import Board, Phase, Word, read_events
+from rigd.engine._topics import (
     CONTROL,
     EVENT,
     SAMPLE,
     TIMING,
     TOPICS,
-    Board,
     Channels,
-    Phase,
     Topic,
-    Word,
     attach_channels,
-    read_events,
 )
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import SAMPLE_SIZE, SessionError, SessionExistsError, SessionWriter

@@ -1,4 +1,6 @@
 from ._folder import runtime_folder as runtime_folder
+from ._linear_algebra import SINGLE_THREADED as SINGLE_THREADED
+from ._linear_algebra import use_one_thread as use_one_thread
 from ._locks import HeldError as HeldError
 from ._locks import HeldFile as HeldFile
 from ._locks import RigBusyError as RigBusyError

@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import DESCRIPTORS, Phase, Word, create_channels
+from rigd.engine._shared_state import Phase, Word
+from rigd.engine._topics import DESCRIPTORS, create_channels
 from rigd.engine.recorder import Recorder
 from rigd.excitation import hold
 from rigd.profile import load_profile

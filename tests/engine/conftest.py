@@ -9,8 +9,9 @@ from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine._jobs import SessionJob
 from rigd.engine._ring import put_reference, shared_memory_fd
-from rigd.engine._shared_state import DESCRIPTORS, Phase, Word, create_channels, read_events
+from rigd.engine._shared_state import Phase, Word, read_events
 from rigd.engine._timing import VirtualClock
+from rigd.engine._topics import DESCRIPTORS, create_channels
 from rigd.engine.control_process import attend
 from rigd.excitation import chirp
 from rigd.profile import load_profile

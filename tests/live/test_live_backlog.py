@@ -5,7 +5,8 @@ from functools import partial
 import pytest
 
 from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import DESCRIPTORS, UNKNOWN, Word, create_channels
+from rigd.engine._shared_state import UNKNOWN, Word
+from rigd.engine._topics import DESCRIPTORS, create_channels
 from rigd.live.publisher import LOOK_S, Backlog, Vitals
 
 

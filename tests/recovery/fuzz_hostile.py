@@ -25,6 +25,8 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from rigd.runtime import use_one_thread
+
 MAGIC = b"\x89MCAP0\r\n"
 MOST_MEGABYTES = 500
 MOST_SECONDS = 30
@@ -465,8 +467,7 @@ def cases(count, seed, scale=None):
 
 def warm_up(commands=COMMANDS):
     """Give each command a sound file, so that not every child has to import what they need."""
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")  # as `analyze` does itself
+    use_one_thread()  # as the commands do themselves
     sys.stdout.flush()
     before = os.dup(1), os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)

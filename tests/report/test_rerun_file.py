@@ -15,7 +15,7 @@ from analysis.report._folder import OutputError
 from analysis.report._rerun_file import write_rerun_file
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
-from rigd.view._recorded import new_rrd_file
+from rigd.view._rrd_file import new_rrd_file
 
 BAND = (0.5875, 50.0)
 

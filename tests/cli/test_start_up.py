@@ -1,0 +1,67 @@
+"""What commands import before they know what is asked for, and numpy's threads."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rigd.runtime import SINGLE_THREADED
+
+PROGRAM = """
+import importlib, os, sys
+
+
+class Witness:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == "numpy":
+            print({variables} <= os.environ.items(), flush=True)
+        return None
+
+
+sys.meta_path.insert(0, Witness)
+sys.argv = ["program", *{arguments}]
+importlib.import_module("{module}").main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [
+        ("rigd.__main__", ["run", "chirp", "--fast", "--profile", "sim", "--amplitude", "9"]),
+        ("rigd.__main__", ["serve", "--profile", "sim", "--output", "/dev/null/nowhere"]),
+        ("rigd.__main__", ["check", "--profile", "sim"]),
+        ("analysis.__main__", ["/dev/null"]),
+    ],
+)
+def test_numpy_finds_the_threads_limited_when_it_is_imported(module, arguments):
+    code = PROGRAM.format(variables=SINGLE_THREADED.items(), module=module, arguments=arguments)
+    code = code.replace("dict_items(", "set(")
+    # The tests' own environment forbids them.
+    clean = {name: value for name, value in os.environ.items() if name not in SINGLE_THREADED}
+
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=False
+    )
+
+    assert run.stdout.splitlines()[:1] == ["True"], run.stderr
+
+
+def test_help_needs_no_arrays():
+    code = (
+        "import sys; from rigd.cli.app import app; "
+        "print([name for name in ('numpy', 'scipy', 'pydantic', 'rerun') if name in sys.modules])"
+    )
+
+    told = subprocess.check_output([sys.executable, "-c", code], text=True)
+
+    assert told == "[]\n"
+
+
+def test_the_processes_of_a_rig_are_started_before_numpy_is_imported():
+    code = "import sys; from rigd.runner import Crew; print('numpy' in sys.modules)"
+
+    told = subprocess.check_output([sys.executable, "-c", code], text=True)
+
+    assert told == "False\n"
