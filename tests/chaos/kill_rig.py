@@ -641,6 +641,8 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
         # To rigd run 130 is a stop that was asked of itself.
         unasked = case.daemon or case.anywhere or case.victim == "control"
         expected = {0} if complete else {130, 1} if unasked else {130}
+        if case.anywhere and not verdict.said:
+            expected.add(-case.how)  # so early that the interpreter did not handle signals yet
     elif case.anywhere or case.how == signal.SIGSTOP:
         expected = ends_by_itself
     else:
@@ -782,7 +784,7 @@ def _analysed(verdict: Verdict, path: Path, samples: int) -> str:
     if "Traceback" in done.stderr or not done.stderr.startswith("Error: "):
         verdict.complaints.append(f"analyze: {_line(done.stderr)}")
         return "refused"
-    if "missing or stale" in done.stderr:
+    if "missing or flagged" in done.stderr:
         return "gaps"  # for as long as the loop was suspended, or the computer busy with others
     if samples > 1000 * (REST_S + 1.5):
         verdict.complaints.append(f"analyze on {samples} samples: {_line(done.stderr)}")
