@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final
 
 from rigd.engine import SAMPLE, TOPICS, Channels, Message, Parent, Word, attach_channels
 from rigd.live._feed import Feed
+from rigd.live._program import RerunError
 from rigd.live._ring_reader import Intake, LiveEnd
-from rigd.live._server import Outlet, RerunError
+from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
 from rigd.view import Health, outcome_note, settle_sdk
 

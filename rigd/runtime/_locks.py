@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
+from rigd.runtime._addresses import file_name
 from rigd.runtime._folder import runtime_folder
 
 _COMMON = Path("/run/lock")
@@ -33,7 +34,7 @@ class HeldFile:
     """
 
     def __init__(self, name: str, *, everybody: bool) -> None:
-        plain = "".join(c if c.isalnum() else "-" for c in name).strip("-")
+        plain = file_name(name)
         common = everybody and os.access(_COMMON, os.W_OK)
         self.path = _COMMON / f"rigd-{plain}.lock" if common else runtime_folder() / f"{plain}.lock"
         self._fd: int | None = None

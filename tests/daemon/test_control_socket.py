@@ -14,9 +14,10 @@ import pytest
 
 from rigd.daemon import _address as address
 from rigd.daemon import _server as server
-from rigd.daemon._address import AddressError, answers, bind, find, running, socket_path
+from rigd.daemon._address import AddressError, bind, find, running, socket_path
 from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
 from rigd.daemon._states import Peer, State
+from rigd.runtime import answers
 
 LONG = {
     "command": "start",

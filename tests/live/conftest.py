@@ -20,8 +20,8 @@ from rigd.engine._ipc import packed_object
 from rigd.engine._ring import Ring, shared_memory_fd
 from rigd.engine._shared_state import Board, Event, Word, write_event
 from rigd.engine._topics import DESCRIPTORS, TOPICS, Channels
+from rigd.live._address import LiveAddress
 from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession
-from rigd.live._server import LiveAddress
 from rigd.session._format import pack_sample_into, pack_timing_into
 from rigd.view._session_info import Subject
 

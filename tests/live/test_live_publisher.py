@@ -14,8 +14,8 @@ import pytest
 from processes import eventually, has_ended, listeners, sockets
 
 from rigd.engine._shared_state import Word
+from rigd.live._address import find
 from rigd.live._ring_reader import LiveJob
-from rigd.live._server import find
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
