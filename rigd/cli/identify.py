@@ -178,17 +178,13 @@ def _run_sessions(
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
-    from rigd.identification import EstimateError, estimate_motor, propose, read_recording
-    from rigd.session import SessionError
+    from rigd.identification import estimate_motor, propose, read_recording
 
     profile = profile_named(profile_name)
-    try:
-        recording = read_recording(files, profile.rig.actuation.delay_s)
-        estimate = estimate_motor(
-            recording.windows,
-            recording.timing,
-            tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
-        )
-    except (SessionError, EstimateError) as error:
-        fail(str(error), EXIT_FAILED)
+    recording = read_recording(files, profile.rig.actuation.delay_s)
+    estimate = estimate_motor(
+        recording.windows,
+        recording.timing,
+        tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
+    )
     return estimate, propose(estimate, profile, unusable=recording.unusable)

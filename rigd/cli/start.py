@@ -59,7 +59,6 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.engine import ChildError
     from rigd.runner import Crew
     from rigd.runtime import StopRequest
 
@@ -73,8 +72,6 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
             "of open files (ulimit -n) and of shared memory (/dev/shm).",
             EXIT_FAILED,
         )
-    except ChildError as error:
-        fail(str(error), EXIT_FAILED)
 
 
 def start_sessions(

@@ -8,6 +8,7 @@ import stat
 import struct
 from pathlib import Path
 
+from rigd.errors import FailureError, UserError
 from rigd.runtime import address_files, answers, file_name, runtime_folder
 
 COMMON = Path("/run/rigd")
@@ -16,11 +17,11 @@ _SUFFIX = ".daemon"
 _CREDENTIALS = struct.Struct("3i")
 
 
-class AddressError(Exception):
+class AddressError(FailureError):
     """There can be no socket, or no daemon is found; the message is for the operator."""
 
 
-class UnknownGroupError(AddressError):
+class UnknownGroupError(UserError):
     """There is no group of that name."""
 
 

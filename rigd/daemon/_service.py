@@ -36,6 +36,7 @@ from rigd.daemon._states import (
 )
 from rigd.devices import Reality, what_moves
 from rigd.engine import Event
+from rigd.errors import RigdError
 from rigd.excitation import Excitation, ExcitationError
 from rigd.profile import Profile
 from rigd.runner import (
@@ -117,7 +118,7 @@ class RigControl(Protocol):
         """Close everything."""
 
 
-class CommandError(Exception):
+class CommandError(RigdError):
     """A request is refused, or failed; the message is for the operator."""
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rigd.engine._shared_state import Word
+from rigd.errors import FailureError
 from rigd.runtime import SINGLE_THREADED, held_back
 
 _WRITE_PATIENCE_S = 5.0
@@ -38,7 +39,7 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 Message = dict[str, Any]
 
 
-class ChildError(Exception):
+class ChildError(FailureError):
     """A child process ended, or answered something else than it was asked."""
 
 

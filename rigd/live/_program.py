@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from rigd.errors import FailureError
 from rigd.live._address import LOOPBACK
 from rigd.view import without_settings
 
@@ -41,7 +42,7 @@ _MOST_READING_S: Final = 10.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class RerunError(Exception):
+class RerunError(FailureError):
     """Rerun's program cannot be run."""
 
 

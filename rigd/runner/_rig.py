@@ -21,6 +21,7 @@ from rigd.engine import (
     Stop,
     Word,
 )
+from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import Crew
@@ -35,7 +36,7 @@ _ANSWER_PATIENCE_S = 10.0
 """Time to wait for an answer, beyond the time that is measured."""
 
 
-class RigError(Exception):
+class RigError(FailureError):
     """The rig cannot do what is asked, or is lost; the message is for the operator."""
 
 

@@ -29,6 +29,7 @@ from rigd.engine import (
     put_reference,
     read_events,
 )
+from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import Crew
 from rigd.runner._request import Order, another_path, file_header, part_of
@@ -54,7 +55,7 @@ _COUNTED = {
 _NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
 
 
-class SessionFailedError(Exception):
+class SessionFailedError(FailureError):
     """A session could not be run or ended; the message says why, in the operator's words.
 
     Attributes

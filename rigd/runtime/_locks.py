@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
+from rigd.errors import FailureError
 from rigd.runtime._addresses import file_name
 from rigd.runtime._folder import runtime_folder
 
@@ -113,7 +114,7 @@ def _others(fd: int, said: str) -> str:
 # One program at a time on a rig
 
 
-class RigBusyError(Exception):
+class RigBusyError(FailureError):
     """Another program runs the rig; the message says which."""
 
 
