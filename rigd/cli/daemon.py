@@ -208,7 +208,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Have the daemon of a profile, or the only one there is, reset its rig; say if there is one."""
+    """Have the daemon of a profile, or the only one there is, reset its rig; False if none is."""
     from rigd.daemon import running, socket_path
 
     sockets = running()
