@@ -128,8 +128,9 @@ class ProgressLine:
                 messages, self._messages = self._messages, []
             with contextlib.suppress(OSError):  # the terminal is gone; the session is not
                 self._show(messages)
-        with contextlib.suppress(OSError):
-            self._progress.stop()
+        if self._progress.live.is_started:  # otherwise it would only leave an empty line
+            with contextlib.suppress(OSError):
+                self._progress.stop()
 
     def _show(self, messages: list[str]) -> None:
         for message in messages:
