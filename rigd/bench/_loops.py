@@ -14,7 +14,7 @@ import numpy as np
 
 from rigd.bench._measure import Measurement, UsageMeter, measurement
 from rigd.devices import Selection
-from rigd.engine import Phase, SessionJob, Stop, Word, put_reference
+from rigd.engine import Finished, Phase, SessionJob, Stop, Word, put_reference
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
@@ -130,10 +130,10 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
         board[Word.STOP] = Stop.NO
         board[Word.GO] = 1
         reference = put_reference(channels.reference_fd, excitation.reference_rad)
-        crew.control.send_object("session", SessionJob(profile, reference))
+        crew.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None
-        while finished is None or "finished" not in finished:
+        while not isinstance(finished, Finished):
             finished = crew.control.poll(LOOK_S)
             board.beat(Word.SUPERVISOR_BEAT)
             meter.look(Phase(board[Word.PHASE]))
@@ -142,7 +142,7 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
             channels.controls.discard()
             channels.timings.discard()
             look()
-    _require(finished["finished"], finished["reason"])
+    _require(finished.outcome, finished.reason)
     return measurement(
         name,
         rate_hz,

@@ -181,7 +181,7 @@ class StillCrew:
 
     def __getitem__(self, process):
         return SimpleNamespace(
-            poll=lambda timeout_s: None, kill=lambda: None, send_object=lambda name, value: None
+            poll=lambda timeout_s: None, kill=lambda: None, send=lambda message: None
         )
 
 
