@@ -9,6 +9,7 @@ import numpy as np
 from analysis.campaigns._experiment import in_dispute, told
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -173,9 +174,9 @@ def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, f
 def _told(values: Sequence[float], each: Heterogeneity) -> str:
     """Write a mean with the digits that tell it from the others."""
     _, factor, unit = label(each.quantity)
-    digits = max(1 - int(np.floor(np.log10(factor * max(each.between_std, 1e-300)))), 0)
+    digits = min(decimals(factor * max(each.between_std, 1e-300)), 9)
     times = "·" if unit.startswith("10") else " "
-    return f"{factor * float(np.mean(values)):.{min(digits, 9)}f}{times}{unit}".rstrip()
+    return f"{factor * float(np.mean(values)):.{digits}f}{times}{unit}".rstrip()
 
 
 def _files(names: Sequence[str]) -> str:
@@ -407,7 +408,7 @@ def _damping(structure: str) -> str:
 
 def _mode(mode: PooledMode) -> str:
     half = NORMAL_95 * 100 * mode.damping_ratio_std
-    digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
+    digits = decimals(max(half, 1e-9))
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
         f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"

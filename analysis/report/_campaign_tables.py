@@ -5,7 +5,6 @@ Beside the paper's Tables 3 to 5 its own numbers stand in parentheses, on reques
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -41,6 +40,7 @@ from analysis.report._table import (
     number,
     unreported,
 )
+from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -457,7 +457,7 @@ def _digits(each: Heterogeneity) -> int:
     """Decimals that show the scatter, or what a session states as its uncertainty."""
     _, factor, _ = label(each.quantity)
     seen = factor * max(each.between_std, min(std for _, _, std in each.values))
-    return min(max(1 - math.floor(math.log10(seen)), 0), 9)
+    return min(decimals(seen), 9)
 
 
 def _chance(chance: float) -> Cell:
