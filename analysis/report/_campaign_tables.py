@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
 
     from analysis.campaigns import (
-        Campaign,
+        CampaignResult,
         Heterogeneity,
         Homogeneity,
         PooledEstimate,
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 _NAMES: Final = (Column("type", "type", WORDS), Column("weights", "weighting", WORDS))
 
 
-def shown_tables(campaign: Campaign) -> tuple[Table, ...]:
+def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Tables of the whole records that terminal and page show, what matters most first."""
     found = campaign.homogeneity
     estimates = likely_estimates(campaign)
@@ -79,14 +79,14 @@ def shown_tables(campaign: Campaign) -> tuple[Table, ...]:
     )
 
 
-def paper_tables(campaign: Campaign, *, with_paper: bool = False) -> tuple[Table, ...]:
+def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple[Table, ...]:
     """Tables 3 to 5, if there are Welch fits; on request with the paper's own numbers beside."""
     if not campaign.nominal:
         return ()
     return tuple(make(campaign, with_paper=with_paper) for make in (table3, table4, table5))
 
 
-def all_tables(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Table]:
+def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
     """Every table of the files by its name, without those that are empty."""
     made = (
         *paper_tables(campaign, with_paper=with_paper),
@@ -111,7 +111,7 @@ _ON_THE_EDGE: Final = "*n: in n sessions on the edge of the range searched."
 _IN_PARENTHESES: Final = "In parentheses: the paper's."
 
 
-def table3(campaign: Campaign, *, with_paper: bool = False) -> Table:
+def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     """Statistics of the parameters."""
     rows: list[Row] = []
     for each in campaign.statistics:
@@ -157,7 +157,7 @@ def table3(campaign: Campaign, *, with_paper: bool = False) -> Table:
 _PEAKS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{} (dB)"}
 
 
-def table4(campaign: Campaign, *, with_paper: bool = False) -> Table:
+def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     """Mean deviation of the resonant peaks; types in columns, as in the paper."""
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
@@ -212,7 +212,7 @@ def table4(campaign: Campaign, *, with_paper: bool = False) -> Table:
     )
 
 
-def table5(campaign: Campaign, *, with_paper: bool = False) -> Table:
+def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     """Parameters and performance of the two best nominal models."""
     rows: list[Row] = []
     for model in best_models(campaign.nominal):
@@ -270,7 +270,7 @@ def _papers(theirs: Mapping[str, float | None]) -> dict[str, Entry]:
     return {f"paper_{name}": value for name, value in theirs.items()}
 
 
-def session_list_table(campaign: Campaign) -> Table:
+def session_list_table(campaign: CampaignResult) -> Table:
     """All files, those that were left out behind the others."""
 
     def said(text: str) -> Cell:
@@ -298,7 +298,7 @@ def session_list_table(campaign: Campaign) -> Table:
     )
 
 
-def sessions_welch_table(campaign: Campaign) -> Table:
+def sessions_welch_table(campaign: CampaignResult) -> Table:
     """Every session's fits by the paper's route, and the nominal models' distance from it."""
     rows = [
         {
@@ -316,7 +316,7 @@ def sessions_welch_table(campaign: Campaign) -> Table:
     return _for_programs("sessions_welch", rows)
 
 
-def sessions_record_table(campaign: Campaign) -> Table:
+def sessions_record_table(campaign: CampaignResult) -> Table:
     """Every session's whole-record fits."""
     rows = [
         {
@@ -349,7 +349,7 @@ NOT_POOLED: Final = (
 )
 
 
-def structures_table(campaign: Campaign) -> Table:
+def structures_table(campaign: CampaignResult) -> Table:
     """All structures on all whole records together, those pooled first, the lowest BIC first."""
 
     def row(each: RankedStructure) -> Row:
@@ -386,7 +386,7 @@ def structures_table(campaign: Campaign) -> Table:
     )
 
 
-def specimens_table(campaign: Campaign) -> Table:
+def specimens_table(campaign: CampaignResult) -> Table:
     """Specimens as the files state them, the one of this campaign first."""
     specimens = campaign.homogeneity.specimens
     return Table(
@@ -414,7 +414,7 @@ def specimens_table(campaign: Campaign) -> Table:
     )
 
 
-def homogeneity_table(campaign: Campaign) -> Table:
+def homogeneity_table(campaign: CampaignResult) -> Table:
     """Scatter of each mode and parameter between sessions."""
     found = campaign.homogeneity
 
@@ -468,24 +468,24 @@ def _marked(text: str, quantity: str, found: Homogeneity) -> str:
     return f"{text} {MIXTURE_MARK}" if found.is_mixed(quantity) else text
 
 
-def likely_estimates(campaign: Campaign) -> list[PooledEstimate]:
+def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
     """Return the headline's estimate, and the one of the lowest BIC, which is conditional."""
     found = {each.name: each for each in (campaign.headline, *campaign.pooled[:1]) if each}
     return list(found.values())
 
 
-def used(estimate: PooledEstimate, campaign: Campaign) -> str:
+def used(estimate: PooledEstimate, campaign: CampaignResult) -> str:
     """Say of how many sessions an estimate is, and of how many it is not."""
     every = len(campaign.sessions)
     return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
 
 
-def pooled_table(campaign: Campaign, only: PooledEstimate | None = None) -> Table:
+def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
     """Pooled whole-record estimates, the headline's first, then the lowest BIC first.
 
     Parameters
     ----------
-    campaign : Campaign
+    campaign : CampaignResult
     only : PooledEstimate, optional
         The one to be shown. Without it, as in the files, all of them, and behind them what is not
         pooled, without values.
@@ -544,7 +544,10 @@ def pooled_table(campaign: Campaign, only: PooledEstimate | None = None) -> Tabl
 
 
 def _pooled_row(
-    pooled: PooledEstimate, each: PooledParameter, campaign: Campaign, withheld: Collection[str]
+    pooled: PooledEstimate,
+    each: PooledParameter,
+    campaign: CampaignResult,
+    withheld: Collection[str],
 ) -> Row:
     found = campaign.homogeneity
     _, factor, _ = label(each.name)
@@ -578,7 +581,7 @@ def _pooled_row(
     }
 
 
-def modes_table(campaign: Campaign) -> Table:
+def modes_table(campaign: CampaignResult) -> Table:
     """Modes over all sessions, of the structure that the numbers are of."""
     found = campaign.homogeneity
     rows: list[Row] = []
@@ -618,7 +621,7 @@ def modes_table(campaign: Campaign) -> Table:
     )
 
 
-def validation_table(campaign: Campaign) -> Table:
+def validation_table(campaign: CampaignResult) -> Table:
     """Errors of each session predicted from the others, then the trials that were lost."""
     rows: list[dict[str, Any]] = [
         {
@@ -636,7 +639,7 @@ def validation_table(campaign: Campaign) -> Table:
     return _for_programs("validation", rows)
 
 
-def validation_summary(campaign: Campaign) -> Table:
+def validation_summary(campaign: CampaignResult) -> Table:
     """Error of each model over the sessions that it was to predict, the best model first."""
     rows: list[Row] = []
     for method, name, weighting, errors in by_model(campaign.validation):
@@ -669,7 +672,7 @@ def validation_summary(campaign: Campaign) -> Table:
     )  # fmt: skip
 
 
-def sessions_table(campaign: Campaign) -> Table:
+def sessions_table(campaign: CampaignResult) -> Table:
     """Every session with its own verdict, then those left out."""
     leading = campaign.homogeneity.leading
     groups = leading.groups if leading else ()

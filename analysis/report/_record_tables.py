@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from analysis.identify import Headline, Quantity, Size
     from analysis.models import Structure
     from analysis.paper import FittedModel, WelchAnalysis
-    from analysis.results import Subject
+    from analysis.results import WholeRecord
 
 PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
     "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
@@ -59,9 +59,9 @@ _MARKED: Final = (
 )
 
 
-def modes_table(subject: Subject) -> Table:
+def modes_table(whole: WholeRecord) -> Table:
     """Frequencies and damping ratios; modes that do not show, or are doubtful, are marked."""
-    told = subject.headline
+    told = whole.headline
     rows: list[tuple[Entry, ...]] = []
     for mode in told.modes:
         f, ratio = mode.frequency_hz, mode.damping_ratio
@@ -87,9 +87,9 @@ def modes_table(subject: Subject) -> Table:
     )
 
 
-def parameters_table(subject: Subject) -> Table:
+def parameters_table(whole: WholeRecord) -> Table:
     """All parameters with their uncertainty; those with a flag are marked, with the reason."""
-    told = subject.headline
+    told = whole.headline
     return Table.of(
         "parameters",
         f"Parameters, type {told.name}",
@@ -112,9 +112,9 @@ def parameters_table(subject: Subject) -> Table:
     )
 
 
-def sizes_table(subject: Subject) -> Table:
+def sizes_table(whole: WholeRecord) -> Table:
     """Loss factors of either damping where they are uncorrelated with its order."""
-    told = subject.headline
+    told = whole.headline
     return Table.of(
         "damping_sizes",
         "Loss factor of either damping at the frequency where it depends least on its order",
@@ -137,9 +137,9 @@ def sizes_table(subject: Subject) -> Table:
     )
 
 
-def condition_table(subject: Subject) -> Table | None:
+def condition_table(whole: WholeRecord) -> Table | None:
     """Set what a simpler structure would give beside what is told; None if none would do."""
-    told, simpler = subject.headline, subject.headline.simpler
+    told, simpler = whole.headline, whole.headline.simpler
     if simpler is None:
         return None
     taken = " and ".join(f"{PARAMETERS[name][0]} = {at:g}" for name, at in simpler.fixed.items())
@@ -173,13 +173,13 @@ def condition_table(subject: Subject) -> Table | None:
     )
 
 
-def correlations_table(subject: Subject) -> Table:
+def correlations_table(whole: WholeRecord) -> Table:
     """Correlations of the determined parameters of the selected fit."""
-    fit = subject.fit
+    fit = whole.fit
     symbols = [_symbol(name) for name in fit.determined]
     return Table.of(
         "correlations",
-        f"Correlations of the parameters, type {subject.headline.name}",
+        f"Correlations of the parameters, type {whole.headline.name}",
         (
             Column("Parameter", "parameter", WORDS),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
@@ -254,14 +254,14 @@ _DAMPING: Final = ("zeta", "alpha", "gamma", "lambda")
 _ON_THE_EDGE: Final = "* rests on the edge of the range searched: the data do not determine it."
 
 
-def structures_table(subject: Subject) -> Table:
+def structures_table(whole: WholeRecord) -> Table:
     """All fits beside each other; orders that the data do not support are marked in each."""
-    lowest = min(fit.cost for fit in subject.fits.values())
-    withheld = subject.unsupported
-    delta_bic = subject.verdict.delta_bic
-    status = dict(subject.headline.structures)
+    lowest = min(fit.cost for fit in whole.fits.values())
+    withheld = whole.unsupported
+    delta_bic = whole.delta_bic
+    status = dict(whole.headline.structures)
     rows: list[tuple[Entry, ...]] = []
-    for name, fit in subject.fits.items():
+    for name, fit in whole.fits.items():
         its = status.get(name, "")
         damping = _damping_cells(
             fit.structure, fit.parameters, fit.std, withheld=withheld, at_bounds=fit.at_bounds
@@ -304,7 +304,7 @@ def structures_table(subject: Subject) -> Table:
             "searched. The marked row is the one that the numbers are of. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
         ),
-        selected=list(subject.fits).index(subject.headline.name),
+        selected=list(whole.fits).index(whole.headline.name),
     )
 
 
@@ -535,9 +535,9 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     )
 
 
-def amplitude_tables(subject: Subject) -> tuple[Table, ...]:
+def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
     """Damping ratios of free vibration by amplitude, if the record tells; else no table."""
-    found = subject.verdict.damping_with_amplitude
+    found = whole.verdict.damping_with_amplitude
     if not found:
         return ()
     rows: list[tuple[Entry, ...]] = []

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.results import RecordResult
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
@@ -343,12 +344,13 @@ def check_rerun_file(path: Path) -> None:
         raise OutputExistsError(f"--rerun {error}") from None
 
 
-def write_rerun_file(analysis: WelchAnalysis, path: Path) -> None:
+def write_rerun_file(result: RecordResult, path: Path) -> None:
     """Write the session in the layout of the live view, and its fits in front of it.
 
     Parameters
     ----------
-    analysis : WelchAnalysis
+    result : RecordResult
+        With Welch fits.
     path : Path
         A new file, ``….rrd``.
 
@@ -361,12 +363,14 @@ def write_rerun_file(analysis: WelchAnalysis, path: Path) -> None:
     """
     from rigd.view import draw_session, recorded_blueprint
 
-    session = read_session(analysis.record.path)
-    timings = read_timings(analysis.record.path)
+    analysis = result.welch
+    assert analysis is not None
+    session = read_session(result.record.path)
+    timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
             layout = recorded_blueprint([tab(analysis)])
             draw_session(stream, session, timings, layout=layout)
-            draw(analysis, tables_text(analysis), stream)
+            draw(analysis, tables_text(result), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

@@ -10,7 +10,7 @@ from analysis.identify import MISREAD
 from analysis.report._table import estimate
 
 if TYPE_CHECKING:
-    from analysis.campaigns import Campaign
+    from analysis.campaigns import CampaignResult
     from analysis.identify import Headline, Mode, Quantity, Size
 
 _SMALL: Final = 1e-3
@@ -114,7 +114,7 @@ _NO_VERDICT: Final = (
 )
 
 
-def campaign_sentences(campaign: Campaign) -> tuple[str, ...]:
+def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     """Return the verdict; without one, what it would have said first, and why there is none."""
     if campaign.verdict is not None:
         return campaign.verdict.sentences
