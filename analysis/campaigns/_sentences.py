@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import in_dispute, told
-from analysis.models import STRUCTURES
+from analysis.models import QUANTITIES, STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.units import decimals
 
@@ -24,16 +24,11 @@ if TYPE_CHECKING:
 
 # Names and numbers
 
-_LABELS: Final = {
-    "zeta": ("ζ", 1e5, "10⁻⁵ s^α"),
-    "alpha": ("α", 1.0, ""),
-    "gamma": ("γ", 1e2, "10⁻² s^λ/m⁴"),
-    "lambda": ("λ", 1.0, ""),
-    "density_over_stiffness": ("ρ/EI", 1e3, "10⁻³ s²/m⁴"),
-    "bending_stiffness_n_m2": ("EI", 1e3, "10⁻³ N·m²"),
-    "delay_s": ("delay of the torque", 1e6, "µs"),
-    "tool_inertia_kg_m2": ("tool's inertia", 1e6, "10⁻⁶ kg·m²"),
-}
+_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool's inertia"}
+"""Names of what a letter alone would not call to mind."""
+_FINER: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
+"""Units smaller than a single record's: of the scatter between sessions more digits are told."""
+_SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _LEAST: Final = 1e-99
 _OF_MODES: Final = {
@@ -45,8 +40,13 @@ _OF_MODES: Final = {
 
 def label(quantity: str) -> tuple[str, float, str]:
     """Symbol, factor and unit in which a parameter or a mode's quantity is shown."""
-    if quantity in _LABELS:
-        return _LABELS[quantity]
+    if quantity in QUANTITIES:
+        symbol, _, unit, factor = QUANTITIES[quantity]
+        unit, factor = _FINER.get(quantity, (unit, factor))
+        power, _, rest = unit.partition(" ")
+        if power.startswith("1e"):
+            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {rest}"
+        return _NAMES.get(quantity, symbol), factor, "" if unit == "1" else unit
     of_mode, mode = quantity.rsplit("_", 1)
     what, factor, unit = _OF_MODES[of_mode]
     return f"{what} of mode {mode}", factor, unit

@@ -17,8 +17,8 @@ from analysis.campaigns import (
 )
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
-from analysis.report._campaign_tables import used
 from analysis.report._frf_figure import line_styles
+from analysis.report._pooled_tables import used
 from analysis.report._table import MARK, unreported
 from rigd.view import magnitude_db, phase_deg
 

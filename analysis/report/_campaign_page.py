@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.report._campaign_tables import paper_tables, sessions_table, shown_tables
+from analysis.report._campaign_tables import sessions_table, shown_tables
+from analysis.report._campaign_text import campaign_sentences
 from analysis.report._page import page, versions
-from analysis.report._sentences import campaign_sentences
+from analysis.report._paper_tables import paper_tables
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables
+from analysis.report._campaign_text import campaign_text
 from analysis.report._document import document_text
 from analysis.report._folder import write_new
 from analysis.report._table import csv_text
-from analysis.report._text import campaign_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable

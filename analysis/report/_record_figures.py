@@ -22,7 +22,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from analysis.identify import fast_length
 from analysis.report import _style as style
 from analysis.report._bands import loss_factors, response_band, supported_band_hz
-from analysis.statistics import NORMAL_95
+from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
 
@@ -297,9 +297,6 @@ def _beyond(
     return [(axis_hz[0], first_hz), (last_hz, axis_hz[1])]
 
 
-_KOLMOGOROV_95: Final = 1.358
-"""95 % quantile of Kolmogorov's distribution: the bounds' half-width is that over √bins."""
-
 _BINS_A_POINT: Final = 24
 _SMOOTH_POINTS: Final = 600
 _STRETCHES: Final = 120
@@ -371,7 +368,7 @@ def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     share = np.cumsum(power) / power.sum()
     uniform = np.arange(1, power.size + 1) / power.size
     frequency_hz = analysis.frequency_hz[counted]
-    half = 100 * _KOLMOGOROV_95 / np.sqrt(power.size)
+    half = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
     axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
     difference = 100 * (share - uniform)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)

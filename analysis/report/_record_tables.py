@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
+from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._table import (
     ABSENT,
@@ -33,24 +34,6 @@ if TYPE_CHECKING:
     from analysis.models import Structure
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.results import WholeRecord
-
-PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
-    "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
-    "alpha": ("α", "its order", "1", 1.0),
-    "gamma": ("γ", "external damping", "1e-2 s^λ/m⁴", 1e2),
-    "lambda": ("λ", "its order", "1", 1.0),
-    "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
-    "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
-    "delay_s": ("τ", "torque older than angle", "µs", 1e6),
-    "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
-    "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
-    "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
-    "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
-    "second_order_filter_time_constant_s": ("T", "second-order filter of the torque", "ms", 1e3),
-    "clock_rate_difference": ("ε", "torque's clock against the angle's", "ppm", 1e6),
-    "drag": ("C_D d", "drag of the air", "mm", 1e3),
-}
-"""Symbol, meaning, unit shown, and how many of that make one SI unit."""
 
 _STRONG_CORRELATION: Final = 0.9
 _MARKED: Final = (
@@ -142,7 +125,7 @@ def condition_table(whole: WholeRecord) -> Table | None:
     told, simpler = whole.headline, whole.headline.simpler
     if simpler is None:
         return None
-    taken = " and ".join(f"{PARAMETERS[name][0]} = {at:g}" for name, at in simpler.fixed.items())
+    taken = " and ".join(f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler.fixed.items())
     rows: list[tuple[Entry, ...]] = []
     for name, each in simpler.parameters.items():
         symbol, _meaning, unit, factor = _described(name)
@@ -234,12 +217,12 @@ def _reasons(quantities: Iterable[Quantity]) -> tuple[str, ...]:
 
 def _described(name: str) -> tuple[str, str, str, float]:
     default = (_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
-    return PARAMETERS.get(name, default)
+    return QUANTITIES.get(name, default)
 
 
 def _symbol(name: str) -> str:
-    if name in PARAMETERS:
-        return PARAMETERS[name][0]
+    if name in QUANTITIES:
+        return QUANTITIES[name][0]
     return f"δ{name.rsplit('_', 1)[-1]}"
 
 
@@ -340,7 +323,7 @@ def _damping_cells(
             shown += [number(None), number(None)]
             continue
         its_std = std[name] if std is not None and name in structure.free else None
-        value, spread = estimate((parameters[name], its_std), its_std, PARAMETERS[name][3])
+        value, spread = estimate((parameters[name], its_std), its_std, QUANTITIES[name][3])
         if name in at_bounds:
             value = replace(value, text=f"{value.text}*")
         shown += [marked(value), greyed(spread)] if name in doubtful else [value, spread]
@@ -349,7 +332,7 @@ def _damping_cells(
 
 def _heading(name: str) -> str:
     """Symbol with its power of ten; the units, which depend on the orders, would be too long."""
-    symbol, _meaning, unit, factor = PARAMETERS[name]
+    symbol, _meaning, unit, factor = QUANTITIES[name]
     return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
 
 

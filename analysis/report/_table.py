@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -15,7 +16,7 @@ from analysis.models import COEFFICIENT_OF
 from rigd.units import decimals
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     import rich.table
 
@@ -56,6 +57,8 @@ class Cell:
 
 
 Entry = Cell | Value
+Row = Mapping[str, Entry]
+"""Entries by their columns' keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +127,7 @@ class Table:
     name: str
     caption: str
     columns: tuple[Column, ...]
-    rows: tuple[Mapping[str, Entry], ...]
+    rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     selected: int | None = None
     grouped: bool = False

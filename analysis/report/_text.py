@@ -9,8 +9,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from analysis.report import _record_tables as tables
-from analysis.report._campaign_tables import paper_tables, shown_tables
-from analysis.report._sentences import campaign_sentences, damping_sentences
+from analysis.report._sentences import damping_sentences
 from analysis.report._table import terminal_table
 
 if TYPE_CHECKING:
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from analysis.campaigns import CampaignResult
     from analysis.report._table import Table
     from analysis.results import RecordResult, WholeRecord
 
@@ -90,39 +88,6 @@ def record_text(whole: WholeRecord) -> RenderableType:
             )
         ),
     )
-
-
-def campaign_tables(campaign: CampaignResult, *, with_paper: bool = False) -> RenderableType:
-    """Return the verdict, what it rests on, and the paper's Tables 3 to 5.
-
-    Parameters
-    ----------
-    campaign : CampaignResult
-    with_paper : bool
-        Whether the paper's numbers stand beside these.
-    """
-    parts: list[RenderableType] = []
-    said = campaign_sentences(campaign)
-    if said:
-        first, *others = said
-        parts += [Text(first, style="bold"), *map(Text, others)]
-        if campaign.verdict is not None and campaign.verdict.experiments:
-            parts.append(Text("What would tell more:"))
-            parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]
-        parts.append("")
-    parts += spaced((*shown_tables(campaign), *paper_tables(campaign, with_paper=with_paper)))
-    parts += [
-        Text(f"Warning: {session.path.name}: {warning}", style="yellow")
-        for session in campaign.sessions
-        for warning in session.warnings
-    ]
-    return Group(*parts)
-
-
-def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
-    """Return the same as plain text, with the files that were left out."""
-    left_out = (Text(f"Left out: {failure.message}") for failure in campaign.failures)
-    return as_text(Group(campaign_tables(campaign, with_paper=with_paper), *left_out))
 
 
 def spaced(shown: Iterable[Table]) -> Iterator[RenderableType]:
