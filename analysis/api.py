@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, overload
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from analysis.campaigns import Campaign
+    from analysis.campaigns import CampaignResult
     from analysis.identify import RecordAnalysis, Selection, Setting
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
@@ -210,7 +210,7 @@ def campaign(
     fixed: Sequence[Setting] = (),
     jobs: int | None = None,
     dask: str | None = None,
-) -> Campaign:
+) -> CampaignResult:
     """Analyse the sessions of one specimen together, in parallel.
 
     Parameters
@@ -230,7 +230,7 @@ def campaign(
 
     Returns
     -------
-    Campaign
+    CampaignResult
         Every session's results, statistics, nominal models, pooled estimate, validation.
 
     Raises

@@ -52,6 +52,29 @@ COEFFICIENT_OF: Final[Mapping[str, Parameter]] = MappingProxyType(
 )
 """The coefficient that belongs to an order of the damping, and means nothing without it."""
 
+QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
+    {
+        "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
+        "alpha": ("α", "its order", "1", 1.0),
+        "gamma": ("γ", "external damping", "1e-2 s^λ/m⁴", 1e2),
+        "lambda": ("λ", "its order", "1", 1.0),
+        "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
+        "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
+        "delay_s": ("τ", "torque older than angle", "µs", 1e6),
+        "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
+        "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
+        "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
+        "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
+        "second_order_filter_time_constant_s": (
+            "T", "second-order filter of the torque", "ms", 1e3,
+        ),
+        "clock_rate_difference": ("ε", "torque's clock against the angle's", "ppm", 1e6),
+        "drag": ("C_D d", "drag of the air", "mm", 1e3),
+    }
+)  # fmt: skip
+"""Parameters of damping, beam and rig: symbol, meaning, unit shown, and how many of that make one
+SI unit."""
+
 
 @dataclass(frozen=True, slots=True)
 class Structure:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rigd.beam import Beam
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,9 +31,9 @@ class RecordError(ValueError):
 # Values that the file states
 
 _BEAM_RANGES: Final = {
-    "beam_length_m": (1e-3, 1e3, "m"),
-    "beam_density_kg_per_m": (1e-6, 1e6, "kg/m"),
-    "beam_bending_stiffness_n_m2": (1e-9, 1e15, "N·m²"),
+    "beam_length_m": (1e-3, 1e3),
+    "beam_density_kg_per_m": (1e-6, 1e6),
+    "beam_bending_stiffness_n_m2": (1e-9, 1e15),
 }
 _MAX_INERTIA_KG_M2: Final = 1e3
 _MAX_DELAY_S: Final = 1.0
@@ -53,7 +54,7 @@ def stated_rate_hz(session: Session) -> float:
     """
     rate_hz = session.number("rate_hz")
     if not rate_hz > 0.0:
-        raise _wrong(session, "rate_hz", rate_hz, "Hz", "must be positive")
+        raise _wrong(session, "rate_hz", rate_hz, "must be positive")
     return rate_hz
 
 
@@ -73,12 +74,12 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
         A value, or the mode's frequency that they give together, cannot be.
     """
     values = []
-    for key, (low, high, unit) in _BEAM_RANGES.items():
+    for key, (low, high) in _BEAM_RANGES.items():
         value = session.number(key)
         if not value > 0.0:
-            raise _wrong(session, key, value, unit, "must be positive")
+            raise _wrong(session, key, value, "must be positive")
         if not low <= value <= high:
-            raise _wrong(session, key, value, unit, f"must lie between {low:g} and {high:g}")
+            raise _wrong(session, key, value, f"must lie between {low:g} and {high:g}")
         values.append(value)
     length_m, density, stiffness = values
     first_hz = (_FIRST_ROOT / length_m) ** 2 * math.sqrt(stiffness / density) / (2 * math.pi)
@@ -105,12 +106,12 @@ def stated_tool_inertia_kg_m2(session: Session) -> float:
     RecordError
         It is negative, or that of a vehicle.
     """
-    key, unit = "tool_inertia_kg_m2", "kg·m²"
+    key = "tool_inertia_kg_m2"
     inertia_kg_m2 = session.number(key, 0.0)
     if inertia_kg_m2 < 0.0:
-        raise _wrong(session, key, inertia_kg_m2, unit, "an inertia cannot be negative")
+        raise _wrong(session, key, inertia_kg_m2, "an inertia cannot be negative")
     if inertia_kg_m2 > _MAX_INERTIA_KG_M2:
-        raise _wrong(session, key, inertia_kg_m2, unit, f"must not exceed {_MAX_INERTIA_KG_M2:g}")
+        raise _wrong(session, key, inertia_kg_m2, f"must not exceed {_MAX_INERTIA_KG_M2:g}")
     return inertia_kg_m2
 
 
@@ -124,7 +125,7 @@ def stated_delay_s(session: Session, key: str) -> float:
     """
     delay_s = session.number(key, 0.0)
     if abs(delay_s) > _MAX_DELAY_S:
-        raise _wrong(session, key, delay_s, "s", f"must lie within ±{_MAX_DELAY_S:g}")
+        raise _wrong(session, key, delay_s, f"must lie within ±{_MAX_DELAY_S:g}")
     return delay_s
 
 
@@ -142,16 +143,17 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
     corner_hz = session.number("torque_filter_hz", math.inf)
     order = session.number("torque_filter_order", 1.0)
     if not corner_hz > 0.0:
-        raise _wrong(session, "torque_filter_hz", corner_hz, "Hz", "must be positive")
+        raise _wrong(session, "torque_filter_hz", corner_hz, "must be positive")
     if order not in (1.0, 2.0):
-        raise _wrong(session, "torque_filter_order", order, "", "must be 1 or 2 (Butterworth)")
+        raise _wrong(session, "torque_filter_order", order, "must be 1 or 2 (Butterworth)")
     constant_s = 1 / (2 * math.pi * corner_hz)
     return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
 
 
-def _wrong(session: Session, key: str, value: float, unit: str, rule: str) -> RecordError:
+def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:
     return RecordError(
-        f"{session.path}: {key} is {value:g} {unit}, but {rule}; correct the file's metadata."
+        f"{session.path}: {key} is {f'{value:g} {unit_of(key)}'.rstrip()}, but {rule}; correct the "
+        "file's metadata."
     )
 
 

@@ -1,23 +1,28 @@
-"""Result of the analysis of one record, as reports take it: fits, selection, verdict, warnings."""
+"""Results of one record, as computing hands them to all that shows them: text, page, files.
+
+`record_result` goes from a session file to a `RecordResult`; a campaign keeps of each one what it
+needs (`analysis.campaigns.SessionResult`) and makes a `analysis.campaigns.CampaignResult` of them.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from analysis.identify import (
-        DampingAt,
-        Finding,
         Headline,
         OrderVerdict,
         RecordAnalysis,
         RecordFit,
         Selection,
         Setting,
+        Verdict,
     )
+    from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
 
@@ -25,97 +30,76 @@ _ORDERS: Final = frozenset({"alpha", "lambda"})
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """What the selection of a structure came to, as a report shows it.
+class Routes:
+    """What is done with a record: Welch's fits, by these settings, and those of the whole record.
 
     Attributes
     ----------
-    sentences : tuple of str
-        What can be told from the data and what cannot, in the operator's words.
-    experiments : tuple of str
-        What would tell more.
-    delta_bic : dict of str to float
-        BIC above the lowest by the name of the fit; may be empty.
-    orders : tuple of OrderVerdict
-        What is known of each order; may be empty.
-    findings : tuple of Finding
-        What else is in the record.
-    damping_with_amplitude : tuple of DampingAt
-        Where the air brakes the beam; else empty.
+    settings : WelchSettings
+    paper, whole_record : bool
+        Which of the two.
+    fixed : tuple of str
+        Settings of rig and specimen that stay at the file's values.
+    band_hz : tuple of float or None
+        Band of both; None takes what suits the record.
     """
 
-    sentences: tuple[str, ...]
-    experiments: tuple[str, ...] = ()
-    delta_bic: Mapping[str, float] = field(default_factory=dict)
-    orders: tuple[OrderVerdict, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    damping_with_amplitude: tuple[DampingAt, ...] = ()
-
-    @classmethod
-    def of(cls, selection: Selection) -> Verdict:
-        """Take over what `analysis.identify` says."""
-        said, best = selection.verdict, selection.candidates[0]
-        return cls(
-            sentences=said.sentences,
-            experiments=said.experiments,
-            delta_bic={each.name: each.bic - best.bic for each in selection.candidates},
-            orders=(said.alpha, said.lambda_),
-            findings=said.findings,
-            damping_with_amplitude=said.damping_with_amplitude,
-        )
+    settings: WelchSettings
+    paper: bool
+    whole_record: bool
+    fixed: tuple[Setting, ...]
+    band_hz: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
-    """One record with everything that was found in it.
+class WholeRecord:
+    """What the whole record gave: all structures fitted to it, and which of them it supports.
 
     Attributes
     ----------
     record : Record
-    analysis : RecordAnalysis
-        Its noise, lines and bins are those of all `fits`.
-    fits : dict of str to RecordFit
-        Whole-record fits by the name that tables call them, in the order of the tables.
-    headline : Headline
-        The numbers that are told first; its fit is one of `fits`.
-    verdict : Verdict
+    selection : Selection
     band_hz : tuple of float
-        Band of the whole-record fits.
+        Band of the fits.
     fixed : tuple of str
         Settings that stayed at the file's values in them.
-    welch : WelchAnalysis or None
-        Welch fits of the same record; None if they were not run.
     """
 
     record: Record
-    analysis: RecordAnalysis
-    fits: Mapping[str, RecordFit]
-    headline: Headline
-    verdict: Verdict
+    selection: Selection
     band_hz: tuple[float, float]
     fixed: tuple[Setting, ...] = ()
-    welch: WelchAnalysis | None = None
 
-    @classmethod
-    def of(
-        cls,
-        record: Record,
-        selection: Selection,
-        band_hz: tuple[float, float],
-        fixed: tuple[Setting, ...] = (),
-        welch: WelchAnalysis | None = None,
-    ) -> Subject:
-        """Take what was selected for a record."""
-        return cls(
-            record=record,
-            analysis=selection.analysis,
-            fits={candidate.name: candidate.fit for candidate in selection.candidates},
-            headline=selection.headline,
-            verdict=Verdict.of(selection),
-            band_hz=band_hz,
-            fixed=fixed,
-            welch=welch,
-        )
+    @property
+    def analysis(self) -> RecordAnalysis:
+        """The fits with the noise, the lines and the bins that are theirs."""
+        return self.selection.analysis
+
+    @property
+    def fits(self) -> Mapping[str, RecordFit]:
+        """Fits by the name that tables call them, the lowest BIC first."""
+        return {each.name: each.fit for each in self.selection.candidates}
+
+    @property
+    def delta_bic(self) -> Mapping[str, float]:
+        """BIC above the lowest by the name of the fit."""
+        best, *_ = self.selection.candidates
+        return {each.name: each.bic - best.bic for each in self.selection.candidates}
+
+    @property
+    def headline(self) -> Headline:
+        """The numbers that are told first; its fit is one of `fits`."""
+        return self.selection.headline
+
+    @property
+    def verdict(self) -> Verdict:
+        """What can be told from the data and what cannot, in the operator's words."""
+        return self.selection.verdict
+
+    @property
+    def orders(self) -> tuple[OrderVerdict, OrderVerdict]:
+        """What is known of each order."""
+        return self.verdict.alpha, self.verdict.lambda_
 
     @property
     def fit(self) -> RecordFit:
@@ -135,7 +119,25 @@ class Subject:
     @property
     def unsupported(self) -> frozenset[str]:
         """Orders that no fit of this record can tell: those withheld, and of absent damping."""
-        return self.withheld | {each.order for each in self.verdict.orders if each.value is None}
+        return self.withheld | {each.order for each in self.orders if each.value is None}
+
+
+@dataclass(frozen=True, slots=True)
+class RecordResult:
+    """One record with everything that was found in it.
+
+    Attributes
+    ----------
+    record : Record
+    whole : WholeRecord or None
+        Fits to the whole record; None if they were not run.
+    welch : WelchAnalysis or None
+        Fits to Welch's estimate, as in the paper; None if they were not run.
+    """
+
+    record: Record
+    whole: WholeRecord | None = None
+    welch: WelchAnalysis | None = None
 
     @property
     def name(self) -> str:
@@ -143,6 +145,100 @@ class Subject:
         return self.record.path.name
 
     @property
+    def unsupported(self) -> frozenset[str]:
+        """Orders that the whole record does not support; none are known without its fits."""
+        return frozenset() if self.whole is None else self.whole.unsupported
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What an analyst should read beside the results."""
         return self.record.warnings if self.welch is None else self.welch.warnings
+
+
+def whole_record(
+    record: Record, fixed: tuple[Setting, ...] = (), band_hz: tuple[float, float] | None = None
+) -> WholeRecord:
+    """Fit every structure to a whole record, and select the one that its data support.
+
+    Parameters
+    ----------
+    record : Record
+    fixed : tuple of str
+        Settings that stay at the file's values.
+    band_hz : tuple of float, optional
+        By default what suits the record.
+
+    Raises
+    ------
+    MeasurementError
+        The record cannot be used.
+    """
+    from analysis.identify import Measurement, select
+    from analysis.suited import record_band_hz
+
+    band_hz = record_band_hz(record, band_hz)
+    selection = select(Measurement.of_record(record), fixed=fixed, band_hz=band_hz)
+    return WholeRecord(record, selection, band_hz, fixed)
+
+
+def record_result(
+    path: Path,
+    routes: Routes,
+    *,
+    welch_required: bool = False,
+    on_step: Callable[[str], None] = lambda _done: None,
+    warn: Callable[[str], None] = lambda _text: None,
+) -> RecordResult:
+    """Analyse a session file.
+
+    Parameters
+    ----------
+    path : Path
+    routes : Routes
+    welch_required : bool
+        Whether Welch's fits are run though they suit the record ill. Otherwise they are left out
+        then, if the whole record is analysed, too.
+    on_step : callable, optional
+        Called with a few words after each step.
+    warn : callable, optional
+        Called with a sentence on what was left out.
+
+    Raises
+    ------
+    SessionError, RecordError
+        The file cannot be read, or holds no record that can be analysed.
+    EstimateError, MeasurementError
+        No route suits the record, or the settings do not.
+    """
+    from analysis.identify import MeasurementError
+    from analysis.record import load_record
+    from analysis.suited import check_record_band, remarks, welch_analysis
+
+    record = load_record(path)
+    record = _with_warnings(record, remarks(record, routes.band_hz))
+    on_step("read")
+    if not routes.paper:
+        check_record_band(record, routes.band_hz)
+    welch, left_out = None, None
+    if routes.paper:
+        welch, left_out = welch_analysis(
+            record, routes.settings, routes.band_hz,
+            optional=routes.whole_record and not welch_required, on_step=on_step,
+        )  # fmt: skip
+    if left_out:
+        warn(f"{path}: {left_out}")
+        record = _with_warnings(record, (left_out,))
+    whole = None
+    if routes.whole_record:
+        on_step("whole record")
+        try:
+            whole = whole_record(record, routes.fixed, routes.band_hz)
+        except MeasurementError as error:
+            if welch is None:
+                raise
+            warn(f"{error} Only the Welch fits were run.")
+    return RecordResult(record, whole, welch)
+
+
+def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
+    return replace(record, warnings=(*record.warnings, *more)) if more else record

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 NORMAL_95: Final = 1.959963984540054
 """Two-sided 95 % point of the standard normal distribution."""
+KOLMOGOROV_95: Final = 1.3581
+"""95 % point of the Kolmogorov statistic times the root of the count."""
 
 _SMALLEST: Final = 1e-290
 """Tail probability below which its logarithm is taken from the tail's asymptotic expansion."""

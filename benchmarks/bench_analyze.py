@@ -39,11 +39,11 @@ welch = analysis.paper.analyse(record, WelchSettings())
 mark("the paper's route")
 selection = analysis.identify.select(Measurement.of_record(record))
 mark("whole record")
-from analysis.results import Subject
+from analysis.results import RecordResult, WholeRecord
 from analysis.report import frf_figure, illustrations, write_report
 mark("imports of matplotlib")
-subject = Subject.of(record, selection, BAND_HZ, (), welch)
-write_report(welch, Path(sys.argv[2]), mark, subject)
+result = RecordResult(record, WholeRecord(record, selection, BAND_HZ), welch)
+write_report(result, Path(sys.argv[2]), mark)
 mark("page, tables and JSON")
 for (name, end), (_, start) in zip(marks[1:], marks):
     print(name, end - start, sep="\\t")

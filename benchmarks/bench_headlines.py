@@ -74,7 +74,7 @@ from analysis.identify import BAND_HZ, Measurement, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.record import Record, load_record
 from analysis.report import document, loss_factors
-from analysis.results import Subject
+from analysis.results import RecordResult, WholeRecord
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -213,7 +213,8 @@ def judged(name: str, seed: int) -> Scored:
     start = time.process_time()
     selection = select(Measurement.of_record(record))
     spent_s = time.process_time() - start
-    results = document([], {}, [Subject.of(record, selection, BAND_HZ)])
+    result = RecordResult(record, WholeRecord(record, selection, BAND_HZ))
+    results = document([result])
     return scored(name, seed, spent_s, results, record, cell.truth)
 
 

@@ -1,4 +1,4 @@
-from ._campaign import Campaign as Campaign
+from ._campaign import CampaignResult as CampaignResult
 from ._campaign import campaign as campaign
 from ._estimates import RecordEstimate as RecordEstimate
 from ._estimates import WelchFit as WelchFit

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Campaign:
+class CampaignResult:
     """Results of all sessions, and of all together.
 
     Attributes
@@ -106,7 +106,7 @@ def campaign(
     jobs: int | None = None,
     dask: str | None = None,
     on_progress: Callable[[int, int, str], None] = lambda _done, _total, _what: None,
-) -> Campaign:
+) -> CampaignResult:
     """Analyse a campaign of sessions of one specimen on one rig.
 
     Every session goes by Welch's method (`analysis.paper`), where that suits all of them, and
@@ -183,12 +183,34 @@ def campaign(
             total = len(paths) + len(sessions)
             names = [session.path.name for session in sessions]
             validation, lost = validate(workers, sessions, band_hz, lambda i: step(names[i]))
+    return campaign_result(sessions, failures, validation, lost)
+
+
+def campaign_result(
+    sessions: Sequence[SessionResult],
+    failures: Sequence[SessionFailure] = (),
+    validation: Sequence[LeftOutError] = (),
+    lost: Sequence[LostTrial] = (),
+) -> CampaignResult:
+    """Say what sessions of one experiment tell together.
+
+    Parameters
+    ----------
+    sessions : sequence of SessionResult
+        At least one.
+    failures : sequence of SessionFailure, optional
+        Sessions of which nothing is used.
+    validation : sequence of LeftOutError, optional
+        Errors of the sessions that were predicted from the others.
+    lost : sequence of LostTrial, optional
+        Sessions that were to be predicted and were not.
+    """
     pooled = pooled_estimates(sessions)
     usable = [(each.path, each.experiment) for each in sessions]
     left_out = [(each.path, each.experiment) for each in failures]
     specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
     alike = homogeneity(sessions, pooled, specimens)
-    return Campaign(
+    return CampaignResult(
         settings=sessions[0].settings,
         record_band_hz=sessions[0].record_band_hz,
         sessions=tuple(sessions),
@@ -199,8 +221,8 @@ def campaign(
         structures=ranked_structures(sessions, pooled),
         pooled=pooled,
         verdict=campaign_verdict(sessions, pooled, alike, validation, lost),
-        validation=validation,
-        lost_trials=lost,
+        validation=tuple(validation),
+        lost_trials=tuple(lost),
     )
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
+from rigd.units import unit_of
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
@@ -52,10 +54,6 @@ LABEL: Final = "specimen"
 
 _OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
                        "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
-_UNITS: Final = {"beam_length_m": "m", "beam_density_kg_per_m": "kg/m",
-                 "beam_bending_stiffness_n_m2": "N·m²", "tool_inertia_kg_m2": "kg·m²",
-                 "amplitude_rad": "rad", "start_hz": "Hz", "stop_hz": "Hz", "duration_s": "s",
-                 "taper_s": "s"}  # fmt: skip
 _WHOLE: Final = 0.99
 """Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
 
@@ -230,7 +228,7 @@ def told(key: str, value: str | float) -> str:
     """Write a fact with its unit."""
     if isinstance(value, str):
         return (f"“{value}”" if value else "not stated") if key == LABEL else value
-    return f"{value:g} {_UNITS.get(key, '')}".rstrip()
+    return f"{value:g} {unit_of(key)}".rstrip()
 
 
 def _time(utc_ns: str) -> str:

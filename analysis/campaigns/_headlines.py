@@ -12,7 +12,7 @@ from analysis.statistics import student_t_quantile
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from analysis.campaigns._campaign import Campaign
+    from analysis.campaigns._campaign import CampaignResult
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._pooling import PooledEstimate
     from analysis.campaigns._statistics import RankedStructure
@@ -25,12 +25,12 @@ _ON_BOUND: Final = "the plain mean: it rests on its bound in some session"
 _ADEQUATE: Final = 0.9
 
 
-def headlines(campaign: Campaign) -> list[dict[str, Any]]:
+def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
     """Collect the headlines of a campaign.
 
     Parameters
     ----------
-    campaign : Campaign
+    campaign : CampaignResult
 
     Returns
     -------
@@ -45,7 +45,9 @@ def headlines(campaign: Campaign) -> list[dict[str, Any]]:
     return found
 
 
-def _shared(campaign: Campaign, pooled: PooledEstimate, verdict: CampaignVerdict) -> dict[str, Any]:
+def _shared(
+    campaign: CampaignResult, pooled: PooledEstimate, verdict: CampaignVerdict
+) -> dict[str, Any]:
     orders = (verdict.alpha, verdict.lambda_)
     explained = verdict.adequate >= _ADEQUATE * verdict.sessions
     every = None if explained else _UNEXPLAINED
@@ -63,7 +65,7 @@ def _shared(campaign: Campaign, pooled: PooledEstimate, verdict: CampaignVerdict
     return headline_json(None, told, orders, named)
 
 
-def _simpler(campaign: Campaign, pooled: PooledEstimate) -> Simpler | None:
+def _simpler(campaign: CampaignResult, pooled: PooledEstimate) -> Simpler | None:
     """Take what the lowest BIC gives, on condition that its orders are true."""
     conditional = campaign.pooled[0]
     if conditional is pooled:
@@ -80,7 +82,7 @@ def _simpler(campaign: Campaign, pooled: PooledEstimate) -> Simpler | None:
 
 
 def _parameters(
-    campaign: Campaign,
+    campaign: CampaignResult,
     pooled: PooledEstimate,
     orders: tuple[PooledOrder, ...],
     every: str | None,
@@ -127,7 +129,7 @@ def _sizes(
     )
 
 
-def _modes(campaign: Campaign, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
+def _modes(campaign: CampaignResult, pooled: PooledEstimate, every: str | None) -> tuple[Mode, ...]:
     t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
 
     def told(value: float, std: float, quantity: str) -> Quantity:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns._experiment import in_dispute, told
-from analysis.models import STRUCTURES
+from analysis.models import QUANTITIES, STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,16 +24,11 @@ if TYPE_CHECKING:
 
 # Names and numbers
 
-_LABELS: Final = {
-    "zeta": ("ζ", 1e5, "10⁻⁵ s^α"),
-    "alpha": ("α", 1.0, ""),
-    "gamma": ("γ", 1e2, "10⁻² s^λ/m⁴"),
-    "lambda": ("λ", 1.0, ""),
-    "density_over_stiffness": ("ρ/EI", 1e3, "10⁻³ s²/m⁴"),
-    "bending_stiffness_n_m2": ("EI", 1e3, "10⁻³ N·m²"),
-    "delay_s": ("delay of the torque", 1e6, "µs"),
-    "tool_inertia_kg_m2": ("tool's inertia", 1e6, "10⁻⁶ kg·m²"),
-}
+_NAMES: Final = {"delay_s": "delay of the torque", "tool_inertia_kg_m2": "tool's inertia"}
+"""Names of what a letter alone would not call to mind."""
+_FINER: Final = {"bending_stiffness_n_m2": ("1e-3 N·m²", 1e3)}
+"""Units smaller than a single record's: of the scatter between sessions more digits are told."""
+_SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _LEAST: Final = 1e-99
 _OF_MODES: Final = {
@@ -44,8 +40,13 @@ _OF_MODES: Final = {
 
 def label(quantity: str) -> tuple[str, float, str]:
     """Symbol, factor and unit in which a parameter or a mode's quantity is shown."""
-    if quantity in _LABELS:
-        return _LABELS[quantity]
+    if quantity in QUANTITIES:
+        symbol, _, unit, factor = QUANTITIES[quantity]
+        unit, factor = _FINER.get(quantity, (unit, factor))
+        power, _, rest = unit.partition(" ")
+        if power.startswith("1e"):
+            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {rest}"
+        return _NAMES.get(quantity, symbol), factor, "" if unit == "1" else unit
     of_mode, mode = quantity.rsplit("_", 1)
     what, factor, unit = _OF_MODES[of_mode]
     return f"{what} of mode {mode}", factor, unit
@@ -173,9 +174,9 @@ def _ends(values: Values) -> tuple[tuple[str, float, float], tuple[str, float, f
 def _told(values: Sequence[float], each: Heterogeneity) -> str:
     """Write a mean with the digits that tell it from the others."""
     _, factor, unit = label(each.quantity)
-    digits = max(1 - int(np.floor(np.log10(factor * max(each.between_std, 1e-300)))), 0)
+    digits = min(decimals(factor * max(each.between_std, 1e-300)), 9)
     times = "·" if unit.startswith("10") else " "
-    return f"{factor * float(np.mean(values)):.{min(digits, 9)}f}{times}{unit}".rstrip()
+    return f"{factor * float(np.mean(values)):.{digits}f}{times}{unit}".rstrip()
 
 
 def _files(names: Sequence[str]) -> str:
@@ -407,7 +408,7 @@ def _damping(structure: str) -> str:
 
 def _mode(mode: PooledMode) -> str:
     half = NORMAL_95 * 100 * mode.damping_ratio_std
-    digits = max(int(np.ceil(-np.log10(max(half, 1e-9)))) + 1, 0)
+    digits = decimals(max(half, 1e-9))
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
         f"{100 * mode.damping_ratio:.{digits}f} ± {half:.{digits}f} %"

@@ -12,17 +12,18 @@ from analysis.campaigns._estimates import RecordEstimate, WelchFit
 from analysis.campaigns._experiment import Experiment, task_errors
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
+from analysis.results import RecordResult, whole_record
 from rigd.spectral import FrequencyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from analysis.identify import Candidate, Setting, Verdict
     from analysis.paper import Peak
-    from analysis.record import Record
+    from analysis.results import WholeRecord
     from rigd.beam import Beam
 
 
@@ -140,7 +141,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
     A session that cannot be analysed is told, not raised: it is one of many.
     """
     from analysis.record import load_record
-    from analysis.suited import record_band_hz, remarks, welch_analysis, welch_settings
+    from analysis.suited import remarks, welch_analysis
 
     failures = task_errors()
     experiment = None
@@ -159,16 +160,12 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
         return SessionFailure(
             path, f"{path}: there is not memory enough to analyse it; use fewer --jobs."
         )
-    measured = _NO_RESPONSE if welch is None else welch.response
     warnings = record.warnings if welch is None else welch.warnings
     warnings = (*warnings, *remarks(record, task.band_hz), *((left_out,) if left_out else ()))
-    estimates: tuple[RecordEstimate, ...] = ()
-    verdict = headline = None
+    whole = None
     if task.structures:
         try:
-            estimates, verdict, headline = _whole_record(record, task, measured)
-            if wrong := next((f.sentence for f in verdict.findings if f.kind in _MISREAD), None):
-                return SessionFailure(path, f"{path}: {wrong}", experiment)
+            whole = whole_record(record, task.fixed, task.band_hz)
         except failures as error:
             if welch is None:
                 return SessionFailure(path, str(error), experiment)
@@ -176,43 +173,59 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
         except (MemoryError, np.linalg.LinAlgError) as error:
             why = "there is not memory enough" if isinstance(error, MemoryError) else error
             warnings = (*warnings, f"Not in the whole-record estimate: {path}: {why}")
+    found = whole.verdict.findings if whole else ()
+    if wrong := next((each.sentence for each in found if each.kind in _MISREAD), None):
+        return SessionFailure(path, f"{path}: {wrong}", experiment)
+    return _session_result(RecordResult(record, whole, welch), task, experiment, warnings)
+
+
+def _session_result(
+    result: RecordResult, task: SessionTask, experiment: Experiment, warnings: tuple[str, ...]
+) -> SessionResult:
+    """Keep of a record's result what a campaign needs."""
+    from analysis.identify import headline_json
+    from analysis.suited import record_band_hz, welch_settings
+
+    record, whole, welch = result.record, result.whole, result.welch
+    measured = _NO_RESPONSE if welch is None else welch.response
+    delay_s = record.torque_delay_s - record.angle_delay_s
     return SessionResult(
-        path=path,
+        path=record.path,
         experiment=experiment,
         beam=record.beam,
         tool_inertia_kg_m2=record.tool_inertia_kg_m2,
-        delay_s=record.torque_delay_s - record.angle_delay_s,
+        delay_s=delay_s,
         frequency_hz=measured.frequency_hz,
         response=measured.response,
         peaks=() if welch is None else welch.peaks,
         welch_fits=() if welch is None else tuple(map(WelchFit.of, welch.models)),
-        record_estimates=estimates,
-        verdict=verdict,
+        record_estimates=()
+        if whole is None
+        else _estimates(whole, task.structures, measured, delay_s),
+        verdict=None if whole is None else whole.verdict,
         warnings=warnings,
-        headline=headline,
+        headline=None
+        if whole is None
+        else headline_json(str(record.path), whole.headline, whole.orders, whole.verdict.findings),
         settings=welch_settings(record, task.settings, task.band_hz),
         record_band_hz=record_band_hz(record, task.band_hz),
     )
 
 
-def _whole_record(
-    record: Record, task: SessionTask, measured: FrequencyResponse
-) -> tuple[tuple[RecordEstimate, ...], Verdict, dict[str, Any]]:
-    """Select a structure on the whole record; of all fits, keep it and those asked for."""
-    from analysis.identify import Measurement, ResponseGrid, headline_json, select
+def _estimates(
+    whole: WholeRecord, structures: Collection[str], measured: FrequencyResponse, delay_s: float
+) -> tuple[RecordEstimate, ...]:
+    """Keep of all fits to a whole record the selected one and those asked for."""
+    from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
-    from analysis.suited import record_band_hz
 
-    measurement = Measurement.of_record(record)
-    band_hz = record_band_hz(record, task.band_hz)
-    selection = select(measurement, fixed=task.fixed, band_hz=band_hz)
     omega = 2 * np.pi * measured.frequency_hz
     grid = ResponseGrid(1j * omega)
 
     def kept(candidate: Candidate) -> RecordEstimate:
         # The measured response is free of the delay that the file states.
         plant = candidate.fit.plant
-        plant = replace(plant, delay_s=plant.delay_s - measurement.delay_s)
+        plant = replace(plant, delay_s=plant.delay_s - delay_s)
         if not omega.size:
             return RecordEstimate.of(candidate, _NOT_COMPARED)
         response = grid.evaluate(plant)[0]
@@ -221,11 +234,7 @@ def _whole_record(
     order = list(STRUCTURES)
     asked = [
         kept(each)
-        for each in selection.candidates
-        if each.fit.structure.name in task.structures or each.fit is selection.fit
+        for each in whole.selection.candidates
+        if each.fit.structure.name in structures or each.fit is whole.fit
     ]
-    asked.sort(key=lambda each: (not each.uniform, order.index(each.structure)))
-    said = selection.verdict
-    orders = (said.alpha, said.lambda_)
-    told = headline_json(str(record.path), selection.headline, orders, said.findings)
-    return tuple(asked), said, told
+    return tuple(sorted(asked, key=lambda each: (not each.uniform, order.index(each.structure))))

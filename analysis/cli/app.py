@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 
 import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
-from analysis.cli.sessions import Routes, session_command
+from analysis.cli.sessions import session_command
 from analysis.cli.standard_streams import standard_streams
 from analysis.cli.welch_options import (
     Band,
@@ -27,6 +27,7 @@ from analysis.cli.welch_options import (
     choice,
     welch_settings,
 )
+from analysis.results import Routes
 from rigd.runtime import raise_on, use_one_thread
 
 if TYPE_CHECKING:

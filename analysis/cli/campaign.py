@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from analysis.campaigns import Campaign
+    from analysis.campaigns import CampaignResult
     from analysis.identify import Setting
     from analysis.models import WelchSettings
 
@@ -107,8 +107,8 @@ def campaign_command(
 
 
 def _analysed(
-    run: Callable[..., Campaign], files: int, folder: Path, *, with_paper: bool
-) -> Campaign:
+    run: Callable[..., CampaignResult], files: int, folder: Path, *, with_paper: bool
+) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -14,38 +13,10 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from analysis.identify import Setting
-    from analysis.models import WelchSettings
-    from analysis.paper import WelchAnalysis
-    from analysis.record import Record
-    from analysis.results import Subject
-
-    _Found = tuple[WelchAnalysis | None, Subject | None]
+    from analysis.results import RecordResult, Routes
 
 _FIGURE_STEPS: Final = 4
 """How many times longer a figure takes than another step, roughly."""
-
-
-@dataclass(frozen=True, slots=True)
-class Routes:
-    """What is done with a record: Welch's fits, by these settings, and those of the whole record.
-
-    Attributes
-    ----------
-    settings : WelchSettings
-    paper, whole_record : bool
-        Which of the two.
-    fixed : tuple of str
-        Settings of rig and specimen that stay at the file's values.
-    band_hz : tuple of float or None
-        Band of both; None takes what suits the record.
-    """
-
-    settings: WelchSettings
-    paper: bool
-    whole_record: bool
-    fixed: tuple[Setting, ...]
-    band_hz: tuple[float, float] | None = None
 
 
 def session_command(
@@ -89,9 +60,7 @@ def session_command(
     found, errors, code = _analyse_all(files, folders, routes, rerun)
     if not found:
         return code
-    analyses = [analysis for analysis, _ in found if analysis is not None]
-    subjects = [subject for _, subject in found if subject is not None]
-    results = document(analyses, {**(others or {}), **errors}, subjects)
+    results = document(found, {**(others or {}), **errors})
     to_stdout = json is not None and str(json) == "-"
     if json is not None and not to_stdout:
         # Before anything is said: the streams may take nothing.
@@ -99,7 +68,7 @@ def session_command(
     console = Console(stderr=to_stdout, highlight=False)
     if not console.is_terminal:
         console = Console(stderr=to_stdout, highlight=False, width=120)
-    _print_tables(console, analyses, subjects, single=len(files) == 1)
+    _print_tables(console, found, single=len(files) == 1)
     _say(console, "")
     for file, folder in zip(files, folders, strict=True):
         if str(file) not in errors:
@@ -113,29 +82,24 @@ def session_command(
     return code
 
 
-def _print_tables(
-    console: Console,
-    analyses: Sequence[WelchAnalysis],
-    subjects: Sequence[Subject],
-    *,
-    single: bool,
-) -> None:
+def _print_tables(console: Console, results: Sequence[RecordResult], *, single: bool) -> None:
     """Print all tables of a single file, of several those of the Welch fits together."""
     from analysis.report import analysis_tables, record_text, summary_table
 
-    if single or not analyses:
-        for subject in subjects:
-            console.print(record_text(subject))
-    if single and analyses:
-        withheld = subjects[0].unsupported if subjects else frozenset()
-        console.print(analysis_tables(analyses[0], withheld))
-    elif analyses:
-        console.print(summary_table(analyses))
+    by_welch = [each for each in results if each.welch is not None]
+    if single or not by_welch:
+        for whole in (each.whole for each in results):
+            if whole is not None:
+                console.print(record_text(whole))
+    if single and by_welch:
+        console.print(analysis_tables(*by_welch))
+    elif by_welch:
+        console.print(summary_table(by_welch))
 
 
 def _analyse_all(
     files: Sequence[Path], folders: Sequence[Path], routes: Routes, rerun: Path | None
-) -> tuple[list[_Found], dict[str, str], int]:
+) -> tuple[list[RecordResult], dict[str, str], int]:
     """Analyse and report every file; return results, message by failed file, and exit code."""
     from numpy.linalg import LinAlgError
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -146,7 +110,7 @@ def _analyse_all(
     from analysis.report import OutputError
     from rigd.session import SessionError
 
-    found: list[_Found] = []
+    found: list[RecordResult] = []
     errors: dict[str, str] = {}
     code = 0
     terminal = _standard_error()
@@ -206,58 +170,23 @@ def _analyse_file(
     routes: Routes,
     rerun: Path | None,
     on_step: Callable[[str], None],
-    warn: Callable[[str], None],
-) -> _Found:
-    from analysis.identify import MeasurementError
-    from analysis.record import load_record
+    tell: Callable[[str], None],
+) -> RecordResult:
     from analysis.report import new_folder, write_report
-    from analysis.suited import check_record_band, remarks, welch_analysis
+    from analysis.results import record_result
 
-    record = load_record(file)
-    record = _with_warnings(record, remarks(record, routes.band_hz))
-    on_step("read")
-    if not routes.paper:
-        check_record_band(record, routes.band_hz)
-    analysis, left_out = None, None
-    if routes.paper:
-        analysis, left_out = welch_analysis(
-            record, routes.settings, routes.band_hz,
-            optional=routes.whole_record and rerun is None, on_step=on_step,
-        )  # fmt: skip
-    if left_out:
-        warn(f"Warning: {file}: {left_out}")
-        record = _with_warnings(record, (left_out,))
-    subject = None
-    if routes.whole_record:
-        on_step("whole record")
-        try:
-            subject = _whole_record(record, routes, analysis)
-        except MeasurementError as error:
-            if analysis is None:
-                raise
-            warn(f"Warning: {error} Only the Welch fits were run.")
+    result = record_result(
+        file, routes, welch_required=rerun is not None, on_step=on_step,
+        warn=lambda text: tell(f"Warning: {text}"),
+    )  # fmt: skip
     with new_folder(folder) as part:
-        write_report(analysis, part, on_step, subject)
-    if rerun is not None and analysis is not None:
+        write_report(result, part, on_step)
+    if rerun is not None:
         from analysis.report import write_rerun_file
 
-        write_rerun_file(analysis, rerun)
+        write_rerun_file(result, rerun)
         on_step("figure for Rerun")
-    return analysis, subject
-
-
-def _with_warnings(record: Record, more: tuple[str, ...]) -> Record:
-    return replace(record, warnings=(*record.warnings, *more)) if more else record
-
-
-def _whole_record(record: Record, routes: Routes, welch: WelchAnalysis | None) -> Subject:
-    from analysis.identify import Measurement, select
-    from analysis.results import Subject
-    from analysis.suited import record_band_hz
-
-    band_hz = record_band_hz(record, routes.band_hz)
-    selection = select(Measurement.of_record(record), fixed=routes.fixed, band_hz=band_hz)
-    return Subject.of(record, selection, band_hz, routes.fixed, welch)
+    return result
 
 
 def _standard_error() -> Console:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from analysis.exchange._source import ExchangeError
 from rigd.beam import Beam
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -56,7 +57,7 @@ def read_specimen(path: Path) -> Specimen:
     beam, sensor = (_section(path, content, name) for name in ("beam", "sensor"))
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor:
-        tool_inertia_kg_m2 = _number(path, "sensor", sensor, "tool_inertia_kg_m2", "kg·m²")
+        tool_inertia_kg_m2 = _number(path, "sensor", sensor, "tool_inertia_kg_m2")
         if tool_inertia_kg_m2 < 0.0:
             raise ExchangeError(
                 f"{path}: sensor.tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg·m², but an "
@@ -64,9 +65,9 @@ def read_specimen(path: Path) -> Specimen:
             )
     return Specimen(
         Beam(
-            length_m=_positive(path, beam, "length_m", "m"),
-            density_kg_per_m=_positive(path, beam, "density_kg_per_m", "kg/m"),
-            bending_stiffness_n_m2=_positive(path, beam, "bending_stiffness_n_m2", "N·m²"),
+            length_m=_positive(path, beam, "length_m"),
+            density_kg_per_m=_positive(path, beam, "density_kg_per_m"),
+            bending_stiffness_n_m2=_positive(path, beam, "bending_stiffness_n_m2"),
         ),
         tool_inertia_kg_m2,
     )
@@ -79,15 +80,17 @@ def _section(path: Path, content: Mapping[str, Any], name: str) -> Mapping[str, 
     return section
 
 
-def _positive(path: Path, section: Mapping[str, Any], key: str, unit: str) -> float:
-    value = _number(path, "beam", section, key, unit)
+def _positive(path: Path, section: Mapping[str, Any], key: str) -> float:
+    value = _number(path, "beam", section, key)
     if not value > 0.0:
-        raise ExchangeError(f"{path}: beam.{key} is {value:g} {unit}, but must be positive.")
+        raise ExchangeError(
+            f"{path}: beam.{key} is {value:g} {unit_of(key)}, but must be positive."
+        )
     return value
 
 
-def _number(path: Path, name: str, section: Mapping[str, Any], key: str, unit: str) -> float:
-    value = section.get(key)
+def _number(path: Path, name: str, section: Mapping[str, Any], key: str) -> float:
+    value, unit = section.get(key), unit_of(key)
     if isinstance(value, dict):
         value = value.get("value")
     if value is None:

@@ -13,6 +13,7 @@ from analysis.paper import estimate
 from analysis.record import load_record
 from analysis.suited import welch_settings
 from rigd.session import SAMPLE_FIELDS, read_session
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.models import WelchSettings
-
-_UNITS: Final = {"_rad": "rad", "_nm": "N.m", "_n": "N"}
-"""Suffix of a field → its unit as it is written into files, in ASCII."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +153,8 @@ def frf_table(
 
 
 def _unit(name: str) -> str:
-    return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
+    """Return a field's unit as it is written into files, in ASCII."""
+    return unit_of(name).replace("·", ".")
 
 
 def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.statistics import chi_square_deviate, kolmogorov_p_value
+from analysis.statistics import KOLMOGOROV_95, chi_square_deviate, kolmogorov_p_value
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,9 +41,6 @@ def largest_of(count: int) -> float:
 
 
 # Whiteness, and coherence with the input
-
-BAND_95: Final = 1.3581
-"""95 % point of the Kolmogorov statistic times the root of the number of bins."""
 
 _LEVEL: Final = 1e-6
 """Probability of chance: what `SURE` means for the other tests."""
@@ -165,7 +162,7 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
         loud |= deviate > SURE + 0.5 and float(total[i]) / (2 * width) > _LOUD
     return Whiteness(
         distance=distance,
-        band=BAND_95 / math.sqrt(count),
+        band=KOLMOGOROV_95 / math.sqrt(count),
         probability=kolmogorov_p_value(distance * math.sqrt(count)),
         loudest_hz=edges,
         loudest_ratio=ratio,

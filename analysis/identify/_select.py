@@ -40,6 +40,7 @@ from analysis.identify._verdict import (
     untold_reason,
 )
 from analysis.identify._visible_modes import driven, visible_modes
+from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -403,7 +404,7 @@ def _with_interval(quantity: Quantity) -> str:
     low, high = quantity.interval_95
     power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
     scale = 10.0**power if power < -2 else 1.0
-    digits = max(0, 1 - math.floor(math.log10(quantity.std / scale)))
+    digits = decimals(quantity.std / scale)
     exponent = f"e{power}" if power < -2 else ""
     return (
         f"{quantity.value / scale:.{digits}f}{exponent} "

@@ -1,8 +1,8 @@
 """What people and programs are shown of an analysis: tables, figures, a JSON document.
 
-Each table is described once, as a `Table` (in `_record_tables` and `_campaign_tables`), and
-rendered for the terminal, for a page, as CSV and as JSON. Pages are the files in ``templates``,
-which `_page` fills; nothing else of this room needs them.
+Each table is described once, as a `Table` (in the modules ``_…_tables``), and rendered for the
+terminal, for a page, as CSV and as JSON. Pages are the files in ``templates``, which `_page` fills;
+nothing else of this room needs them.
 """
 
 import lazy_loader as lazy

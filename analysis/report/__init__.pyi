@@ -1,6 +1,7 @@
 from ._bands import loss_factors as loss_factors
 from ._bands import response_band as response_band
 from ._campaign_document import campaign_document as campaign_document
+from ._campaign_text import campaign_tables as campaign_tables
 from ._campaign_write import write_campaign as write_campaign
 from ._document import document as document
 from ._document import document_text as document_text
@@ -16,7 +17,6 @@ from ._record_figures import illustrations as illustrations
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
 from ._text import analysis_tables as analysis_tables
-from ._text import campaign_tables as campaign_tables
 from ._text import record_text as record_text
 from ._text import summary_table as summary_table
 from ._write import figures_of_paper as figures_of_paper

@@ -13,7 +13,7 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from analysis.identify import RecordAnalysis
     from analysis.record import Record
-    from analysis.results import Subject
+    from analysis.results import WholeRecord
 
     Band = tuple[float, float]
     from numpy.typing import NDArray
@@ -27,7 +27,7 @@ _OVER_NOISE: Final = 4.0
 """Mean power of a block over the noise's. By chance it exceeds 2 in one of 10 000 blocks."""
 
 
-def supported_band_hz(subject: Subject) -> Band | None:
+def supported_band_hz(whole: WholeRecord) -> Band | None:
     """Band in which the selected fit's loss factors rest on data.
 
     The modes show the damping. A model whose orders the data support is also right between and
@@ -36,17 +36,17 @@ def supported_band_hz(subject: Subject) -> Band | None:
 
     Parameters
     ----------
-    subject : Subject
+    whole : WholeRecord
 
     Returns
     -------
     tuple of float or None
         First and last frequency in Hz; None if there is no such band.
     """
-    if not subject.withheld:
-        return excited_band_hz(subject.record, subject.analysis)
-    shown = subject.visible_modes
-    frequencies = [mode.frequency_hz for mode in subject.fit.modes if mode.number in shown]
+    if not whole.withheld:
+        return excited_band_hz(whole.record, whole.analysis)
+    shown = whole.visible_modes
+    frequencies = [mode.frequency_hz for mode in whole.fit.modes if mode.number in shown]
     if len(frequencies) < 2:
         return None
     return min(frequencies), max(frequencies)

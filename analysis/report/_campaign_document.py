@@ -14,11 +14,11 @@ from analysis.report._table import json_rows
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
-    from analysis.campaigns import Campaign, RecordEstimate, SessionResult, WelchFit
+    from analysis.campaigns import CampaignResult, RecordEstimate, SessionResult, WelchFit
     from analysis.identify import ModeEstimate
 
 
-def campaign_document(campaign: Campaign, *, with_paper: bool = False) -> dict[str, Any]:
+def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Any]:
     """Collect everything.
 
     Returns

@@ -17,8 +17,8 @@ from analysis.campaigns import (
 )
 from analysis.models import ESTIMATOR_WORDS, STRUCTURES
 from analysis.report import _style as style
-from analysis.report._campaign_tables import used
 from analysis.report._frf_figure import line_styles
+from analysis.report._pooled_tables import used
 from analysis.report._table import MARK, unreported
 from rigd.view import magnitude_db, phase_deg
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
-    from analysis.campaigns import Campaign, NominalModel, PooledParameter
+    from analysis.campaigns import CampaignResult, NominalModel, PooledParameter
 
 _PANELS: Final = (
     ("mse", "(a) Mean square error", "MSE ((N·m/rad)²)"),
@@ -40,7 +40,7 @@ _PANELS: Final = (
 _FLIER_SIZE: Final = 3.0
 
 
-def index_figure(campaign: Campaign) -> Figure:
+def index_figure(campaign: CampaignResult) -> Figure:
     """Draw MSE, WMSE and MD of every nominal model over the sessions (Eqs. 28-30)."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -105,7 +105,7 @@ _POOLED: Final = "#C3DCED"
 """Of an interval: the pooled line's blue, but light and opaque."""
 
 
-def pooled_figure(campaign: Campaign) -> Figure:
+def pooled_figure(campaign: CampaignResult) -> Figure:
     """Draw each session's estimate with its 95 % interval over the pooled one, freest structure."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -153,7 +153,7 @@ def pooled_figure(campaign: Campaign) -> Figure:
 
 
 def _panel(
-    campaign: Campaign, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
+    campaign: CampaignResult, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
 ) -> None:
     symbol, factor, _ = label(parameter.name)
     places, values, spreads = [], [], []
@@ -197,7 +197,7 @@ _PAIR: Final[tuple[dict[str, Any], ...]] = (
 )
 
 
-def nominal_figure(campaign: Campaign) -> Figure:
+def nominal_figure(campaign: CampaignResult) -> Figure:
     """Draw every type's nominal models over all measured responses (Figure 6)."""
     types = list(dict.fromkeys(model.structure for model in campaign.nominal))
     columns = min(len(types), 4 if len(types) > 6 else 3)
@@ -229,7 +229,7 @@ def nominal_figure(campaign: Campaign) -> Figure:
     return figure
 
 
-def best_figure(campaign: Campaign) -> Figure:
+def best_figure(campaign: CampaignResult) -> Figure:
     """Draw the two best nominal models over all measured responses (Figure 8)."""
     models = best_models(campaign.nominal)
     width_in, height_in = 10.0, 6.6
@@ -250,7 +250,7 @@ def best_figure(campaign: Campaign) -> Figure:
     return figure
 
 
-def _figure(campaign: Campaign, width_in: float, height_in: float, what: str) -> Figure:
+def _figure(campaign: CampaignResult, width_in: float, height_in: float, what: str) -> Figure:
     count = len(campaign.sessions)
     drawn = "" if count <= _MOST_LINES else f", {_MOST_LINES} of them drawn"
     estimator = ESTIMATOR_WORDS[campaign.settings.estimator]
@@ -262,7 +262,7 @@ def _figure(campaign: Campaign, width_in: float, height_in: float, what: str) ->
 
 
 def _response_panel(
-    campaign: Campaign,
+    campaign: CampaignResult,
     magnitude: Axes,
     phase: Axes,
     models: Sequence[NominalModel],
@@ -299,7 +299,7 @@ def _line(
 
 
 def _dress(
-    campaign: Campaign,
+    campaign: CampaignResult,
     magnitude: Axes,
     phase: Axes,
     limits: tuple[float, float],
@@ -327,7 +327,7 @@ def _legend(figure: Figure, handles: dict[str, Line2D], width_in: float, height_
     legend.get_lines()[0].set_linewidth(1.5)
 
 
-def _db_limits(campaign: Campaign, models: Sequence[NominalModel]) -> tuple[float, float]:
+def _db_limits(campaign: CampaignResult, models: Sequence[NominalModel]) -> tuple[float, float]:
     """Limits that hold the measured responses and the models' peaks, not every zero's depth."""
     measured = np.concatenate([magnitude_db(s.response) for s in campaign.sessions])
     peaks = max(float(magnitude_db(model.response).max()) for model in models)
@@ -338,7 +338,7 @@ def _db_limits(campaign: Campaign, models: Sequence[NominalModel]) -> tuple[floa
 _ROW_IN: Final = 0.27
 
 
-def validation_figure(campaign: Campaign) -> Figure:
+def validation_figure(campaign: CampaignResult) -> Figure:
     """Draw every left-out session's error, model by model, the best at the top."""
     from matplotlib.lines import Line2D
 
@@ -388,7 +388,7 @@ def validation_figure(campaign: Campaign) -> Figure:
     return figure
 
 
-def _predicted(campaign: Campaign) -> str:
+def _predicted(campaign: CampaignResult) -> str:
     done = campaign.trials - len(campaign.lost_trials)
     return f"{done} of {campaign.trials}" if campaign.lost_trials else str(done)
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.report._campaign_tables import paper_tables, sessions_table, shown_tables
+from analysis.report._campaign_tables import sessions_table, shown_tables
+from analysis.report._campaign_text import campaign_sentences
 from analysis.report._page import page, versions
-from analysis.report._sentences import campaign_sentences
+from analysis.report._paper_tables import paper_tables
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from datetime import datetime
 
-    from analysis.campaigns import Campaign
+    from analysis.campaigns import CampaignResult
     from analysis.report._page import Facts, Picture
 
 _OF_RECORDS: Final = ("pooled", "validation")
@@ -20,13 +21,13 @@ _OF_RECORDS: Final = ("pooled", "validation")
 
 
 def campaign_page(
-    campaign: Campaign, pictures: Sequence[Picture], made_at: datetime, *, with_paper: bool
+    campaign: CampaignResult, pictures: Sequence[Picture], made_at: datetime, *, with_paper: bool
 ) -> str:
     """Put a campaign's report together.
 
     Parameters
     ----------
-    campaign : Campaign
+    campaign : CampaignResult
     pictures : sequence of Picture
     made_at : datetime
         When, with a time zone.
@@ -56,7 +57,7 @@ def campaign_page(
     )
 
 
-def _warnings(campaign: Campaign) -> list[str]:
+def _warnings(campaign: CampaignResult) -> list[str]:
     return [
         *(f"Left out: {each.message}" for each in campaign.failures),
         *(
@@ -71,7 +72,7 @@ def _warnings(campaign: Campaign) -> list[str]:
     ]
 
 
-def _how(campaign: Campaign, made_at: datetime) -> list[Facts]:
+def _how(campaign: CampaignResult, made_at: datetime) -> list[Facts]:
     """Collect what is known of specimen, estimators and versions."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
     beam = campaign.sessions[0].beam

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables
+from analysis.report._campaign_text import campaign_text
 from analysis.report._document import document_text
 from analysis.report._folder import write_new
 from analysis.report._table import csv_text
-from analysis.report._text import campaign_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from analysis.campaigns import Campaign
+    from analysis.campaigns import CampaignResult
 
 
 def write_campaign(
-    campaign: Campaign,
+    campaign: CampaignResult,
     folder: Path,
     *,
     with_paper: bool = False,
@@ -34,7 +34,7 @@ def write_campaign(
 
     Parameters
     ----------
-    campaign : Campaign
+    campaign : CampaignResult
     folder : Path
         An existing folder without these files.
     with_paper : bool
@@ -69,7 +69,7 @@ def write_campaign(
     write_new(folder / "report.html", page)
 
 
-def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
+def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], str]]:
     """Drawings by name, with what is seen in them: those for which there are data."""
     from analysis.report._campaign_figures import (
         best_figure,
@@ -113,7 +113,7 @@ def _figures(campaign: Campaign) -> dict[str, tuple[Callable[[], Figure], str]]:
     }
 
 
-def _signals(campaign: Campaign) -> Figure:
+def _signals(campaign: CampaignResult) -> Figure:
     """Draw the first session's signals as an example, as the paper does."""
     from analysis.paper import analyse
     from analysis.record import load_record

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._bands import LossFactor
-    from analysis.results import Subject
+    from analysis.results import RecordResult, WholeRecord
     from rigd.spectral import FrequencyResponse
 
     IndexValues = dict[str, float | None]
@@ -87,7 +87,7 @@ def _indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> Inde
 _CURVE_POINTS = 200
 
 
-def record_entries(subject: Subject) -> dict[str, Any]:
+def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str, Any]:
     """Collect the whole-record results of one record.
 
     Returns
@@ -106,32 +106,31 @@ def record_entries(subject: Subject) -> dict[str, Any]:
     names = [
         (
             {
-                "file": str(subject.record.path),
+                "file": str(whole.record.path),
                 "estimator": "record",
                 "type": fit.structure.name,
                 "weighting": None,
                 "candidate": name,
-                "selected": name == subject.headline.name,
+                "selected": name == whole.headline.name,
             },
             fit,
         )
-        for name, fit in subject.fits.items()
+        for name, fit in whole.fits.items()
     ]
-    welch = subject.welch
     indices = [
         (NOT_COMPARED, NOT_COMPARED) if welch is None else indices_of_record_fit(fit, welch)
         for _, fit in names
     ]
-    file = str(subject.record.path)
-    verdict = subject.verdict
+    file = str(whole.record.path)
+    verdict = whole.verdict
     return {
-        "headline": headline_json(file, subject.headline, verdict.orders, verdict.findings),
+        "headline": headline_json(file, whole.headline, whole.orders, verdict.findings),
         "fits": [
             {
                 **name,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
-                "withheld": sorted(unreported(fit.structure, subject.unsupported)),
+                "withheld": sorted(unreported(fit.structure, whole.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
                     key: None if ends is None else list(ends) for key, ends in fit.interval.items()
@@ -153,7 +152,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
             {
                 **name,
                 "mode": mode.number,
-                "visible": mode.number in subject.visible_modes,
+                "visible": mode.number in whole.visible_modes,
                 "frequency_hz": mode.frequency_hz,
                 "frequency_std_hz": mode.frequency_std_hz,
                 "damping_ratio": mode.damping_ratio,
@@ -166,23 +165,23 @@ def record_entries(subject: Subject) -> dict[str, Any]:
         ],
         "records": [
             {
-                "file": str(subject.record.path),
-                "selected": subject.headline.name,
-                "verdict": list(subject.verdict.sentences),
-                "experiments": list(subject.verdict.experiments),
-                "withheld": sorted(subject.withheld),
+                "file": str(whole.record.path),
+                "selected": whole.headline.name,
+                "verdict": list(whole.verdict.sentences),
+                "experiments": list(whole.verdict.experiments),
+                "withheld": sorted(whole.withheld),
                 "orders": {
                     each.order: {
                         "status": each.status,
                         "value": each.value,
                         "interval_95": None if each.interval is None else list(each.interval),
                     }
-                    for each in subject.verdict.orders
+                    for each in whole.orders
                 },
-                "band_hz": list(subject.band_hz),
-                "fixed": list(subject.fixed),
-                "hum": [asdict(line) for line in subject.analysis.lines],
-                "curves": _curves(subject),
+                "band_hz": list(whole.band_hz),
+                "fixed": list(whole.fixed),
+                "hum": [asdict(line) for line in whole.analysis.lines],
+                "curves": _curves(whole),
             }
         ],
     }
@@ -192,14 +191,14 @@ def _size(size: DampingSize | None) -> dict[str, Any] | None:
     return None if size is None else asdict(size)
 
 
-def _curves(subject: Subject) -> dict[str, Any]:
+def _curves(whole: WholeRecord) -> dict[str, Any]:
     """Tabulate the selected fit's response and loss factors over the band."""
-    first_hz, last_hz = subject.band_hz
+    first_hz, last_hz = whole.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
-    band = response_band(subject.fit, frequency_hz)
+    band = response_band(whole.fit, frequency_hz)
     low, high = band.magnitude_limits()
-    factors = loss_factors(subject.fit, frequency_hz)
-    supported_hz = supported_band_hz(subject)
+    factors = loss_factors(whole.fit, frequency_hz)
+    supported_hz = supported_band_hz(whole)
     return {
         "frequency_hz": frequency_hz.tolist(),
         "magnitude_nm_per_rad": np.abs(band.response).tolist(),
@@ -222,19 +221,16 @@ def _factor(factor: LossFactor | None) -> dict[str, list[float]] | None:
 
 
 def document(
-    analyses: Sequence[WelchAnalysis],
-    errors: Mapping[str, str] | None = None,
-    subjects: Sequence[Subject] = (),
+    results: Sequence[RecordResult], errors: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Collect the results of all files.
 
     Parameters
     ----------
-    analyses : sequence of WelchAnalysis
+    results : sequence of RecordResult
+        The entries of whole records follow those of the paper's route.
     errors : mapping of str to str, optional
         Message for each file that could not be analysed.
-    subjects : sequence of Subject, optional
-        Whole-record results, whose entries follow those of the paper's route.
 
     Returns
     -------
@@ -244,31 +240,27 @@ def document(
         ``errors``: lists of objects that name their file.
         Finite numbers only.
     """
-    of_records = [record_entries(subject) for subject in subjects]
-    withheld = {subject.record.path: subject.unsupported for subject in subjects}
+    of_records = [record_entries(each.whole, each.welch) for each in results if each.whole]
+    by_welch = [(each.welch, each.unsupported) for each in results if each.welch]
     content: dict[str, Any] = finite(
         {
             "versions": versions(),
             "files": [
-                *(_file(analysis) for analysis in analyses),
+                *(_file(analysis) for analysis, _ in by_welch),
                 *(
-                    _record_facts(subject.record, subject.warnings)
-                    for subject in subjects
-                    if subject.welch is None
+                    _record_facts(each.record, each.warnings)
+                    for each in results
+                    if each.welch is None
                 ),
             ],
             "fits": [
-                *(
-                    fit
-                    for analysis in analyses
-                    for fit in _fits(analysis, withheld.get(analysis.record.path, ()))
-                ),
+                *(fit for analysis, withheld in by_welch for fit in _fits(analysis, withheld)),
                 *(fit for entries in of_records for fit in entries["fits"]),
             ],
             "modes": [
                 *(
                     mode
-                    for analysis in analyses
+                    for analysis, _ in by_welch
                     for model in analysis.models
                     for mode in _modes(analysis, model)
                 ),
@@ -283,7 +275,7 @@ def document(
                     "frequency_hz": None if peak is None else peak.frequency_hz,
                     "magnitude_db": None if peak is None else peak.magnitude_db,
                 }
-                for analysis in analyses
+                for analysis, _ in by_welch
                 for number, peak in enumerate(analysis.peaks, start=1)
             ],
             "errors": [

@@ -22,7 +22,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from analysis.identify import fast_length
 from analysis.report import _style as style
 from analysis.report._bands import loss_factors, response_band, supported_band_hz
-from analysis.statistics import NORMAL_95
+from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import ModeEstimate, RecordAnalysis, RecordFit
     from analysis.report._bands import ResponseBand
-    from analysis.results import Subject
+    from analysis.results import WholeRecord
     from rigd.spectral import FrequencyResponse
 
 
@@ -297,9 +297,6 @@ def _beyond(
     return [(axis_hz[0], first_hz), (last_hz, axis_hz[1])]
 
 
-_KOLMOGOROV_95: Final = 1.358
-"""95 % quantile of Kolmogorov's distribution: the bounds' half-width is that over √bins."""
-
 _BINS_A_POINT: Final = 24
 _SMOOTH_POINTS: Final = 600
 _STRETCHES: Final = 120
@@ -371,7 +368,7 @@ def _cumulative(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     share = np.cumsum(power) / power.sum()
     uniform = np.arange(1, power.size + 1) / power.size
     frequency_hz = analysis.frequency_hz[counted]
-    half = 100 * _KOLMOGOROV_95 / np.sqrt(power.size)
+    half = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
     axes.axhspan(-half, half, color=style.SHADE, linewidth=0, zorder=0, label="95 % of white noise")
     difference = 100 * (share - uniform)
     axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
@@ -440,19 +437,19 @@ class Illustration:
 FIGURES: Final = ("record_frf", "loss_factor", "residual", "record_signals")
 
 
-def illustrations(subject: Subject) -> Iterator[Illustration]:
+def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     """Draw the figures one after the other; within `style.styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    name, highest_hz, shown = subject.name, subject.band_hz[1], subject.visible_modes
+    name, highest_hz, shown = whole.record.path.name, whole.band_hz[1], whole.visible_modes
     # Details and lines are of modes that the record shows, not of what the model adds.
-    fit = replace(subject.fit, modes=tuple(m for m in subject.fit.modes if m.number in shown))
-    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in subject.fit.modes)
+    fit = replace(whole.fit, modes=tuple(m for m in whole.fit.modes if m.number in shown))
+    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in whole.fit.modes)
     frf, loss, residual, signals = FIGURES
-    measured = measured_response(subject)
+    measured = measured_response(whole)
     yield Illustration(
         frf,
-        frf_figure(name, measured, subject.fit),
+        frf_figure(name, measured, whole.fit),
         f"Frequency response from motor angle to coupling torque: magnitude and phase as measured "
         f"and of the model, half-width of the model's 95 % band, and details of the modes ({modes} "
         "Hz). The band is narrower than the line where it is not seen.",
@@ -463,14 +460,14 @@ def illustrations(subject: Subject) -> Iterator[Illustration]:
             name,
             fit,
             (float(measured.frequency_hz[0]), highest_hz),
-            supported_band_hz(subject),
-            withheld=subject.withheld,
+            supported_band_hz(whole),
+            withheld=whole.withheld,
         ),
-        _loss_description(subject),
+        _loss_description(whole),
     )
     yield Illustration(
         residual,
-        residual_figure(name, subject.analysis, fit),
+        residual_figure(name, whole.analysis, fit),
         "What the model leaves of the torque: its spectrum beside what was taken for noise; its "
         "cumulative periodogram, which stays in the shaded range in 95 of 100 records or more if "
         "only noise is left; and its power through the record. Excess at a mode or at one time "
@@ -478,14 +475,14 @@ def illustrations(subject: Subject) -> Iterator[Illustration]:
     )
     yield Illustration(
         signals,
-        signals_figure(subject.record, fit, highest_hz),
+        signals_figure(whole.record, fit, highest_hz),
         "Motor angle, coupling torque as measured and as the model makes it of the measured angle, "
         "and their difference; below, where each mode rings most.",
     )
 
 
-def _loss_description(subject: Subject) -> str:
-    if subject.withheld:
+def _loss_description(whole: WholeRecord) -> str:
+    if whole.withheld:
         return (
             "Loss factor of all damping against frequency with its 95 % band, and at each mode "
             "that shows (points: twice its damping ratio). It is drawn between these modes only, "
@@ -500,16 +497,16 @@ def _loss_description(subject: Subject) -> str:
     )
 
 
-def measured_response(subject: Subject) -> FrequencyResponse:
+def measured_response(whole: WholeRecord) -> FrequencyResponse:
     """Ratio of the whole record's transforms, from well below the first mode to the band's end.
 
     The delay between the channels is still in it.
     """
-    record = subject.record
+    record = whole.record
     angle = record.angle_rad - (record.rest_angle_rad or 0.0)
     response = fft_response(angle, record.torque_nm, record.rate_hz, fast_length(len(angle)))
-    first_mode_hz = float(undamped_frequencies_rad_s(subject.fit.plant.beam, 1)[0]) / (2 * np.pi)
-    first_hz, last_hz = subject.band_hz
+    first_mode_hz = float(undamped_frequencies_rad_s(whole.fit.plant.beam, 1)[0]) / (2 * np.pi)
+    first_hz, last_hz = whole.band_hz
     response = response.band(max(first_hz, min(first_mode_hz / 4, last_hz / 4)), last_hz)
     known = np.isfinite(response.response)
     return replace(

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from analysis.record import Record
     from analysis.report._page import Facts, Picture
     from analysis.report._table import Table
-    from analysis.results import Subject
+    from analysis.results import RecordResult, WholeRecord
 
 
 def record_page(
-    subject: Subject,
+    result: RecordResult,
     pictures: Sequence[Picture],
     modes: Table,
     tables: Sequence[Table],
@@ -34,7 +34,8 @@ def record_page(
 
     Parameters
     ----------
-    subject : Subject
+    result : RecordResult
+        With whole-record fits.
     pictures : sequence of Picture
         The figures; the table of the modes follows the first one.
     modes : Table
@@ -51,29 +52,31 @@ def record_page(
     str
         An HTML document that refers to nothing outside it.
     """
+    whole = result.whole
+    assert whole is not None
     return page(
         "record.html",
-        title=subject.name,
-        session=_session(subject),
-        note=subject.record.metadata.get("note"),
-        first=damping_sentences(subject.headline),
-        sentences=subject.verdict.sentences,
-        experiments=subject.verdict.experiments,
-        warnings=subject.warnings,
+        title=result.name,
+        session=_session(result.record),
+        note=result.record.metadata.get("note"),
+        first=damping_sentences(whole.headline),
+        sentences=whole.verdict.sentences,
+        experiments=whole.verdict.experiments,
+        warnings=result.warnings,
         pictures=pictures,
         modes=modes,
         tables=tables,
         paper_pictures=paper_pictures,
         paper_tables=paper_tables,
-        how=_how(subject, made_at),
+        how=_how(result, whole, made_at),
     )
 
 
-def _session(subject: Subject) -> list[str]:
+def _session(record: Record) -> list[str]:
     """Say whose session it is, as far as the file does."""
-    metadata = subject.record.metadata
+    metadata = record.metadata
     told = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
-    return [*_start(metadata), f"outcome {subject.record.outcome}", *told]
+    return [*_start(metadata), f"outcome {record.outcome}", *told]
 
 
 def _start(metadata: Mapping[str, str]) -> list[str]:
@@ -94,9 +97,9 @@ _SHOWN_ALREADY = frozenset(
 )  # fmt: skip
 
 
-def _how(subject: Subject, made_at: datetime) -> list[Facts]:
+def _how(result: RecordResult, whole: WholeRecord, made_at: datetime) -> list[Facts]:
     """Collect what is known of file, record, session, settings and versions."""
-    record = subject.record
+    record, welch = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
         ("Record", _record_facts(record)),
@@ -104,8 +107,8 @@ def _how(subject: Subject, made_at: datetime) -> list[Facts]:
             "Session, as the file states it",
             [(key, value) for key, value in record.metadata.items() if key not in _SHOWN_ALREADY],
         ),
-        ("Whole-record fits", _record_fit_facts(subject)),
-        *([] if subject.welch is None else [("The paper's route", _welch_facts(subject.welch))]),
+        ("Whole-record fits", _record_fit_facts(whole)),
+        *([] if welch is None else [("The paper's route", _welch_facts(welch))]),
         versions(made_at),
     ]
 
@@ -150,11 +153,11 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
     ]
 
 
-def _record_fit_facts(subject: Subject) -> list[tuple[str, str]]:
-    first_hz, last_hz = subject.band_hz
+def _record_fit_facts(whole: WholeRecord) -> list[tuple[str, str]]:
+    first_hz, last_hz = whole.band_hz
     lines = [
         f"{line.frequency_hz:.5g} Hz, {1e3 * line.amplitude_nm:.3g} mN·m"
-        for line in subject.analysis.lines
+        for line in whole.analysis.lines
     ]
     return [
         (
@@ -163,9 +166,9 @@ def _record_fit_facts(subject: Subject) -> list[tuple[str, str]]:
             "the measured angle against the measured one, whitened with the noise found; maximum "
             "likelihood for noise in the torque",
         ),
-        ("band", f"{first_hz:g} to {last_hz:g} Hz, {subject.analysis.frequency_hz.size} bins"),
-        ("types", ", ".join(subject.fits)),
-        ("fixed at the file's values", ", ".join(subject.fixed) or "none"),
+        ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole.analysis.frequency_hz.size} bins"),
+        ("types", ", ".join(whole.fits)),
+        ("fixed at the file's values", ", ".join(whole.fixed) or "none"),
         ("hum taken out", "; ".join(lines) or "none found"),
         (
             "intervals and bands",

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
+from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
 from analysis.report._table import (
     ABSENT,
@@ -32,25 +33,7 @@ if TYPE_CHECKING:
     from analysis.identify import Headline, Quantity, Size
     from analysis.models import Structure
     from analysis.paper import FittedModel, WelchAnalysis
-    from analysis.results import Subject
-
-PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
-    "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
-    "alpha": ("α", "its order", "1", 1.0),
-    "gamma": ("γ", "external damping", "1e-2 s^λ/m⁴", 1e2),
-    "lambda": ("λ", "its order", "1", 1.0),
-    "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
-    "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
-    "delay_s": ("τ", "torque older than angle", "µs", 1e6),
-    "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
-    "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
-    "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
-    "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
-    "second_order_filter_time_constant_s": ("T", "second-order filter of the torque", "ms", 1e3),
-    "clock_rate_difference": ("ε", "torque's clock against the angle's", "ppm", 1e6),
-    "drag": ("C_D d", "drag of the air", "mm", 1e3),
-}
-"""Symbol, meaning, unit shown, and how many of that make one SI unit."""
+    from analysis.results import WholeRecord
 
 _STRONG_CORRELATION: Final = 0.9
 _MARKED: Final = (
@@ -59,9 +42,9 @@ _MARKED: Final = (
 )
 
 
-def modes_table(subject: Subject) -> Table:
+def modes_table(whole: WholeRecord) -> Table:
     """Frequencies and damping ratios; modes that do not show, or are doubtful, are marked."""
-    told = subject.headline
+    told = whole.headline
     rows: list[tuple[Entry, ...]] = []
     for mode in told.modes:
         f, ratio = mode.frequency_hz, mode.damping_ratio
@@ -87,9 +70,9 @@ def modes_table(subject: Subject) -> Table:
     )
 
 
-def parameters_table(subject: Subject) -> Table:
+def parameters_table(whole: WholeRecord) -> Table:
     """All parameters with their uncertainty; those with a flag are marked, with the reason."""
-    told = subject.headline
+    told = whole.headline
     return Table.of(
         "parameters",
         f"Parameters, type {told.name}",
@@ -112,9 +95,9 @@ def parameters_table(subject: Subject) -> Table:
     )
 
 
-def sizes_table(subject: Subject) -> Table:
+def sizes_table(whole: WholeRecord) -> Table:
     """Loss factors of either damping where they are uncorrelated with its order."""
-    told = subject.headline
+    told = whole.headline
     return Table.of(
         "damping_sizes",
         "Loss factor of either damping at the frequency where it depends least on its order",
@@ -137,12 +120,12 @@ def sizes_table(subject: Subject) -> Table:
     )
 
 
-def condition_table(subject: Subject) -> Table | None:
+def condition_table(whole: WholeRecord) -> Table | None:
     """Set what a simpler structure would give beside what is told; None if none would do."""
-    told, simpler = subject.headline, subject.headline.simpler
+    told, simpler = whole.headline, whole.headline.simpler
     if simpler is None:
         return None
-    taken = " and ".join(f"{PARAMETERS[name][0]} = {at:g}" for name, at in simpler.fixed.items())
+    taken = " and ".join(f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler.fixed.items())
     rows: list[tuple[Entry, ...]] = []
     for name, each in simpler.parameters.items():
         symbol, _meaning, unit, factor = _described(name)
@@ -173,13 +156,13 @@ def condition_table(subject: Subject) -> Table | None:
     )
 
 
-def correlations_table(subject: Subject) -> Table:
+def correlations_table(whole: WholeRecord) -> Table:
     """Correlations of the determined parameters of the selected fit."""
-    fit = subject.fit
+    fit = whole.fit
     symbols = [_symbol(name) for name in fit.determined]
     return Table.of(
         "correlations",
-        f"Correlations of the parameters, type {subject.headline.name}",
+        f"Correlations of the parameters, type {whole.headline.name}",
         (
             Column("Parameter", "parameter", WORDS),
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
@@ -234,12 +217,12 @@ def _reasons(quantities: Iterable[Quantity]) -> tuple[str, ...]:
 
 def _described(name: str) -> tuple[str, str, str, float]:
     default = (_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
-    return PARAMETERS.get(name, default)
+    return QUANTITIES.get(name, default)
 
 
 def _symbol(name: str) -> str:
-    if name in PARAMETERS:
-        return PARAMETERS[name][0]
+    if name in QUANTITIES:
+        return QUANTITIES[name][0]
     return f"δ{name.rsplit('_', 1)[-1]}"
 
 
@@ -254,14 +237,14 @@ _DAMPING: Final = ("zeta", "alpha", "gamma", "lambda")
 _ON_THE_EDGE: Final = "* rests on the edge of the range searched: the data do not determine it."
 
 
-def structures_table(subject: Subject) -> Table:
+def structures_table(whole: WholeRecord) -> Table:
     """All fits beside each other; orders that the data do not support are marked in each."""
-    lowest = min(fit.cost for fit in subject.fits.values())
-    withheld = subject.unsupported
-    delta_bic = subject.verdict.delta_bic
-    status = dict(subject.headline.structures)
+    lowest = min(fit.cost for fit in whole.fits.values())
+    withheld = whole.unsupported
+    delta_bic = whole.delta_bic
+    status = dict(whole.headline.structures)
     rows: list[tuple[Entry, ...]] = []
-    for name, fit in subject.fits.items():
+    for name, fit in whole.fits.items():
         its = status.get(name, "")
         damping = _damping_cells(
             fit.structure, fit.parameters, fit.std, withheld=withheld, at_bounds=fit.at_bounds
@@ -304,7 +287,7 @@ def structures_table(subject: Subject) -> Table:
             "searched. The marked row is the one that the numbers are of. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
         ),
-        selected=list(subject.fits).index(subject.headline.name),
+        selected=list(whole.fits).index(whole.headline.name),
     )
 
 
@@ -340,7 +323,7 @@ def _damping_cells(
             shown += [number(None), number(None)]
             continue
         its_std = std[name] if std is not None and name in structure.free else None
-        value, spread = estimate((parameters[name], its_std), its_std, PARAMETERS[name][3])
+        value, spread = estimate((parameters[name], its_std), its_std, QUANTITIES[name][3])
         if name in at_bounds:
             value = replace(value, text=f"{value.text}*")
         shown += [marked(value), greyed(spread)] if name in doubtful else [value, spread]
@@ -349,7 +332,7 @@ def _damping_cells(
 
 def _heading(name: str) -> str:
     """Symbol with its power of ten; the units, which depend on the orders, would be too long."""
-    symbol, _meaning, unit, factor = PARAMETERS[name]
+    symbol, _meaning, unit, factor = QUANTITIES[name]
     return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
 
 
@@ -535,9 +518,9 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     )
 
 
-def amplitude_tables(subject: Subject) -> tuple[Table, ...]:
+def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
     """Damping ratios of free vibration by amplitude, if the record tells; else no table."""
-    found = subject.verdict.damping_with_amplitude
+    found = whole.verdict.damping_with_amplitude
     if not found:
         return ()
     rows: list[tuple[Entry, ...]] = []

@@ -12,38 +12,44 @@ from analysis.report._folder import OutputError, OutputExistsError
 from analysis.report._text import tables_text
 from rigd.session import read_session, read_timings
 from rigd.view import (
+    COHERENCE_AXIS,
+    COHERENCE_KEY,
     GREEN,
     GREY,
+    MEASURED_KEY,
     ORANGE,
+    PHASE_AXIS,
     PURPLE,
-    SKY_BLUE,
     VERMILION,
-    Axis,
     Chart,
     Color,
     Key,
     RrdFileError,
     Thinning,
+    chart_page,
+    chart_view,
     check_new,
-    decades,
+    magnitude_axis,
     magnitude_db,
     new_rrd_file,
     phase_deg,
-    steps,
+    response_chart,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
+    from pathlib import Path
 
     import rerun.blueprint as rrb
     from numpy.typing import NDArray
     from rerun import RecordingStream
 
     from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.results import RecordResult
+    from rigd.view import Axis
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
-    from pathlib import Path
 
 FITS: Final = "/fits"
 TITLE: Final = "Fits"
@@ -51,8 +57,6 @@ TABLES: Final = f"{FITS}/tables"
 MEASURED_PAGE: Final = "Measured"
 TABLES_PAGE: Final = "Tables"
 
-MEASURED: Final = Key("measured", SKY_BLUE)
-COHERENCE: Final = Key("coherence", GREEN)
 _SIZE_DB: Final = Key("|measured|", GREY)
 _WIDE: Final = (1280.0, 350.0)
 _HALF: Final = (640.0, 262.0)
@@ -65,15 +69,10 @@ _MOST_IN_WORDS: Final = 2
 """Models whose keys on a narrow chart say that what they name are weights."""
 _GROUPS: Final = 400
 """Of points along the axis, two kept of each: enough for the pixels of a view."""
-_DOT: Final = 1.0
-"""Radius of a dot, in points."""
-_STEP_DB: Final = 20.0
-_PHASES_DEG: Final = (-90.0, 0.0, 90.0, 180.0, 270.0)
-_COHERENCES: Final = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class Curve:
     """A curve of a chart.
 
     Attributes
@@ -101,7 +100,7 @@ class Graph:
 
     title: str
     chart: Chart
-    lines: tuple[Line, ...]
+    curves: tuple[Curve, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,25 +108,17 @@ class Page:
     """Charts that are seen together: a wide one over two narrow ones."""
 
     title: str
-    wide: Graph
-    narrow: tuple[Graph, Graph]
-
-    @property
-    def graphs(self) -> tuple[Graph, ...]:
-        """All of them."""
-        return (self.wide, *self.narrow)
+    graphs: tuple[Graph, Graph, Graph]
 
 
 def pages(analysis: WelchAnalysis) -> tuple[Page, ...]:
     """Return the measured response with its coherence, and each model type with its residuals."""
-    lines = line_keys(analysis.settings.weightings)
-    by_type = [
-        _type_page(
-            analysis, name, [m for m in analysis.models if m.fit.structure.name == name], lines
-        )
-        for name in analysis.settings.types
-    ]
-    return (_measured_page(analysis), *by_type)
+    magnitude = _magnitude_axis(analysis)
+    looks = line_keys(analysis.settings.weightings)
+    return (
+        _measured_page(analysis, magnitude),
+        *(_type_page(analysis, name, magnitude, looks) for name in analysis.settings.types),
+    )
 
 
 def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
@@ -153,31 +144,16 @@ def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     """
     import rerun as rr
 
-    first_hz, last_hz = analysis.settings.band_hz
-    grid = analysis.response.frequency_hz
-    thinning = Thinning.logarithmic(grid, first_hz, last_hz, _GROUPS)
-    for page in pages(analysis):
-        for graph in page.graphs:
-            graph.chart.draw_frame(stream)
-            for order, line in enumerate(graph.lines):
-                strips = thinning.strips(line.values)
-                curve = [graph.chart.place(strip[:, 0], strip[:, 1]) for strip in strips]
-                shape = (
-                    rr.Points2D(
-                        np.concatenate(curve or [np.zeros((0, 2))]),
-                        colors=[line.key.color],
-                        radii=rr.Radius.ui_points(_DOT),
-                        draw_order=20.0 + order,
-                    )
-                    if line.dotted
-                    else rr.LineStrips2D(
-                        curve,
-                        colors=[line.key.color],
-                        radii=rr.Radius.ui_points(line.key.width / 2),
-                        draw_order=20.0 + order,
-                    )
-                )
-                stream.log(f"{graph.chart.entity}/{line.name}", shape, static=True)
+    thinning = Thinning.logarithmic(
+        analysis.response.frequency_hz, *analysis.settings.band_hz, _GROUPS
+    )
+    for graph in (graph for page in pages(analysis) for graph in page.graphs):
+        graph.chart.draw_frame(stream)
+        for order, curve in enumerate(graph.curves):
+            strips = thinning.strips(curve.values)
+            graph.chart.draw_curve(
+                stream, curve.name, strips, curve.key, static=True, dotted=curve.dotted, order=order
+            )
     stream.log(
         TABLES,
         rr.TextDocument(f"```\n{tables}\n```", media_type=rr.MediaType.MARKDOWN),
@@ -189,145 +165,112 @@ def tab(analysis: WelchAnalysis) -> rrb.Container:
     """Return the tab of the fits, with a tab in it for each page and for the tables."""
     import rerun.blueprint as rrb
 
-    contents = [
-        rrb.Vertical(
-            _view(page.wide),
-            rrb.Horizontal(*map(_view, page.narrow)),
-            row_shares=[4, 3],
-            name=page.title,
-        )
-        for page in pages(analysis)
-    ]
+    def view(graph: Graph) -> rrb.Spatial2DView:
+        chart = graph.chart
+        return chart_view(graph.title, chart.entity, (chart.width, chart.height))
+
+    contents = [chart_page(*map(view, page.graphs), name=page.title) for page in pages(analysis)]
     tables = rrb.TextDocumentView(name=TABLES_PAGE, origin=TABLES)
     return rrb.Tabs(*contents, tables, name=TITLE)
 
 
-def _view(graph: Graph) -> rrb.Spatial2DView:
-    import rerun.blueprint as rrb
-
-    chart = graph.chart
-    return rrb.Spatial2DView(
-        name=graph.title,
-        origin=chart.entity,
-        visual_bounds=rrb.VisualBounds2D(x_range=[0.0, chart.width], y_range=[0.0, chart.height]),
-    )
-
-
-def _measured_page(analysis: WelchAnalysis) -> Page:
-    response = analysis.response
+def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
+    response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
     if coherence is None:
         coherence = np.full(response.frequency_hz.shape, np.nan)
     entity = f"{FITS}/measured"
-    magnitude = Line("measured", MEASURED, magnitude_db(response.response))
-    phase = Line("measured", MEASURED, phase_deg(response.response), dotted=True)
     return Page(
         MEASURED_PAGE,
-        Graph(
-            "Magnitude of torque over angle, as estimated for the fits",
-            _chart(analysis, f"{entity}/magnitude", _WIDE, _decibels(analysis), MEASURED),
-            (magnitude,),
-        ),
         (
             Graph(
+                "Magnitude of torque over angle, as estimated for the fits",
+                response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY),
+                (Curve("measured", MEASURED_KEY, magnitude_db(response.response)),),
+            ),
+            Graph(
                 "Phase of torque over angle",
-                _chart(analysis, f"{entity}/phase", _HALF, _PHASE, MEASURED),
-                (phase,),
+                response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY),
+                (Curve("measured", MEASURED_KEY, phase_deg(response.response), dotted=True),),
             ),
             Graph(
                 "Coherence of angle and torque",
-                _chart(analysis, f"{entity}/coherence", _HALF, _COHERENCE, COHERENCE),
-                (Line("coherence", COHERENCE, coherence),),
+                response_chart(
+                    f"{entity}/coherence", _HALF, band_hz, COHERENCE_AXIS, COHERENCE_KEY
+                ),
+                (Curve("coherence", COHERENCE_KEY, coherence),),
             ),
         ),
     )
 
 
-def _type_page(
-    analysis: WelchAnalysis, name: str, models: list[FittedModel], keys: dict[str, Key]
-) -> Page:
-    measured = analysis.response.response
-    entity = f"{FITS}/type_{name}"
-
-    def lines(values: Callable[[Complex], Real], *, dotted: bool = False) -> Iterator[Line]:
-        yield Line("measured", MEASURED, values(measured), dotted)
-        for model in models:
-            yield Line(
-                _plain(model.fit.weighting), keys[model.fit.weighting], values(model.response)
-            )
-
-    used = [keys[model.fit.weighting] for model in models]
+def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[str, Key]) -> Page:
+    models = [model for model in analysis.models if model.fit.structure.name == name]
+    keys = [looks[model.fit.weighting] for model in models]
     # Shorter on the narrow charts: in full they would run into the title of the axis.
     form = "weights {}" if len(models) <= _MOST_IN_WORDS else "{}"
     short = [
-        replace(keys[model.fit.weighting], label=form.format(model.fit.weighting))
-        for model in models
+        replace(key, label=form.format(model.fit.weighting))
+        for key, model in zip(keys, models, strict=True)
     ]
-    residuals = [
-        Line(
-            _plain(model.fit.weighting),
-            keys[model.fit.weighting],
-            magnitude_db(measured - model.response),
-        )
-        for model in models
-    ]
-    magnitudes = _chart(
-        analysis, f"{entity}/magnitude", _WIDE, _decibels(analysis), MEASURED, *used
-    )
+    measured, band_hz = analysis.response.response, analysis.settings.band_hz
+    entity = f"{FITS}/type_{name}"
+
+    def of_models(values: Callable[[FittedModel], Real]) -> list[Curve]:
+        return [
+            Curve(_plain(model.fit.weighting), key, values(model))
+            for key, model in zip(keys, models, strict=True)
+        ]
+
     scores = "; ".join(
         f"{model.fit.weighting}: MSE {model.indices.mse:.3g}, WMSE {model.indices.wmse:.3g}"
         for model in models
     )
     return Page(
         f"Type {name}",
-        Graph(f"Magnitude, type {name} ({scores})", magnitudes, tuple(lines(magnitude_db))),
         (
             Graph(
+                f"Magnitude, type {name} ({scores})",
+                response_chart(
+                    f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, *keys
+                ),
+                (
+                    Curve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    *of_models(lambda model: magnitude_db(model.response)),
+                ),
+            ),
+            Graph(
                 "Phase",
-                _chart(analysis, f"{entity}/phase", _HALF, _PHASE, MEASURED, *short),
-                tuple(lines(phase_deg, dotted=True)),
+                response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, *short),
+                (
+                    Curve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    *of_models(lambda model: phase_deg(model.response)),
+                ),
             ),
             Graph(
                 "Residual, measured − model",
-                _chart(
-                    analysis, f"{entity}/residual", _HALF, _decibels(analysis), _SIZE_DB, *short
+                response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, *short),
+                (
+                    Curve("measured", _SIZE_DB, magnitude_db(measured)),
+                    *of_models(lambda model: magnitude_db(measured - model.response)),
                 ),
-                (Line("measured", _SIZE_DB, magnitude_db(measured)), *residuals),
             ),
         ),
     )
 
 
-_PHASE: Final = Axis("Phase (degrees)", _PHASES_DEG[0], _PHASES_DEG[-1], _PHASES_DEG)
-_COHERENCE: Final = Axis("Coherence (1)", 0.0, 1.0, _COHERENCES)
-
-
-def _chart(
-    analysis: WelchAnalysis, entity: str, size: tuple[float, float], y: Axis, *legend: Key
-) -> Chart:
-    first_hz, last_hz = analysis.settings.band_hz
-    ticks, lines = decades(first_hz, last_hz)
-    frequency = Axis("Frequency (Hz)", first_hz, last_hz, ticks, lines, logarithmic=True)
-    width, height = size
-    return Chart(entity, width, height, frequency, y, legend)
-
-
-def _decibels(analysis: WelchAnalysis) -> Axis:
+def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
     """Return the axis that holds the peaks of all responses, and the residuals of the better ones.
 
     It is the same on all pages, so that types can be compared at a glance.
     """
     measured = analysis.response.response
     responses = [measured, *(model.response for model in analysis.models)]
-    residuals = [measured - model.response for model in analysis.models]
-    last = max(float(np.nanmax(magnitude_db(response))) for response in responses)
-    first = min(
-        float(np.nanquantile(magnitude_db(values), 0.02)) for values in (measured, *residuals)
+    shown = [measured, *(measured - model.response for model in analysis.models)]
+    return magnitude_axis(
+        min(float(np.nanquantile(magnitude_db(values), 0.02)) for values in shown),
+        max(float(np.nanmax(magnitude_db(values))) for values in responses) + 3.0,
     )
-    last = _STEP_DB * np.ceil((last + 3.0) / _STEP_DB)
-    first = _STEP_DB * np.floor(first / _STEP_DB)
-    count = max(1, round((last - first) / _STEP_DB))
-    return Axis("Magnitude (dB re 1 N·m/rad)", float(first), float(last), steps(first, last, count))
 
 
 def _plain(weighting: str) -> str:
@@ -343,12 +286,13 @@ def check_rerun_file(path: Path) -> None:
         raise OutputExistsError(f"--rerun {error}") from None
 
 
-def write_rerun_file(analysis: WelchAnalysis, path: Path) -> None:
+def write_rerun_file(result: RecordResult, path: Path) -> None:
     """Write the session in the layout of the live view, and its fits in front of it.
 
     Parameters
     ----------
-    analysis : WelchAnalysis
+    result : RecordResult
+        With Welch fits.
     path : Path
         A new file, ``….rrd``.
 
@@ -361,12 +305,14 @@ def write_rerun_file(analysis: WelchAnalysis, path: Path) -> None:
     """
     from rigd.view import draw_session, recorded_blueprint
 
-    session = read_session(analysis.record.path)
-    timings = read_timings(analysis.record.path)
+    analysis = result.welch
+    assert analysis is not None
+    session = read_session(result.record.path)
+    timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
             layout = recorded_blueprint([tab(analysis)])
             draw_session(stream, session, timings, layout=layout)
-            draw(analysis, tables_text(analysis), stream)
+            draw(analysis, tables_text(result), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

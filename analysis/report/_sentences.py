@@ -1,16 +1,14 @@
-"""What a whole record says of the damping, and what a campaign says, in sentences."""
+"""What a whole record says of the damping, in sentences."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns import lost_trials, specimens
 from analysis.identify import MISREAD
 from analysis.report._table import estimate
 
 if TYPE_CHECKING:
-    from analysis.campaigns import Campaign
     from analysis.identify import Headline, Mode, Quantity, Size
 
 _SMALL: Final = 1e-3
@@ -107,20 +105,3 @@ def _listed(parts: list[str]) -> str:
     if len(parts) == 1:
         return parts[0]
     return f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
-_NO_VERDICT: Final = (
-    "No verdict on the whole records: it takes two sessions that determine a structure's damping."
-)
-
-
-def campaign_sentences(campaign: Campaign) -> tuple[str, ...]:
-    """Return the verdict; without one, what it would have said first, and why there is none."""
-    if campaign.verdict is not None:
-        return campaign.verdict.sentences
-    asked = any(each.record_estimates for each in campaign.sessions)
-    return (
-        *specimens(campaign.homogeneity),
-        *([_NO_VERDICT] if asked else []),
-        *lost_trials(campaign.lost_trials, campaign.trials),
-    )

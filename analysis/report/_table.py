@@ -8,13 +8,15 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.models import COEFFICIENT_OF
+from rigd.units import decimals
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     import rich.table
 
@@ -55,6 +57,8 @@ class Cell:
 
 
 Entry = Cell | Value
+Row = Mapping[str, Entry]
+"""Entries by their columns' keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +127,7 @@ class Table:
     name: str
     caption: str
     columns: tuple[Column, ...]
-    rows: tuple[Mapping[str, Entry], ...]
+    rows: tuple[Row, ...]
     notes: tuple[str, ...] = ()
     selected: int | None = None
     grouped: bool = False
@@ -237,8 +241,8 @@ def estimate(
     """Show numbers that are uncertain by `std`, all to its second digit."""
     if std is None or not math.isfinite(std) or std <= 0:
         return tuple(number(value, ".5g", factor) for value in values)
-    decimals = max(1 - math.floor(math.log10(factor * std)), 0)
-    form = f".{decimals}f" if decimals <= 7 else ".4g"
+    digits = decimals(factor * std)
+    form = f".{digits}f" if digits <= 7 else ".4g"
     return tuple(number(value, form, factor) for value in values)
 
 

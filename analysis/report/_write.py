@@ -9,14 +9,14 @@ from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
 from analysis.report._folder import write_new
 from analysis.report._table import Table, csv_text
-from analysis.report._text import as_text, record_text, tables_text
+from analysis.report._text import tables_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
     from analysis.paper import WelchAnalysis
-    from analysis.results import Subject
+    from analysis.results import RecordResult, WholeRecord
 
 _WELCH_FIGURE: Final = "frf"
 _WELCH_DESCRIPTION: Final = (
@@ -25,29 +25,16 @@ _WELCH_DESCRIPTION: Final = (
 )
 
 
-def write_html_report(
-    subject: Subject,
+def _write_page(
+    result: RecordResult,
+    whole: WholeRecord,
     folder: Path,
-    on_step: Callable[[str], None] = lambda _done: None,
-    made_at: datetime | None = None,
+    on_step: Callable[[str], None],
+    made_at: datetime | None,
 ) -> None:
     """Write ``report.html``, ``figures/*.png`` and ``.svg``, and ``tables/*.csv``.
 
-    Parameters
-    ----------
-    subject : Subject
-    folder : Path
-        An existing folder without these files. The paper's figure ``frf.png`` is shown in the
-        report if it is there, as `analysis.report._write.write_report` leaves it.
-    on_step : callable, optional
-        Called with a few words after each figure.
-    made_at : datetime, optional
-        What the report calls its time; by default now.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-        If a file exists, or cannot be written.
+    The paper's figure ``frf.png`` is shown in the page if it is there.
     """
     from analysis.report import _style as style
     from analysis.report._page import Picture
@@ -56,43 +43,44 @@ def write_html_report(
 
     pictures = []
     with style.styled():
-        for shown in illustrations(subject):
+        for shown in illustrations(whole):
             target = folder / "figures" / f"{shown.name}.png"
             png = style.save(shown.figure, target)
             svg = style.save_svg(shown.figure, target.with_suffix(".svg"))
             pictures.append(Picture(shown.name, shown.description, png, svg))
             on_step(f"figure {shown.name}")
-    modes, of_record, of_paper = report_tables(subject)
+    modes, of_record, of_paper = report_tables(result)
     for table in (modes, *of_record, *of_paper):
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
     welch = folder / f"{_WELCH_FIGURE}.png"
     paper_pictures = []
-    if subject.welch is not None and welch.exists():
+    if result.welch is not None and welch.exists():
         name = f"welch_{_WELCH_FIGURE}"
         paper_pictures = [Picture(name, _WELCH_DESCRIPTION, welch.read_bytes())]
     made_at = made_at or datetime.now().astimezone()
-    text = record_page(subject, pictures, modes, of_record, made_at, paper_pictures, of_paper)
+    text = record_page(result, pictures, modes, of_record, made_at, paper_pictures, of_paper)
     write_new(folder / "report.html", text)
 
 
-def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
+def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Make the table of modes, those of the whole-record fits, and those of the paper's route."""
-    condition = tables.condition_table(subject)
+    whole, welch = result.whole, result.welch
+    assert whole is not None
+    condition = tables.condition_table(whole)
     of_record = (
-        tables.sizes_table(subject),
-        tables.parameters_table(subject),
+        tables.sizes_table(whole),
+        tables.parameters_table(whole),
         *(() if condition is None else (condition,)),
-        tables.correlations_table(subject),
-        *tables.amplitude_tables(subject),
-        tables.structures_table(subject),
+        tables.correlations_table(whole),
+        *tables.amplitude_tables(whole),
+        tables.structures_table(whole),
     )
-    welch = subject.welch
     of_paper = (
         ()
         if welch is None
-        else (tables.welch_fits_table(welch, subject.unsupported), tables.peaks_table(welch))
+        else (tables.welch_fits_table(welch, whole.unsupported), tables.peaks_table(welch))
     )
-    return tables.modes_table(subject), of_record, of_paper
+    return tables.modes_table(whole), of_record, of_paper
 
 
 _FIGURES: Final = ("signals", "frf", "torque")
@@ -101,43 +89,39 @@ _FIGURES_BESIDE_RECORD: Final = ("frf",)
 
 
 def write_report(
-    analysis: WelchAnalysis | None,
+    result: RecordResult,
     folder: Path,
     on_step: Callable[[str], None] = lambda _done: None,
-    subject: Subject | None = None,
+    made_at: datetime | None = None,
 ) -> None:
-    """Write figures, ``tables.txt``, ``analysis.json`` and, of a whole record, all in HTML.
+    """Write figures, ``tables.txt``, ``analysis.json`` and, of a whole record, a page.
+
+    The page ``report.html`` comes with ``figures/*.png`` and ``.svg`` and ``tables/*.csv``, in the
+    place of ``signals.png`` and ``torque.png``.
 
     Parameters
     ----------
-    analysis : WelchAnalysis or None
-        The paper's route; None if it was not gone, and only `subject` is reported.
+    result : RecordResult
     folder : Path
         An existing folder without these files.
     on_step : callable, optional
         Called with a few words after each figure.
-    subject : Subject, optional
-        The whole-record fits: with them, what `write_html_report` writes, in the place of
-        ``signals.png`` and ``torque.png``.
+    made_at : datetime, optional
+        What the page calls its time; by default now.
 
     Raises
     ------
     OutputExistsError, OutputError
         If a file exists, or cannot be written.
     """
-    if analysis is not None:
-        _draw(
-            analysis,
-            figures_of_paper(paper=True, whole_record=subject is not None),
-            folder,
-            on_step,
-        )
-    write_new(folder / "tables.txt", _text(analysis, subject))
-    if subject is not None:
-        write_html_report(subject, folder, on_step)
-    analyses = () if analysis is None else (analysis,)
-    subjects = () if subject is None else (subject,)
-    write_new(folder / "analysis.json", document_text(document(analyses, subjects=subjects)))
+    whole = result.whole
+    if result.welch is not None:
+        names = figures_of_paper(paper=True, whole_record=whole is not None)
+        _draw(result.welch, names, folder, on_step)
+    write_new(folder / "tables.txt", tables_text(result))
+    if whole is not None:
+        _write_page(result, whole, folder, on_step, made_at)
+    write_new(folder / "analysis.json", document_text(document([result])))
 
 
 def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
@@ -159,10 +143,3 @@ def _draw(
         with style.styled():
             style.save(drawn[name](analysis), folder / f"{name}.png")
         on_step(f"figure {name}")
-
-
-def _text(analysis: WelchAnalysis | None, subject: Subject | None) -> str:
-    """Return the tables of the paper's route, or without it those of the whole record."""
-    if analysis is not None:
-        return tables_text(analysis, () if subject is None else subject.withheld)
-    return "" if subject is None else as_text(record_text(subject))

@@ -10,21 +10,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from rigd.units import UNITS, suffix_of
+
 # Values and their units
 
-_UNITS = {
-    "_hz": (1.0, "Hz"),
-    "_s": (1e3, "ms"),
-    "_ns": (1e-6, "ms"),
-    "_us": (1e-3, "ms"),
-    "_n_nm": (1.0, "N, N·m"),
-    "_nm": (1.0, "N·m"),
-    "_n": (1.0, "N"),
-    "_rad": (1.0, "rad"),
-    "_rad_s": (1.0, "rad/s"),
-    "_percent": (1.0, "%"),
-}
-_ENDS = sorted(_UNITS, key=len, reverse=True)
+_MILLISECONDS = {"s": 1e3, "ns": 1e-6, "µs": 1e-3}
+"""Times are shown in ms: unit of the key → how many ms it has."""
 
 
 def name_of(key: str) -> str:
@@ -35,15 +26,17 @@ def name_of(key: str) -> str:
 
 def value_of(key: str, value: object) -> str:
     """Return the value of a key with its unit; numbers to four digits."""
-    end = _end(key)
-    factor, unit = _UNITS[end] if end else (1.0, "")
+    unit = UNITS.get(_end(key), "")
+    factor = 1.0
+    if unit in _MILLISECONDS:
+        factor, unit = _MILLISECONDS[unit], "ms"
     if isinstance(value, list | tuple) and not all(_is_number(each) for each in value):
         return "; ".join(map(str, value))
     if isinstance(value, list | tuple):
         text = ", ".join(f"{factor * each:.4g}" for each in value) or "none"
     elif isinstance(value, float):
         text = f"{factor * value:.4g}" if isfinite(value) else "none"
-    elif isinstance(value, int) and not isinstance(value, bool) and end:
+    elif isinstance(value, int) and not isinstance(value, bool) and unit:
         text = f"{factor * value:.4g}"
     else:
         return str(value)
@@ -51,7 +44,8 @@ def value_of(key: str, value: object) -> str:
 
 
 def _end(key: str) -> str:
-    return next((end for end in _ENDS if key.endswith(end)), "")
+    # How many counts there are is a bare number, whose name says what is counted.
+    return "" if key.endswith("_counts") else suffix_of(key)
 
 
 def _is_number(value: object) -> bool:

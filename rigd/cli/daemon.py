@@ -23,6 +23,7 @@ from rigd.cli.options import (
     fail,
 )
 from rigd.errors import RigdError
+from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -186,8 +187,7 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
         typer.echo(json.dumps(_measured(told)))
         return
     for axis, mean in told["mean"].items():
-        unit = "N·m" if axis.endswith("_nm") else "N"
-        name = axis.removesuffix("_nm").removesuffix("_n")
+        name, unit = axis.removesuffix(suffix_of(axis)), unit_of(axis)
         typer.echo(f"{name}: {mean:.4g} {unit}, scatter {told['std'][axis]:.2g} {unit}")
     typer.echo(f"coupling torque: scatter {told['torque_std_nm']:.2g} N·m")
 

@@ -19,27 +19,8 @@ from rigd.devices.ati import RECORD_BITS
 from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
 from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
 from rigd.safety import BUFFERED_S
+from rigd.units import UNITS, suffix_of, unit_of
 
-# Longest endings first: the first that fits is the key's unit.
-_UNITS = {
-    "_nm_s_per_rad": "N·m·s/rad",
-    "_kg_per_m": "kg/m",
-    "_kg_m2": "kg·m²",
-    "_n_m2": "N·m²",
-    "_percent": "%",
-    "_counts": "counts",
-    "_bit_s": "bit/s",
-    "_rad_s2": "rad/s²",
-    "_rad_s": "rad/s",
-    "_rad": "rad",
-    "_nm": "N·m",
-    "_mb": "MB",
-    "_hz": "Hz",
-    "_us": "µs",
-    "_m": "m",
-    "_n": "N",
-    "_s": "s",
-}
 _UNITS_OF_SIX = {
     "sensor.resolution": "N, N, N, N·m, N·m, N·m",
     "sensor.range": "N, N, N, N·m, N·m, N·m",
@@ -216,13 +197,13 @@ def unknown(key: str, given: Mapping[str, Any]) -> str:
         hint = f"did you mean [{close[0]}]?" if close else f"sections are {', '.join(SECTIONS)}."
         return f"{key} is not a key of a profile; {hint}"
     for candidate in known:
-        suffix = next((s for s in _UNITS if candidate.endswith(s)), "")
+        suffix = suffix_of(candidate)
         stem = candidate.removesuffix(suffix)
         if suffix and key.startswith(stem + "_"):
             return (
                 f"{key} = {_show(given[key])} has the wrong unit "
                 f"('{key.removeprefix(stem + '_')}'); write {candidate}, the value in "
-                f"{_UNITS[suffix]}."
+                f"{UNITS[suffix]}."
             )
     close = difflib.get_close_matches(key, known, 1)
     if close:
@@ -273,7 +254,7 @@ def wrong(detail: ErrorDetails) -> str:
 
 def _unit(key: str, before: str = "") -> str:
     """Return the unit of a key as written after its value, or nothing."""
-    unit = _UNITS_OF_SIX.get(key) or next((u for s, u in _UNITS.items() if key.endswith(s)), "")
+    unit = _UNITS_OF_SIX.get(key) or unit_of(key)
     return f"{before} {unit}" if unit else ""
 
 

@@ -30,6 +30,7 @@ from rigd.session._message_decoder import (
 )
 from rigd.session._schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -52,19 +53,6 @@ _BYTES_A_SAMPLE: Final = 60
 """Fewest that a sample takes in the file, unless it repeats itself."""
 _LONGEST_NUMBER: Final = 400
 """Characters: the longest finite number in decimal, without its fraction, has 309."""
-
-_UNITS: Final = {
-    "_kg_m2": "kg·m²",
-    "_kg_per_m": "kg/m",
-    "_n_m2": "N·m²",
-    "_hz": "Hz",
-    "_rad": "rad",
-    "_ns": "ns",
-    "_nm": "N·m",
-    "_m": "m",
-    "_s": "s",
-}
-"""Suffix of a key → its unit, the longer suffixes first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +102,7 @@ class Session:
             If the key is required and missing, or its value is not a finite number.
         """
         text = self.metadata.get(key)
-        unit = next((f" in {u}" for suffix, u in _UNITS.items() if key.endswith(suffix)), "")
+        unit = f" in {unit_of(key)}" if unit_of(key) else ""
         if text is None:
             if default is not None:
                 return default

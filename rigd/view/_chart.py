@@ -35,6 +35,8 @@ _LABEL_DROP = 12.0
 _CHARACTER = 6.7
 """Mean width of a character of a label, in points."""
 _DOT_SPACING = 6.0
+_CURVE_DOT = 1.0
+"""Radius of a dot of a dotted curve, in points."""
 _SHADE_OPACITY = 0.18
 
 
@@ -171,21 +173,42 @@ class Chart:
         key: Key,
         *,
         static: bool = False,
+        dotted: bool = False,
+        order: int = 0,
     ) -> None:
-        """Draw lines through points (n, 2) of the two axes, each strip by itself."""
+        """Draw lines through points (n, 2) of the two axes, each strip by itself.
+
+        Parameters
+        ----------
+        stream, name, strips, key
+            Where the curve goes, its name under the chart, its points, and how it looks.
+        static
+            Whether it stays as it is; it lies beneath whatever is drawn as it comes then.
+        dotted
+            Whether the points stand for themselves, where a line between them would mean nothing.
+        order
+            Place among the curves of its kind, from the lowest to the topmost.
+        """
         import rerun as rr
 
-        stream.log(
-            f"{self.entity}/{name}",
-            rr.LineStrips2D(
-                [self.place(strip[:, 0], strip[:, 1]) for strip in strips],
+        drawn = [self.place(strip[:, 0], strip[:, 1]) for strip in strips]
+        draw_order = (20.0 if static else 30.0) + order
+        shape = (
+            rr.Points2D(
+                np.concatenate(drawn or [np.zeros((0, 2))]),
+                colors=[key.color],
+                radii=rr.Radius.ui_points(_CURVE_DOT),
+                draw_order=draw_order,
+            )
+            if dotted
+            else rr.LineStrips2D(
+                drawn,
                 colors=[key.color],
                 radii=rr.Radius.ui_points(key.width / 2),
-                # Beneath whatever is drawn as it comes.
-                draw_order=20.0 if static else 30.0,
-            ),
-            static=static,
+                draw_order=draw_order,
+            )
         )
+        stream.log(f"{self.entity}/{name}", shape, static=static)
 
     def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
         """Write a text into the middle of the frame; an empty one takes it away."""

@@ -106,6 +106,14 @@ _GROUPS: Final = 200
 """Groups of points along the axis, two kept per group: enough for the pixels of a view."""
 _PHASE_FROM_DEG: Final = -90.0
 """Phases lie about 0 and 180 degrees; cut here, they do not jump from end to end."""
+PHASE_AXIS: Final = Axis(
+    "Phase (degrees)",
+    _PHASE_FROM_DEG,
+    _PHASE_FROM_DEG + 360.0,
+    (-90.0, 0.0, 90.0, 180.0, 270.0),
+)
+COHERENCE_AXIS: Final = Axis("Coherence (1)", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0))
+_STEP_DB: Final = 20.0
 _MODEL_STEP_HZ: Final = 0.01
 _FAINT: Final = Damping(zeta=3e-4)
 """Damping that gives the highest magnitude of the axis where the beam's is not known."""
@@ -132,14 +140,8 @@ class ResponseCharts:
     def __init__(self, subject: "Subject") -> None:
         frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
         model = _measured_model(subject, frequency_hz, subject.damping or _FAINT)
-        magnitude = _magnitude_axis(magnitude_db(model))
-        phase = Axis(
-            "Phase (degrees)",
-            _PHASE_FROM_DEG,
-            _PHASE_FROM_DEG + 360.0,
-            (-90.0, 0.0, 90.0, 180.0, 270.0),
-        )
-        coherence = Axis("Coherence (1)", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0))
+        model_db = magnitude_db(model)
+        magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
         known = subject.damping is not None
         of_model = (MODEL_KEY,) if known else ()
         self._graphs = (
@@ -149,15 +151,15 @@ class ResponseCharts:
                 )
                 for entity in (OVERVIEW_MAGNITUDE, MAGNITUDE)
             ),
-            _Graph(_chart(PHASE, phase, MEASURED_KEY, *of_model), MEASURED_KEY, _phase_deg),
-            _Graph(_chart(COHERENCE, coherence, COHERENCE_KEY), COHERENCE_KEY, _coherence),
+            _Graph(_chart(PHASE, PHASE_AXIS, MEASURED_KEY, *of_model), MEASURED_KEY, _phase_deg),
+            _Graph(_chart(COHERENCE, COHERENCE_AXIS, COHERENCE_KEY), COHERENCE_KEY, _coherence),
         )
         self._delays_s = {
             "input_delay_s": subject.angle_delay_s,
             "output_delay_s": subject.torque_delay_s,
         }
         thinning = Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _GROUPS)
-        of_magnitude = thinning.strips(magnitude_db(model))
+        of_magnitude = thinning.strips(model_db)
         self._models = (
             {
                 OVERVIEW_MAGNITUDE: of_magnitude,
@@ -253,20 +255,25 @@ def _measured_model(subject: "Subject", frequency_hz: Real, damping: Damping) ->
     return model
 
 
-def _magnitude_axis(model_db: Real) -> Axis:
-    step_db = 20.0
-    last = step_db * np.ceil((model_db.max() + 6.0) / step_db)
-    first = step_db * np.floor((model_db.min() - 3.0) / step_db)
-    first = max(first, last - _DEEPEST_DB)
-    ticks = steps(first, last, round((last - first) / step_db))
+def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
+    """Return the axis of a magnitude in whole steps, which ends far below the highest value."""
+    last = _STEP_DB * np.ceil(highest_db / _STEP_DB)
+    first = max(_STEP_DB * np.floor(lowest_db / _STEP_DB), last - _DEEPEST_DB)
+    ticks = steps(first, last, max(1, round((last - first) / _STEP_DB)))
     return Axis("Magnitude (dB re 1 N·m/rad)", float(first), float(last), ticks)
 
 
+def response_chart(
+    entity: str, size: tuple[float, float], band_hz: tuple[float, float], y: Axis, *keys: Key
+) -> Chart:
+    """Return a chart over frequency: its entity, size in points, band, vertical axis, legend."""
+    ticks, lines = decades(*band_hz)
+    frequency = Axis("Frequency (Hz)", *band_hz, ticks, lines, logarithmic=True)
+    return Chart(entity, *size, frequency, y, keys)
+
+
 def _chart(entity: str, y: Axis, *keys: Key) -> Chart:
-    ticks, lines = decades(FIRST_HZ, LAST_HZ)
-    frequency = Axis("Frequency (Hz)", FIRST_HZ, LAST_HZ, ticks, lines, logarithmic=True)
-    width, height = SIZES[entity]
-    return Chart(entity, width, height, frequency, y, (*keys, NOT_ESTIMATED_KEY))
+    return response_chart(entity, SIZES[entity], (FIRST_HZ, LAST_HZ), y, *keys, NOT_ESTIMATED_KEY)
 
 
 # Spectrogram

@@ -132,7 +132,7 @@ def _overview() -> "rrb.Container":
     return rrb.Horizontal(
         rrb.Vertical(*map(_plot, OVERVIEW)),
         rrb.Vertical(
-            _chart(
+            chart_view(
                 "Frequency response, torque over angle",
                 OVERVIEW_MAGNITUDE,
                 SIZES[OVERVIEW_MAGNITUDE],
@@ -153,22 +153,19 @@ def _signals() -> "rrb.Container":
 
 
 def _frequency_response() -> "rrb.Container":
-    import rerun.blueprint as rrb
-
-    return rrb.Vertical(
-        _chart("Magnitude of torque over angle", MAGNITUDE, SIZES[MAGNITUDE]),
-        rrb.Horizontal(
-            _chart("Phase of torque over angle", PHASE, SIZES[PHASE]),
-            _chart("Coherence of angle and torque", COHERENCE, SIZES[COHERENCE]),
-        ),
-        row_shares=[4, 3],
+    return chart_page(
+        chart_view("Magnitude of torque over angle", MAGNITUDE, SIZES[MAGNITUDE]),
+        chart_view("Phase of torque over angle", PHASE, SIZES[PHASE]),
+        chart_view("Coherence of angle and torque", COHERENCE, SIZES[COHERENCE]),
     )
 
 
 def _spectrogram() -> "rrb.Container":
     import rerun.blueprint as rrb
 
-    return rrb.Vertical(_chart("Spectrogram of the coupling torque", SPECTROGRAM, SPECTROGRAM_SIZE))
+    return rrb.Vertical(
+        chart_view("Spectrogram of the coupling torque", SPECTROGRAM, SPECTROGRAM_SIZE)
+    )
 
 
 def _health() -> "rrb.Container":
@@ -232,7 +229,8 @@ def _values(component: str) -> "VisualizerComponentMapping":
     )
 
 
-def _chart(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
+def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
+    """Return the view of a chart, by its title, entity, and size in points."""
     import rerun.blueprint as rrb
 
     width, height = size
@@ -241,6 +239,15 @@ def _chart(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DV
         origin=entity,
         visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
     )
+
+
+def chart_page(
+    wide: "rrb.Spatial2DView", *narrow: "rrb.Spatial2DView", name: str | None = None
+) -> "rrb.Vertical":
+    """Return a wide chart over narrow ones side by side."""
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(wide, rrb.Horizontal(*narrow), row_shares=[4, 3], name=name)
 
 
 def _summary() -> "rrb.TextDocumentView":

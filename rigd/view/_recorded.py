@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
 from rigd.session import Session, SessionError, Status
+from rigd.units import unit_of
 from rigd.view._layout import blueprint
 from rigd.view._plots import TIMELINE
 from rigd.view._scene import Picture
@@ -57,13 +58,13 @@ def subject_of_session(session: Session) -> Subject:
         )
     return Subject(
         name=session.metadata.get("id") or session.path.stem,
-        rate_hz=_within(session, "rate_hz", "Hz", 1.0, 1e5),
+        rate_hz=_within(session, "rate_hz", 1.0, 1e5),
         ticks=max(end, *(planned for _, planned in session.segments.values()), 0),
         sweep=session.segments.get("sweep", (first, end)),
         beam=Beam(
-            _within(session, "beam_length_m", "m", 1e-3, 1e3),
-            _within(session, "beam_density_kg_per_m", "kg/m", 1e-6, 1e3),
-            _within(session, "beam_bending_stiffness_n_m2", "N·m²", 1e-9, 1e9),
+            _within(session, "beam_length_m", 1e-3, 1e3),
+            _within(session, "beam_density_kg_per_m", 1e-6, 1e3),
+            _within(session, "beam_bending_stiffness_n_m2", 1e-9, 1e9),
         ),
         damping=nominal_damping(session.attachments.get(_PROFILE, b"")),
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
@@ -167,13 +168,13 @@ def recorded_blueprint(front: "Sequence[rrb.Container]" = ()) -> "rrb.Blueprint"
     )
 
 
-def _within(session: Session, key: str, unit: str, least: float, most: float) -> float:
+def _within(session: Session, key: str, least: float, most: float) -> float:
     """Return a number of the file, if a rig can have it."""
     value = session.number(key)
     if not least <= value <= most:
         raise SessionError(
-            f"{session.path}: {key} is {value:g} {unit}, but must be from {least:g} to {most:g} "
-            f"{unit}. Whoever writes the file must correct it."
+            f"{session.path}: {key} is {value:g} {unit_of(key)}, but must be from {least:g} to "
+            f"{most:g} {unit_of(key)}. Whoever writes the file must correct it."
         )
     return value
 

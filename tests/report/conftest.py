@@ -1,15 +1,24 @@
 """One session with everything a report can be of, and its report."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import pytest
 
-from analysis.identify import Measurement, fit_record, of_fit
+from analysis.identify import (
+    Candidate,
+    Measurement,
+    OrderVerdict,
+    Selection,
+    Verdict,
+    fit_record,
+    of_fit,
+)
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
-from analysis.report._write import write_html_report
-from analysis.results import Subject, Verdict
+from analysis.report._write import _write_page
+from analysis.results import RecordResult, WholeRecord
 
 TYPES = ("I", "III", "VI", "VII")
 HOSTILE = "<script>alert('note')</script> & \"quotes\" $x^2$"
@@ -21,8 +30,22 @@ def hostile_note():
     return HOSTILE
 
 
+def order(name, status="fractional", value=0.9, interval=(0.8, 1.0)):
+    return OrderVerdict(name, status, value, interval, None, profile=None)
+
+
+def verdict(*sentences, experiments=()):
+    """Verdict on a record whose orders are both known."""
+    return Verdict(
+        name="session", structure="VI", uniform=True, rivals=(), parameters={}, adequate=True,
+        alpha=order("alpha"), lambda_=order("lambda"), visible_modes=(1, 2, 3), findings=(),
+        table=(), whiteness=None, input_relation=None, harmonics=(), sentences=sentences,
+        experiments=experiments,
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="session")
-def record_subject(make_signals, write_session, tmp_path_factory):
+def record_result(make_signals, write_session, tmp_path_factory):
     signals = make_signals(sweep_s=60.0, ring_down_s=10.0, tool_inertia_kg_m2=1e-5)
     path = write_session(
         tmp_path_factory.mktemp("html") / "a <b> & $c$.mcap",
@@ -31,25 +54,38 @@ def record_subject(make_signals, write_session, tmp_path_factory):
     )
     record = load_record(path)
     analysis = fit_record(Measurement.of_record(record), [STRUCTURES[name] for name in TYPES])
-    return Subject(
-        record=record,
-        analysis=analysis,
-        fits={fit.structure.name: fit for fit in analysis.fits},
-        headline=of_fit("VI", analysis.fits[TYPES.index("VI")], (1, 2, 3)),
-        verdict=Verdict(
-            sentences=("Both orders are fractional.", "Less than noise <b> remains."),
+    candidates = [Candidate(fit.structure, uniform=True, fit=fit) for fit in analysis.fits]
+    selection = Selection(
+        verdict(
+            "Both orders are fractional.", "Less than noise <b> remains.",
             experiments=("Sweep round mode 1 & 2.",),
-            delta_bic=dict(zip(TYPES, (4e4, 2e4, 0.0, 12.5), strict=True)),
         ),
-        band_hz=(0.0, 50.0),
-        welch=analyse(record, WelchSettings(types=("III", "VI"))),
+        of_fit("VI", analysis.fits[TYPES.index("VI")], (1, 2, 3)),
+        tuple(sorted(candidates, key=lambda each: each.bic)),
+        analysis,
+    )  # fmt: skip
+    return RecordResult(
+        record,
+        WholeRecord(record, selection, (0.0, 50.0)),
+        analyse(record, WelchSettings(types=("III", "VI"))),
     )
 
 
 @pytest.fixture(scope="session")
-def report(record_subject, tmp_path_factory):
-    """Folder of the written report."""
+def retold():
+    """Replace parts of what was selected for a record."""
+
+    def made(result, **parts):
+        selection = replace(result.whole.selection, **parts)
+        return replace(result, whole=replace(result.whole, selection=selection))
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def report(record_result, tmp_path_factory):
+    """Folder of the written page with its figures and tables."""
     folder = tmp_path_factory.mktemp("reports") / "report"
     folder.mkdir()
-    write_html_report(record_subject, folder, made_at=MADE_AT)
+    _write_page(record_result, record_result.whole, folder, lambda _done: None, MADE_AT)
     return folder

@@ -15,8 +15,8 @@ FREQUENCY_HZ = np.array([1.0, 2.5, 2.57, 8.0, 11.3, 16.01, 30.0, 44.8])
 
 
 @pytest.fixture(scope="module")
-def fit(record_subject):
-    return record_subject.fits["VI"]
+def fit(record_result):
+    return record_result.whole.fits["VI"]
 
 
 def drawn(fit, draws):
@@ -72,9 +72,9 @@ def test_loss_factor_bands_are_what_draws_scatter(fit):
         np.testing.assert_allclose(inside.mean(axis=0), 0.95, atol=0.004)
 
 
-def test_at_a_mode_the_total_is_twice_the_damping_ratio(record_subject):
+def test_at_a_mode_the_total_is_twice_the_damping_ratio(record_result):
     for name in ("III", "VI", "VII"):
-        fit = record_subject.fits[name]
+        fit = record_result.whole.fits[name]
         at_hz = np.array([mode.frequency_hz for mode in fit.modes])
         total = loss_factors(fit, at_hz).total
         ratios = np.array([mode.damping_ratio for mode in fit.modes])
@@ -85,8 +85,8 @@ def test_at_a_mode_the_total_is_twice_the_damping_ratio(record_subject):
         np.testing.assert_allclose(total.value * total.log_std, 2 * stds, rtol=0.04)
 
 
-def test_what_a_structure_lacks_has_no_loss_factor(record_subject):
-    only_internal = loss_factors(record_subject.fits["I"], FREQUENCY_HZ)
+def test_what_a_structure_lacks_has_no_loss_factor(record_result):
+    only_internal = loss_factors(record_result.whole.fits["I"], FREQUENCY_HZ)
     assert only_internal.external is None
     np.testing.assert_array_equal(only_internal.total.value, only_internal.internal.value)
     assert np.all(only_internal.total.log_std > 0)
@@ -119,5 +119,5 @@ def test_undetermined_parameters_count_as_known(fit):
 
 
 @pytest.fixture(scope="module")
-def noisy_measurement(record_subject):
-    return Measurement.of_record(record_subject.record)
+def noisy_measurement(record_result):
+    return Measurement.of_record(record_result.record)

@@ -5,11 +5,16 @@ from dataclasses import replace
 import pytest
 
 from analysis.report._document import document, document_text
+from analysis.results import RecordResult
+
+
+def by_welch(analysis):
+    return RecordResult(analysis.record, welch=analysis)
 
 
 @pytest.fixture(scope="module")
 def content(paper_analysis):
-    return document([paper_analysis], {"bad.mcap": "bad.mcap is empty."})
+    return document([by_welch(paper_analysis)], {"bad.mcap": "bad.mcap is empty."})
 
 
 def test_fits_have_what_the_format_promises(content, paper_file):
@@ -73,7 +78,7 @@ def test_it_is_json_without_nan(content, paper_analysis):
     def refuse(constant):
         raise AssertionError(constant)
 
-    read = json.loads(document_text(document([broken])), parse_constant=refuse)
+    read = json.loads(document_text(document([by_welch(broken)])), parse_constant=refuse)
     assert read["fits"][0]["std"]["zeta"] is None
     assert read["fits"][0]["cost"] is None
     assert all(mode["frequency_hz"] is None for mode in read["modes"])

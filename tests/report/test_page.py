@@ -21,8 +21,7 @@ from analysis.report._page import Picture
 from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_page import record_page
 from analysis.report._sentences import damping_sentences
-from analysis.report._write import report_tables, write_html_report
-from analysis.results import Verdict
+from analysis.report._write import _write_page, report_tables
 
 VOID = {"meta", "br", "img"}
 LIMIT_BYTES = 2_000_000
@@ -104,13 +103,13 @@ def test_nothing_comes_from_outside_and_nothing_runs(source, read_page):
     assert len(source.encode()) < LIMIT_BYTES
 
 
-def test_what_the_operator_wrote_stays_text(read_page, record_subject, hostile_note):
+def test_what_the_operator_wrote_stays_text(read_page, record_result, hostile_note):
     text = "".join(read_page.text)
     assert f"Note: {hostile_note}" in text
     assert text.count(hostile_note) == 2
     assert "operator: <i>Rossi</i>" in text
     assert "Less than noise <b> remains." in text
-    assert record_subject.record.path.name == "a <b> & $c$.mcap"
+    assert record_result.record.path.name == "a <b> & $c$.mcap"
     assert read_page.tags.count("b") == read_page.tags.count("i") == 0
 
 
@@ -142,9 +141,9 @@ def test_a_figure_stands_in_the_page_in_its_smaller_format():
     assert Picture("name", "seen", b"longer", b"svg").source == "data:image/svg+xml;base64,c3Zn"
 
 
-def test_the_verdict_comes_first_with_its_intervals(read_page, record_subject):
+def test_the_verdict_comes_first_with_its_intervals(read_page, record_result):
     text = " ".join("".join(read_page.text).split())
-    first_mode = record_subject.fit.modes[0]
+    first_mode = record_result.whole.fit.modes[0]
     assert f"The antenna's damping ratio is {100 * first_mode.damping_ratio:.2f}"[:-1] in text
     places = [text.index(word) for word in ("Both orders", "Sweep round mode 1 & 2", "Parameters,")]
     assert places == sorted(places)
@@ -154,8 +153,12 @@ def test_the_verdict_comes_first_with_its_intervals(read_page, record_subject):
         assert fact in text
 
 
-def test_numbers_are_those_of_the_json_document(report, read_page, record_subject):
-    entries = json.loads(json.dumps(finite(record_entries(record_subject)), allow_nan=False))
+def test_numbers_are_those_of_the_json_document(report, read_page, record_result):
+    entries = json.loads(
+        json.dumps(
+            finite(record_entries(record_result.whole, record_result.welch)), allow_nan=False
+        )
+    )
     (fit,) = [fit for fit in entries["fits"] if fit["type"] == "VI"]
     rows = read_page.rows["parameters"][1:]
     assert len(rows) == len(fit["parameters"]) == 8
@@ -185,8 +188,8 @@ def open_table(report, name):
     return (report / "tables" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
 
 
-def test_csv_and_page_hold_the_same_numbers(report, read_page, record_subject):
-    modes, tables, of_paper = report_tables(record_subject)
+def test_csv_and_page_hold_the_same_numbers(report, read_page, record_result):
+    modes, tables, of_paper = report_tables(record_result)
     assert {path.stem for path in (report / "tables").iterdir()} == {
         table.name for table in (modes, *tables, *of_paper)
     }
@@ -199,8 +202,8 @@ def test_csv_and_page_hold_the_same_numbers(report, read_page, record_subject):
         assert in_csv == read_page.rows[table.name][1:]
 
 
-def test_what_is_shown_is_the_number_rounded(record_subject):
-    modes, tables, of_paper = report_tables(record_subject)
+def test_what_is_shown_is_the_number_rounded(record_result):
+    modes, tables, of_paper = report_tables(record_result)
     shown = {"modes": (1.0, 1.0, 1.0, 100.0, 100.0, 100.0, 100.0)}
     for row in modes.shown_rows:
         for cell, factor in zip(row, shown["modes"], strict=True):
@@ -210,18 +213,18 @@ def test_what_is_shown_is_the_number_rounded(record_subject):
     assert alpha["value_si"].text == f"{alpha['value_si'].value:.4f}"
     assert len(alpha["std_si"].text.lstrip("0.")) == 2  # significant digits of a deviation
     welch = {(row["type"], row["weighting"]): row for row in of_paper[0].rows}
-    for model in record_subject.welch.models:
+    for model in record_result.welch.models:
         row = welch[model.fit.structure.name, model.fit.weighting]
         assert row["zeta"].value == model.fit.parameters["zeta"]
         assert row["mse"] == model.indices.mse
 
 
-def test_orders_that_the_data_do_not_support_are_not_told(record_subject):
+def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold):
     reason = "the record does not tell the order"
-    careful = replace(
-        record_subject,
-        headline=of_fit("VI", record_subject.fit, (1, 2, 3), {"alpha": reason}),
-        verdict=Verdict(("Nothing is sure.",)),
+    careful = retold(
+        record_result,
+        headline=of_fit("VI", record_result.whole.fit, (1, 2, 3), {"alpha": reason}),
+        verdict=replace(record_result.whole.verdict, sentences=("Nothing is sure.",)),
     )
     modes, tables, _ = report_tables(careful)
     pictures = [Picture(name, "A figure.", b"") for name in ("one", "two")]
@@ -234,8 +237,8 @@ def test_orders_that_the_data_do_not_support_are_not_told(record_subject):
     assert 'href="#paper"' not in text
 
 
-def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_subject):
-    fit = record_subject.fits["VII"]
+def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_result):
+    fit = record_result.whole.fits["VII"]
     flagged = of_fit("VII", fit, (1, 2, 3), {"alpha": "the record does not tell the order"})
     told = " ".join(damping_sentences(flagged))
     assert "internal damping" not in told
@@ -244,33 +247,35 @@ def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_subject):
     assert "of the fixed order α\u00a0=\u00a01." in known
 
 
-def test_what_is_unexplained_makes_every_number_a_condition(record_subject):
-    spoilt = of_fit("VI", record_subject.fit, (1, 2, 3), unexplained="part is unexplained")
+def test_what_is_unexplained_makes_every_number_a_condition(record_result, retold):
+    spoilt = of_fit("VI", record_result.whole.fit, (1, 2, 3), unexplained="part is unexplained")
     (told,) = damping_sentences(spoilt)
     assert "would be" in told
     assert "(" not in told  # no interval
-    modes, tables, _ = report_tables(replace(record_subject, headline=spoilt))
+    modes, tables, _ = report_tables(retold(record_result, headline=spoilt))
     for table in (modes, tables[0], tables[1]):
         for row in table.shown_rows:
             shown = [cell for cell in row if cell.is_number]
             assert sum(cell.doubtful for cell in shown) >= len(shown) - 1
 
 
-def test_a_simpler_structure_stands_beside_the_freest(record_subject):
-    taken = of_fit("VII", record_subject.fits["VII"], (1, 2, 3)).parameters
+def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
+    taken = of_fit("VII", record_result.whole.fits["VII"], (1, 2, 3)).parameters
     simpler = Simpler("VII", {"alpha": 1.0}, taken)
-    told = replace(record_subject.headline, simpler=simpler)
-    _modes, tables, _ = report_tables(replace(record_subject, headline=told))
+    told = replace(record_result.whole.headline, simpler=simpler)
+    _modes, tables, _ = report_tables(retold(record_result, headline=told))
     (table,) = [table for table in tables if table.name == "on_condition"]
     assert "If α = 1 is taken for granted: type VII" in table.caption
     row = {row["parameter"]: row for row in table.rows}["ζ"]
-    assert row["value_si"].value == record_subject.fits["VII"].parameters["zeta"]
-    assert row["free_value_si"].value == record_subject.fits["VI"].parameters["zeta"]
+    assert row["value_si"].value == record_result.whole.fits["VII"].parameters["zeta"]
+    assert row["free_value_si"].value == record_result.whole.fits["VI"].parameters["zeta"]
 
 
-def test_a_band_that_begins_beyond_a_mode_is_drawn(record_subject):
+def test_a_band_that_begins_beyond_a_mode_is_drawn(record_result):
     with style.styled():
-        found = [each.name for each in illustrations(replace(record_subject, band_hz=(5.0, 50.0)))]
+        found = [
+            each.name for each in illustrations(replace(record_result.whole, band_hz=(5.0, 50.0)))
+        ]
     assert found == list(FIGURES)
 
 
@@ -282,15 +287,15 @@ def test_figures_are_there_as_png_and_svg(report):
         assert "<text" in svg
 
 
-def test_a_taken_name_is_told_and_left_alone(report, record_subject):
+def test_a_taken_name_is_told_and_left_alone(report, record_result):
     before = (report / "report.html").stat().st_mtime_ns
     with pytest.raises(OutputExistsError, match=r"record_frf\.png exists"):
-        write_html_report(record_subject, report)
+        _write_page(record_result, record_result.whole, report, lambda _done: None, None)
     assert (report / "report.html").stat().st_mtime_ns == before
 
 
-def test_entries_hold_bands_round_their_curves(record_subject):
-    (record,) = record_entries(record_subject)["records"]
+def test_entries_hold_bands_round_their_curves(record_result):
+    (record,) = record_entries(record_result.whole, record_result.welch)["records"]
     curves = record["curves"]
     assert record["selected"] == "VI"
     low, value, high = (

@@ -18,8 +18,8 @@ def plain(fit, record, measured, delay_s):
     return fit_indices(s.imag, measured.response, model * np.exp(-s * delay_s))
 
 
-def test_they_are_those_of_eq_25_with_the_delay_that_was_found(record_subject):
-    welch, fit = record_subject.welch, record_subject.fit
+def test_they_are_those_of_eq_25_with_the_delay_that_was_found(record_result):
+    welch, fit = record_result.welch, record_result.whole.fit
     found = indices_of_record_fit(fit, welch)
     for indices, measured in zip(found, (welch.response, welch.whole_record), strict=True):
         expected = plain(fit, welch.record, measured, fit.parameters["delay_s"])
@@ -32,12 +32,12 @@ def test_they_are_those_of_eq_25_with_the_delay_that_was_found(record_subject):
     assert again[0]["mse"] == pytest.approx(found[0]["mse"], rel=1e-9)
 
 
-def test_the_document_has_both_of_every_fit(record_subject):
-    content = document([record_subject.welch], subjects=[record_subject])
+def test_the_document_has_both_of_every_fit(record_result):
+    content = document([record_result])
     for fit in content["fits"]:
         for key in ("indices", "indices_whole_record"):
             assert all(value > 0 for value in fit[key].values()), (fit["type"], key)
-    of_welch = whole_record_indices(record_subject.welch)
+    of_welch = whole_record_indices(record_result.welch)
     assert [fit["indices_whole_record"] for fit in content["fits"][: len(of_welch)]] == of_welch
     # Welch's estimate is biased: what suits it best is not what was there.
     paper = min(of_welch, key=lambda each: each["wmse"])
@@ -47,7 +47,7 @@ def test_the_document_has_both_of_every_fit(record_subject):
     assert record["indices"]["wmse"] > best
 
 
-def test_without_the_paper_s_route_they_are_null(record_subject):
-    alone = replace(record_subject, welch=None)
-    content = document([], subjects=[alone])
+def test_without_the_paper_s_route_they_are_null(record_result):
+    alone = replace(record_result, welch=None)
+    content = document([alone])
     assert {value for fit in content["fits"] for value in fit["indices"].values()} == {None}

@@ -29,12 +29,12 @@ REASON = "order 1 on another beam explains as much"
 
 
 @pytest.fixture(scope="module")
-def careful(record_subject):
+def careful(record_result, retold):
     """Type VI whose alpha the data do not support, on a record that shows two modes."""
     order = SimpleNamespace(order="alpha", status="open", value=1.05, interval=(0.9, 1.2))
-    told = of_fit("VI", record_subject.fit, (1, 2), {"alpha": REASON}, {"alpha": (0.9, 1.2)})
-    verdict = replace(record_subject.verdict, orders=(order,))
-    return replace(record_subject, headline=told, verdict=verdict)
+    told = of_fit("VI", record_result.whole.fit, (1, 2), {"alpha": REASON}, {"alpha": (0.9, 1.2)})
+    verdict = replace(record_result.whole.verdict, alpha=order)
+    return retold(record_result, headline=told, verdict=verdict)
 
 
 def test_an_order_takes_its_coefficient_with_it():
@@ -51,11 +51,11 @@ def test_tables_mark_every_such_number_and_no_other(careful):
     shown = {row["parameter"]: row for row in parameters.rows}
     for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
         number = shown[symbol]["value_si"]
-        assert (number.value, number.doubtful) == (careful.fit.parameters[name], True)
+        assert (number.value, number.doubtful) == (careful.whole.fit.parameters[name], True)
         assert MARK in number.text
         assert shown[symbol]["remark"] == REASON
     assert [shown["α"][end].value for end in ("low_si", "high_si")] == [0.9, 1.2]
-    assert shown["λ"]["value_si"].value == careful.fit.parameters["lambda"]
+    assert shown["λ"]["value_si"].value == careful.whole.fit.parameters["lambda"]
     assert MARK not in shown["λ"]["value_si"].text
     unsupported = ("zeta", "zeta_std", "alpha", "alpha_std")
     for table in (structures, welch):
@@ -67,32 +67,32 @@ def test_tables_mark_every_such_number_and_no_other(careful):
         assert any(MARK in note and "α" in note and "λ" not in note for note in table.notes)
     by_type = {row["type"]: row for row in csv.DictReader(csv_text(structures).splitlines())}
     assert by_type["VI"]["not_reported"] == "alpha zeta"
-    assert float(by_type["VI"]["alpha"]) == careful.fit.parameters["alpha"]
+    assert float(by_type["VI"]["alpha"]) == careful.whole.fit.parameters["alpha"]
     assert [row[0].text for row in modes.shown_rows] == ["1", "2", f"3{MARK}"]
     assert "does not show" in modes.notes[0]
 
 
-def test_of_absent_damping_no_fit_tells_the_order(record_subject):
+def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
     """Selected is a structure without external damping: types V, VI and VII have a lambda."""
     absent = SimpleNamespace(order="lambda", status="absent", value=None, interval=None)
     known = SimpleNamespace(order="alpha", status="fractional", value=0.8, interval=(0.7, 0.9))
-    verdict = replace(record_subject.verdict, orders=(known, absent))
-    subject = replace(record_subject, verdict=verdict)
-    assert not subject.withheld
-    assert subject.unsupported == {"lambda"}
-    _modes, (*_others, structures), (welch, _peaks) = report_tables(subject)
+    verdict = replace(record_result.whole.verdict, alpha=known, lambda_=absent)
+    result = retold(record_result, verdict=verdict)
+    assert not result.whole.withheld
+    assert result.unsupported == {"lambda"}
+    _modes, (*_others, structures), (welch, _peaks) = report_tables(result)
     for table in (structures, welch):
         assert any(MARK in note and "λ" in note for note in table.notes)
         for row in table.rows:
             marks = [MARK in row[name].text for name in ("zeta", "alpha", "gamma", "lambda")]
             external = row["type"] not in ("I", "IV")
             assert marks == [False, False, external, external]
-    for fit in document([subject.welch], subjects=[subject])["fits"]:
+    for fit in document([result])["fits"]:
         assert fit["withheld"] == ([] if fit["type"] in ("I", "IV") else ["gamma", "lambda"])
 
 
-def test_nothing_is_marked_where_all_is_supported(record_subject):
-    modes, tables, of_paper = report_tables(record_subject)
+def test_nothing_is_marked_where_all_is_supported(record_result):
+    modes, tables, of_paper = report_tables(record_result)
     for table in (modes, *tables, *of_paper):
         assert MARK not in csv_text(table) + "".join(table.notes)
         assert not any(cell.doubtful for row in table.shown_rows for cell in row)
@@ -102,27 +102,27 @@ def test_page_terminal_and_text_tables_show_the_mark(careful):
     modes, tables, of_paper = report_tables(careful)
     made_at = datetime(2026, 1, 1, tzinfo=UTC)
     text = record_page(careful, PICTURES, modes, tables, made_at, (), of_paper)
-    alpha = careful.fits["VI"].parameters["alpha"]
+    alpha = careful.whole.fits["VI"].parameters["alpha"]
     cells = re.findall(rf'<td class="number withheld"><data value="{alpha!r}">([^<]+)', text)
     assert len(cells) == 2  # among the parameters, and among the structures
     assert all(cell.endswith(MARK) for cell in cells)
     console = Console(width=140)
     with console.capture() as capture:
-        console.print(record_text(careful))
+        console.print(record_text(careful.whole))
     assert f"3{MARK}" in capture.get()
     (row,) = [line.split() for line in capture.get().splitlines() if line.split()[:1] == ["α"]]
     assert row[4].endswith(MARK)
     assert REASON in capture.get()
-    welch = tables_text(careful.welch, ALPHA)
+    welch = tables_text(careful)
     fits, *others = [line for line in welch.splitlines() if re.match(r"VI\s+omega", line)]
     assert fits.count(MARK) == 2
     assert MARK not in "".join(others)
     assert f"{MARK} not reported" in welch
-    assert MARK not in tables_text(careful.welch)
+    assert MARK not in tables_text(replace(careful, whole=None))
 
 
 def test_the_document_flags_and_keeps_the_numbers(careful):
-    content = document([careful.welch], subjects=[careful])
+    content = document([careful])
     for fit in content["fits"]:
         expected = [] if fit["type"] in ("II", "V") else ["alpha", "zeta"]
         assert fit["withheld"] == expected
@@ -131,55 +131,59 @@ def test_the_document_flags_and_keeps_the_numbers(careful):
     assert selected == ["VI"]
     (record,) = content["records"]
     assert record["orders"] == {
-        "alpha": {"status": "open", "value": 1.05, "interval_95": [0.9, 1.2]}
+        "alpha": {"status": "open", "value": 1.05, "interval_95": [0.9, 1.2]},
+        "lambda": {"status": "fractional", "value": 0.9, "interval_95": [0.8, 1.0]},
     }
     first, last = record["curves"]["loss_factor_supported_hz"]
-    assert (first, last) == (careful.fit.modes[0].frequency_hz, careful.fit.modes[1].frequency_hz)
+    assert (first, last) == (
+        careful.whole.fit.modes[0].frequency_hz,
+        careful.whole.fit.modes[1].frequency_hz,
+    )
     visible = {m["mode"]: m["visible"] for m in content["modes"] if m["estimator"] == "record"}
     assert visible == {1: True, 2: True, 3: False}
 
 
 def test_of_modes_that_do_not_show_no_damping_is_told(careful):
-    told = " ".join(damping_sentences(careful.headline))
+    told = " ".join(damping_sentences(careful.whole.headline))
     assert "at 2.57 Hz and" in told
     assert "44.8" not in told
-    none = of_fit("VI", careful.fit, ())
+    none = of_fit("VI", careful.whole.fit, ())
     assert "damping ratio" not in " ".join(damping_sentences(none))
 
 
-def loss_axes(subject):
+def loss_axes(result):
     with style.styled():
-        (found,) = [each for each in illustrations(subject) if each.name == "loss_factor"]
+        (found,) = [each for each in illustrations(result.whole) if each.name == "loss_factor"]
     return found.figure.axes[0], found.description
 
 
-def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_subject):
+def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_result):
     axes, description = loss_axes(careful)
     labels = [line.get_label() for line in axes.get_lines()]
     assert "total" in labels
     assert "internal (material)" not in labels
     (total,) = [line for line in axes.get_lines() if line.get_label() == "total"]
-    modes = careful.fit.modes
+    modes = careful.whole.fit.modes
     assert total.get_xdata()[0] == pytest.approx(modes[0].frequency_hz)
     assert total.get_xdata()[-1] == pytest.approx(modes[1].frequency_hz)
     assert "do not support" in description
-    axes, description = loss_axes(record_subject)
+    axes, description = loss_axes(record_result)
     assert {"total", "internal (material)"} <= {line.get_label() for line in axes.get_lines()}
     assert "do not support" not in description
 
 
-def test_one_mode_has_a_point_and_no_curve(careful):
-    one = replace(careful, headline=of_fit("VI", careful.fit, (1,), {"alpha": REASON}))
-    assert supported_band_hz(one) is None
+def test_one_mode_has_a_point_and_no_curve(careful, retold):
+    one = retold(careful, headline=of_fit("VI", careful.whole.fit, (1,), {"alpha": REASON}))
+    assert supported_band_hz(one.whole) is None
     axes, _ = loss_axes(one)
     (point,) = {float(x) for line in axes.get_lines() for x in line.get_xdata()}
-    assert point == careful.fit.modes[0].frequency_hz
+    assert point == careful.whole.fit.modes[0].frequency_hz
 
 
 def test_the_excited_band_ends_where_the_sweep_does(careful):
     """Of a chirp of 0.05 to 50 Hz nearly all; of noise alone nothing."""
-    first_hz, last_hz = excited_band_hz(careful.record, careful.analysis)
+    first_hz, last_hz = excited_band_hz(careful.record, careful.whole.analysis)
     assert first_hz < 2.0
     assert last_hz > 45.0
     noise = 5e-3 * np.random.default_rng(1).standard_normal(len(careful.record.torque_nm))
-    assert excited_band_hz(replace(careful.record, torque_nm=noise), careful.analysis) is None
+    assert excited_band_hz(replace(careful.record, torque_nm=noise), careful.whole.analysis) is None

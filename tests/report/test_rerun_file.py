@@ -13,6 +13,7 @@ from analysis.record import load_record
 from analysis.report import _rerun_file as fit_charts
 from analysis.report._folder import OutputError
 from analysis.report._rerun_file import write_rerun_file
+from analysis.results import RecordResult
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
 from rigd.view._rrd_file import new_rrd_file
@@ -39,7 +40,7 @@ def value(batches: list, name: str):
 @pytest.fixture(scope="module")
 def written(paper_analysis, tmp_path_factory):
     path = tmp_path_factory.mktemp("rerun") / "paper.rrd"
-    write_rerun_file(paper_analysis, path)
+    write_rerun_file(RecordResult(paper_analysis.record, welch=paper_analysis), path)
     return read(path), path
 
 
@@ -205,7 +206,9 @@ def session(write_session, short_signals, tmp_path):
 
 def test_a_file_that_cannot_be_written_is_told(paper_analysis):
     with pytest.raises(OutputError, match=r"^/proc/fits.rrd cannot be written: [A-Z][^:]*\.$"):
-        write_rerun_file(paper_analysis, Path("/proc/fits.rrd"))
+        write_rerun_file(
+            RecordResult(paper_analysis.record, welch=paper_analysis), Path("/proc/fits.rrd")
+        )
 
 
 def run(application, *arguments):

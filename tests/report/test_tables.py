@@ -17,7 +17,9 @@ from analysis.report._table import (
     json_rows,
     terminal_table,
 )
-from analysis.report._text import as_text, summary_table, tables_text
+from analysis.report._text import as_text, summary_table
+from analysis.report._text import tables_text as text_of_result
+from analysis.results import RecordResult
 from rigd.beam import modes
 
 
@@ -38,6 +40,14 @@ def test_a_value_shows_the_digits_its_spread_leaves(value, std, text):
     columns = (Column("value", "value"), Column("std", "std", spread=True))
     table = Table.of("name", "", columns, [estimate((value, std), std)])
     assert as_text(terminal_table(table)).split("\n")[2].strip() == text
+
+
+def by_welch(analysis):
+    return RecordResult(analysis.record, welch=analysis)
+
+
+def tables_text(analysis):
+    return text_of_result(by_welch(analysis))
 
 
 def rows(text, *starts):
@@ -89,7 +99,7 @@ def test_the_summary_is_mean_and_standard_deviation(paper_analysis):
         others.append(replace(paper_analysis, models=(replace(model, fit=fit),)))
     console = Console(width=120)
     with console.capture() as capture:
-        console.print(summary_table(others))
+        console.print(summary_table([by_welch(each) for each in others]))
     assert "over 3 files" in capture.get()
     (row,) = rows(capture.get(), "I", "const")
     assert row[2:5] == ["23", "±15", "1"]

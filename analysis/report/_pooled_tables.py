@@ -1,0 +1,229 @@
+"""Tables of what all sessions give together: structures, pooled parameters, modes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Final
+
+from analysis.campaigns import MIXTURE_NOTE, label, title, with_unit
+from analysis.models import STRUCTURES
+from analysis.report._specimen_tables import chance_cell, with_mark
+from analysis.report._table import (
+    WORDS,
+    Cell,
+    Column,
+    Entry,
+    Row,
+    Table,
+    count,
+    estimate,
+    footnotes,
+    greyed,
+    marked,
+    number,
+    unreported,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+
+    from analysis.campaigns import (
+        CampaignResult,
+        PooledEstimate,
+        PooledParameter,
+        RankedStructure,
+    )
+
+NOT_POOLED: Final = (
+    "In grey: not pooled, since fewer than two sessions determine its damping, or not all tried it."
+)
+
+
+def structures_table(campaign: CampaignResult) -> Table:
+    """All structures on all whole records together, those pooled first, the lowest BIC first."""
+
+    def row(each: RankedStructure) -> Row:
+        grey: Callable[[Cell], Cell] = (lambda cell: cell) if each.pooled else greyed
+        return {
+            "type": Cell(each.structure, each.name),
+            "uniform": each.uniform,
+            "fitted": grey(count(each.fitted)),
+            "sessions": grey(count(each.determined)),
+            "bic_above_lowest": grey(number(each.bic_above_lowest, ".1f")),
+            "misfit": grey(number(each.misfit)),
+            "selected_alone": grey(count(each.selected_alone)),
+            "pooled": each.pooled,
+        }
+
+    return Table(
+        "structures",
+        title("Structures on the whole records of all sessions together", campaign.homogeneity),
+        (
+            Column("type", "type", WORDS),
+            Column("sessions fitted", "fitted"),
+            Column("that determine it", "sessions"),
+            Column("that select it alone", "selected_alone"),
+            Column("BIC above the lowest", "bic_above_lowest"),
+            Column("residual (noise = 1)", "misfit"),
+        ),
+        tuple(map(row, campaign.structures)),
+        (
+            "Damping and the modes' offsets are the specimen's, one value for all sessions (and a "
+            "scatter between them, where they differ); settings of the rig are each session's.",
+            *(() if all(each.pooled for each in campaign.structures) else (NOT_POOLED,)),
+        ),
+        selected=0 if campaign.pooled else None,
+    )
+
+
+def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
+    """Return the headline's estimate, and the one of the lowest BIC, which is conditional."""
+    found = {each.name: each for each in (campaign.headline, *campaign.pooled[:1]) if each}
+    return list(found.values())
+
+
+def used(estimate: PooledEstimate, campaign: CampaignResult) -> str:
+    """Say of how many sessions an estimate is, and of how many it is not."""
+    every = len(campaign.sessions)
+    return f"{estimate.sessions}{f' of {every}' if estimate.sessions < every else ''} sessions"
+
+
+def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -> Table:
+    """Pooled whole-record estimates, the headline's first, then the lowest BIC first.
+
+    Parameters
+    ----------
+    campaign : CampaignResult
+    only : PooledEstimate, optional
+        The one to be shown. Without it, as in the files, all of them, and behind them what is not
+        pooled, without values.
+    """
+    withheld = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    found, headline = campaign.homogeneity, campaign.headline
+    columns = (
+        Column("parameter", "parameter", WORDS),
+        Column("pooled", "value"), Column("std", "std", spread=True),
+        Column("95 % from", "low_95"), Column("to", "high_95"),
+        Column("one session's std", "within_std"), Column("between sessions", "between_std"),
+        Column("p", "chance"),
+    )  # fmt: skip
+    if only is None:
+        pooled = sorted(campaign.pooled, key=lambda each: each is not headline)
+        rows = [
+            _pooled_row(estimate, each, campaign, withheld)
+            for estimate in pooled
+            for each in estimate.parameters
+        ]
+        rows += [
+            {
+                "type": each.structure,
+                "uniform": each.uniform,
+                "name": each.name,
+                "headline": False,
+                "sessions": each.determined,
+                "misfit": each.misfit,
+                "parameter": parameter,
+                "reported": False,
+            }
+            for each in campaign.structures
+            if not each.pooled
+            for parameter in STRUCTURES[each.structure].free
+        ]
+        return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
+    role = "freest structure"
+    if only is not headline:
+        role = "lowest BIC, conditional on its being the true one"
+    notes = [
+        "One session's std: what a session states as its own. Between sessions: scatter beyond "
+        "that. p: probability of so much scatter by the sessions' own uncertainties alone. "
+        f"Residual {only.misfit:.4g} times the noise."
+    ]
+    if unreported(STRUCTURES[only.structure], withheld):
+        notes += footnotes(withheld)
+    if any(found.is_mixed(each.name) for each in only.parameters):
+        notes.append(MIXTURE_NOTE)
+    return Table(
+        f"pooled_{only.name.replace(', ', '_').replace(' ', '_')}",
+        title(f"Pooled over {used(only, campaign)}: type {only.name} ({role})", found),
+        columns,
+        tuple(_pooled_row(only, each, campaign, withheld) for each in only.parameters),
+        tuple(notes),
+    )
+
+
+def _pooled_row(
+    pooled: PooledEstimate,
+    each: PooledParameter,
+    campaign: CampaignResult,
+    withheld: Collection[str],
+) -> Row:
+    found = campaign.homogeneity
+    _, factor, _ = label(each.name)
+    value, std, low, high = estimate((each.value, each.std, *each.interval), each.std, factor)
+    reported = each.name not in unreported(STRUCTURES[pooled.structure], withheld)
+    if not reported:
+        value = marked(value)
+    else:
+        # Let the eye stop at what can be used only.
+        value = greyed(value) if found.is_mixed(each.name) else replace(value, strong=True)
+    return {
+        "type": pooled.structure,
+        "uniform": pooled.uniform,
+        "name": pooled.name,
+        "headline": pooled is campaign.headline,
+        "sessions": pooled.sessions,
+        "bic": pooled.bic,
+        "misfit": pooled.misfit,
+        "parameter": Cell(each.name, with_mark(with_unit(each.name), each.name, found)),
+        "value": value,
+        "std": std,
+        "low_95": low,
+        "high_95": high,
+        "within_std": number(each.within_std, ".2g", factor),
+        "between_std": number(each.between_std, ".2g", factor),
+        "chance": chance_cell(each.chance),
+        "next_low_95": each.next_interval[0],
+        "next_high_95": each.next_interval[1],
+        "reported": reported,
+        "mixture": found.is_mixed(each.name),
+    }
+
+
+def modes_table(campaign: CampaignResult) -> Table:
+    """Modes over all sessions, of the structure that the numbers are of."""
+    found = campaign.homogeneity
+    rows: list[Row] = []
+    for mode in campaign.headline.modes if campaign.headline else ():
+        shown: dict[str, Entry] = {"number": mode.number}
+        for name, std, between, factor in (
+            ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
+            ("damping_ratio", "damping_ratio_std", "damping_ratio_between_std", 100.0),
+        ):
+            its = getattr(mode, std)
+            mean, shown[std] = estimate((getattr(mode, name), its), its, factor)
+            text = with_mark(mean.text, f"{name}_{mode.number}", found)
+            shown[name] = replace(mean, text=text)
+            shown[between] = number(getattr(mode, between), ".2g", factor)
+        rows.append(
+            {
+                **{name: shown[name] for name in asdict(mode)},
+                "frequency_mixture": found.is_mixed(f"frequency_hz_{mode.number}"),
+                "damping_ratio_mixture": found.is_mixed(f"damping_ratio_{mode.number}"),
+            }
+        )
+    mixed = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
+    return Table(
+        "pooled_modes",
+        title("Modes of the beam on a motor that stands still, mean of the sessions", found),
+        (
+            Column("mode", "number"),
+            Column("frequency (Hz)", "frequency_hz"),
+            Column("std", "frequency_std_hz", spread=True),
+            Column("between sessions", "frequency_between_std_hz"),
+            Column("damping ratio (%)", "damping_ratio"),
+            Column("std", "damping_ratio_std", spread=True),
+            Column("between sessions", "damping_ratio_between_std"),
+        ),
+        tuple(rows),
+        (MIXTURE_NOTE,) if mixed else (),
+    )

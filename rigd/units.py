@@ -1,0 +1,64 @@
+"""Units: which one a key's ending names, and how many digits an uncertain number is shown with."""
+
+from math import floor, log10
+from types import MappingProxyType
+from typing import Final
+
+UNITS: Final = MappingProxyType(
+    {
+        "_nm_s_per_rad": "N·m·s/rad",
+        "_nm_per_rad": "N·m/rad",
+        "_kg_per_m": "kg/m",
+        "_kg_m2": "kg·m²",
+        "_n_m2": "N·m²",
+        "_n_nm": "N, N·m",
+        "_percent": "%",
+        "_counts": "counts",
+        "_bit_s": "bit/s",
+        "_rad_s2": "rad/s²",
+        "_rad_s": "rad/s",
+        "_rad": "rad",
+        "_nm": "N·m",
+        "_mb": "MB",
+        "_hz": "Hz",
+        "_us": "µs",
+        "_ns": "ns",
+        "_m": "m",
+        "_n": "N",
+        "_s": "s",
+    }
+)
+"""Ending of a key → its unit, the longer endings first: the first that fits is the key's."""
+
+
+def suffix_of(key: str) -> str:
+    """Return the ending of a key that names its unit; empty if there is none.
+
+    Examples
+    --------
+    >>> suffix_of("beam.bending_stiffness_n_m2")
+    '_n_m2'
+    """
+    return next((suffix for suffix in UNITS if key.endswith(suffix)), "")
+
+
+def unit_of(key: str) -> str:
+    """Return the unit that a key's ending names; empty if there is none.
+
+    Examples
+    --------
+    >>> unit_of("rated_torque_nm")
+    'N·m'
+    """
+    return UNITS.get(suffix_of(key), "")
+
+
+def decimals(uncertainty: float) -> int:
+    """Return how many decimals show a number to the second digit of its uncertainty.
+
+    Examples
+    --------
+    >>> decimals(0.0123), decimals(40.0)
+    (3, 0)
+    """
+    return max(1 - floor(log10(uncertainty)), 0)
