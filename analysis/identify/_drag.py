@@ -25,7 +25,7 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
-from analysis.identify._refit import Refit, adapted, unexplained_part, vector
+from analysis.identify._refit import Refit, unexplained_part
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
@@ -182,7 +182,7 @@ def _promising(field: Field) -> bool:
         beside = Refit.descend(
             field.comparison,
             unknowns,
-            vector(unknowns, plant),
+            unknowns.vector(plant),
             field.noise,
             np.concatenate([field.columns, _first_order(field.comparison, plant)]),
             max_evaluations=1,
@@ -224,7 +224,7 @@ def _start(field: Field, lead: Candidate) -> _Point | None:
     plant, structure = lead.fit.plant, lead.structure
     columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
     unknowns = field.unknowns(structure, lead.uniform)
-    here = vector(unknowns, plant)
+    here = unknowns.vector(plant)
     size, *_ = _last_amplitude(
         Refit.descend(field.comparison, unknowns, here, field.noise, columns, max_evaluations=1)
     )
@@ -258,7 +258,7 @@ def _settled(
         None if the air would have to push, the drag cannot be followed, or nothing settles.
     """
     unknowns = field.unknowns(structure, uniform)
-    x = adapted(unknowns, point.plant, point.structure)
+    x = unknowns.vector(point.plant)
     still = False
     law, noise, two = point.law, point.noise, point.two
     for _ in range(_ROUNDS):
@@ -312,12 +312,12 @@ def _all(field: Field, settled: Refit) -> Field:
         columns=settled.columns,
         noise=settled.noise_here(),
     )
-    of, plant = settled.objective.unknowns.structure, settled.plant
+    plant = settled.plant
     least = other.descent(settled.objective.unknowns, settled.x, 1).cost
     candidates = []
     for before in _without_extras(field):
         unknowns = other.unknowns(before.structure, before.uniform)
-        refit = other.descent(unknowns, adapted(unknowns, plant, of), _FEW)
+        refit = other.descent(unknowns, unknowns.vector(plant), _FEW)
         if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
             refit = other.descent(unknowns, refit.x, _MANY)
         candidates.append(
@@ -335,7 +335,7 @@ def _estimate(field: Field) -> DragEstimate:
         (c for c in field.candidates if c.kind == best.kind),
         key=lambda c: (len(c.structure.free), -c.bic),
     )
-    refit = field.refit(freest.structure, freest.uniform, freest.fit.plant)
+    refit = field.refit(freest)
     law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
     covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag
