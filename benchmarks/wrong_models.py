@@ -323,37 +323,42 @@ def drags(wires: list[Drag], seeds: list[int], noise_nm: float = NOISE_NM) -> li
 def _braked(wires: list[Drag]) -> Real:
     """Torque of beams of integer orders in air, shape (wires, n)."""
     roots = np.concatenate([_ROOTS, (2 * np.arange(5, 7) - 1) * np.pi / 2])
-    xi = (np.arange(24) + 0.5) / 24
+    node, weight = np.polynomial.legendre.leggauss(24)
+    xi, weight = 0.5 * (node + 1), 0.5 * weight
     shapes = np.array([_shape(z, xi) for z in roots])
     # In units of an eigenfunction's expansion of the rigid turn x.
-    shares = np.array([2 / z**2 * LENGTH_M * np.sign(_shape(z, np.ones(1))[0]) for z in roots])
+    shares = 2 / roots**2 * LENGTH_M
     k = (roots / LENGTH_M) ** 4
     ratio, step = DENSITY / STIFFNESS, 1 / RATE_HZ
-    field, back = shapes * shares[:, None], (shapes / shares[:, None]).T
+    field, back = shapes * shares[:, None], weight[:, None] * (shapes / shares[:, None]).T
+    # What force does to modes beyond these, which follow it at once.
+    arm = STIFFNESS * LENGTH_M * weight * (LENGTH_M * xi - shares @ shapes)
     zeta, gamma = (
         np.array([getattr(wire.rig, name) for wire in wires])[:, None] for name in ("zeta", "gamma")
     )
     per_speed, slowing = np.array([wire.laws() for wire in wires]).T[:, :, None] * (
-        0.5 * _AIR_KG_M3 / STIFFNESS / 24
+        0.5 * _AIR_KG_M3 / STIFFNESS
     )
     slow = bool(slowing.any())
     size = np.array([wire.amplitude_rad for wire in wires])[:, None] / _AMPLITUDE_RAD
     hub, turning = (np.array(x) for x in _hub())
-    out = np.zeros((TICKS, len(wires), len(roots)))
+    out, rest = np.zeros((TICKS, len(wires), len(roots))), np.zeros((TICKS, len(wires)))
     y, v = np.zeros((2, len(wires), len(roots)))
 
-    def pull(j: int, y: Real, v: Real) -> tuple[Real, Real]:
+    def pull(j: int, y: Real, v: Real) -> tuple[Real, Real, Real]:
         elastic = k * (y - hub[j] * size + zeta * (v - turning[j] * size))
         speed = v @ field
         magnitude = np.abs(speed)
         factor = per_speed * magnitude
         if slow:
             factor += slowing * np.cbrt(magnitude)
-        return elastic, elastic + gamma * v + (factor * speed) @ back
+        drag = factor * speed
+        return elastic, elastic + gamma * v + drag @ back, drag
 
     for i in range(TICKS - 1):
         j = 2 * i
-        out[i], f = pull(j, y, v)
+        out[i], f, drag = pull(j, y, v)
+        rest[i] = drag @ arm
         v2 = v - step / 2 * f / ratio
         d2 = pull(j + 1, y + step / 2 * v, v2)[1]
         v3 = v - step / 2 * d2 / ratio
@@ -362,7 +367,7 @@ def _braked(wires: list[Drag]) -> Real:
         d4 = pull(j + 2, y + step * v3, v4)[1]
         y = y + step / 6 * (v + 2 * v2 + 2 * v3 + v4)
         v = v - step / 6 * (f + 2 * d2 + 2 * d3 + d4) / ratio
-    torque: Real = -(out @ (4 * LENGTH_M**3 / roots**4 * STIFFNESS)).T
+    torque: Real = rest.T - (out @ (4 * LENGTH_M**3 / roots**4 * STIFFNESS)).T
     return torque
 
 
