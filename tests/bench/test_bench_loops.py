@@ -26,8 +26,10 @@ def assert_accounted(found):
 
 def test_the_loop_alone_is_measured_without_a_file(profile):
     looks = []
+    before = os.sched_getaffinity(0), os.sched_getscheduler(0)
     assert_accounted(loops.run_alone("alone", profile, SECONDS, lambda: looks.append(1)))
     assert looks
+    assert (os.sched_getaffinity(0), os.sched_getscheduler(0)) == before
 
 
 def test_a_session_is_measured_and_its_file_goes(profile, tmp_path, monkeypatch):
