@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -96,9 +96,12 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Cr
         If they do not start.
     """
     try:
-        with Crew(live=live) as crew:
+        with Crew(live=live) as crew, ExitStack() as connection:
             rig = Rig(profile, crew=crew)
             rig.connect()
+            # It also gives back the precedence that supervision has, of which what is measured
+            # next, such as cyclictest, would inherit the cores.
+            connection.callback(rig.disconnect)
             yield rig, crew
     except (FailureError, OSError) as error:
         raise LoopError(str(error)) from error

@@ -3,10 +3,9 @@
 import json
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from rigd.cli.check import check, reset
+from rigd.cli.app import app
 from rigd.devices.contracts import DeviceError
 
 
@@ -15,9 +14,6 @@ def rigd(monkeypatch):
     """Run one of the two commands; returns exit code, standard output and standard error."""
     monkeypatch.setattr("rigd.cli.check.signal.signal", lambda *_: None)  # of the test runner
     monkeypatch.setenv("COLUMNS", "80")
-    app = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command()(check)
-    app.command()(reset)
 
     def run(*arguments):
         done = CliRunner().invoke(app, arguments)

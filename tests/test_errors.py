@@ -1,0 +1,42 @@
+"""The tree of errors that `rigd.errors` draws is the one that there is."""
+
+import ast
+import re
+from pathlib import Path
+
+from rigd import errors
+
+ROOT = Path(__file__).parents[1]
+BASES = {"RigdError", "UserError", "FailureError"}
+
+
+def derived():
+    """Classes that derive from one of the bases by name: each with that base."""
+    for path in (ROOT / "rigd").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                for base in node.bases:
+                    if isinstance(base, ast.Name) and base.id in BASES:
+                        yield node.name, base.id
+
+
+def drawn():
+    """Names in the drawing, each with the one that it hangs on."""
+    above = {-1: "RigdError"}  # by column
+    for line in errors.__doc__.splitlines():
+        if (column := line.find("+-- ")) >= 0:
+            above = {at: name for at, name in above.items() if at < column}
+            parent = above[max(above)]
+            names = re.match(r"\w+(, \w+)*", line[column + 4 :])[0].split(", ")
+            above[column] = names[0]
+            yield from ((name, parent) for name in names)
+
+
+def test_the_drawing_names_every_error_under_its_base():
+    assert sorted((name, base) for name, base in drawn() if base in BASES) == sorted(derived())
+
+
+def test_the_bases_tell_the_two_kinds_apart():
+    assert errors.UserError("x").wrong_use
+    assert not errors.FailureError("x").wrong_use
+    assert errors.FailureError("what to do").told() == "what to do"
