@@ -9,9 +9,10 @@ checked against the profile's limits, and Ctrl-C stops safely.
 import sys
 from pathlib import Path
 
+from rigd.errors import RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile
-from rigd.runner import Crew, ForegroundError, excitation_for, run_in_foreground
+from rigd.runner import Crew, excitation_for, run_in_foreground
 from rigd.runtime import StopRequest
 
 CHIRP = {
@@ -50,7 +51,7 @@ def main() -> None:
             force=False,
             quiet_stdout=True,
         )
-    except ForegroundError as error:
+    except RigdError as error:
         sys.exit(str(error))
     for result in results:
         print(f"{result.outcome}: {result.recorded} of {result.scheduled} samples, {result.path}")

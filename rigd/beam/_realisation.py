@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from rigd.beam._model import Beam, Damping, TransferGrid
 from rigd.beam._modes import clamped_free_eigenvalues
 from rigd.beam._tip_mass import LoadedBeam
+from rigd.errors import UserError
 
 ERROR_BAND_HZ = (0.05, 100.0)
 """Band in which a realisation states its error: the paper's chirp and an octave above."""
@@ -51,7 +52,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 
-class RealisationError(ValueError):
+class RealisationError(UserError, ValueError):
     """The damping cannot be realised to the error asked for, or not stably."""
 
 

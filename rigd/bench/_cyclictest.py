@@ -10,6 +10,7 @@ import numpy as np
 
 from rigd.bench._measure import Measurement
 from rigd.engine import WAKE_UP_US
+from rigd.errors import FailureError
 
 NAME = "cyclictest"
 _LARGEST_US = 50_000
@@ -19,7 +20,7 @@ _OVERFLOWS = re.compile(r"^# Histogram Overflows:\s*(\d+)", re.MULTILINE)
 _LARGEST = re.compile(r"^# Max Latencies:\s*(\d+)", re.MULTILINE)
 
 
-class CyclictestError(Exception):
+class CyclictestError(FailureError):
     """It could not be run, or tells something else than expected; the message says why."""
 
 

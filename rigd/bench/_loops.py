@@ -14,10 +14,11 @@ import numpy as np
 
 from rigd.bench._measure import Measurement, UsageMeter, measurement
 from rigd.devices import Selection
-from rigd.engine import ChildError, Phase, SessionJob, Stop, Word, put_reference
+from rigd.engine import Finished, Phase, SessionJob, Stop, Word, put_reference
+from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
-from rigd.runner import Crew, Order, Rig, RigError, SessionFailedError, SessionProgress
+from rigd.runner import Crew, Order, Rig, SessionProgress
 from rigd.runtime import StopRequest
 from rigd.session import decode_samples, read_session
 
@@ -31,7 +32,7 @@ _NO_LIMIT = 1_000_000_000
 OnLook = Callable[[], None]
 
 
-class LoopError(Exception):
+class LoopError(FailureError):
     """The loop could not be measured; the message says why."""
 
 
@@ -99,7 +100,7 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Cr
             rig = Rig(profile, crew=crew)
             rig.connect()
             yield rig, crew
-    except (RigError, SessionFailedError, ChildError, OSError) as error:
+    except (FailureError, OSError) as error:
         raise LoopError(str(error)) from error
 
 
@@ -129,10 +130,10 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
         board[Word.STOP] = Stop.NO
         board[Word.GO] = 1
         reference = put_reference(channels.reference_fd, excitation.reference_rad)
-        crew.control.send_object("session", SessionJob(profile, reference))
+        crew.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None
-        while finished is None or "finished" not in finished:
+        while not isinstance(finished, Finished):
             finished = crew.control.poll(LOOK_S)
             board.beat(Word.SUPERVISOR_BEAT)
             meter.look(Phase(board[Word.PHASE]))
@@ -141,7 +142,7 @@ def run_alone(name: str, profile: Profile, seconds: float, look: OnLook) -> Meas
             channels.controls.discard()
             channels.timings.discard()
             look()
-    _require(finished["finished"], finished["reason"])
+    _require(finished.outcome, finished.reason)
     return measurement(
         name,
         rate_hz,

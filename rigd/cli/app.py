@@ -6,9 +6,10 @@ import io
 import os
 import signal
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 import rigd
 from rigd.cli.check import bench, check, reset
@@ -16,7 +17,7 @@ from rigd.cli.daemon import serve, status, stop, tare, zero
 from rigd.cli.files import info, recover
 from rigd.cli.identify import identify_app
 from rigd.cli.live import live, replay
-from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED
+from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, errors_told
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
 from rigd.cli.simulate import inject, simulate
@@ -37,7 +38,18 @@ def before_a_command(
     """Take the options that stand before a command; they have done their work by then."""
 
 
+class RigdGroup(TyperGroup):
+    """All commands: what an error says, and its exit code, are told here for each of them."""
+
+    # Typer's click is its own in some versions and the package of that name in others.
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
+        """Run the command that was asked for."""
+        with errors_told():
+            return super().invoke(ctx)
+
+
 app = typer.Typer(
+    cls=RigdGroup,
     help="Run the rig: excite the antenna, record every sample, watch it live.\n\n"
     "Example: rigd check --profile sim, then rigd run chirp --profile sim --fast",
     no_args_is_help=True,
@@ -92,7 +104,8 @@ def main() -> None:
 def _stop_at_once() -> None:
     """Do what ``rigd stop`` does."""
     try:
-        stop()
+        with errors_told():
+            stop()
     except typer.Exit as ending:
         sys.exit(ending.exit_code)
 

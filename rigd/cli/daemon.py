@@ -22,6 +22,7 @@ from rigd.cli.options import (
     ProfileName,
     fail,
 )
+from rigd.errors import RigdError
 from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
@@ -53,20 +54,12 @@ def serve(
 
     Example: rigd serve --profile antenna_can --output /data/sessions
     """
-    from rigd.daemon import AddressError, UnknownGroupError, run_daemon
-    from rigd.devices import UnknownDeviceError
-    from rigd.profile import ProfileError
-    from rigd.runner import RefusedError, load_rig, make_folder
-    from rigd.runtime import RigBusyError
+    from rigd.daemon import run_daemon
+    from rigd.runner import load_rig, make_folder
 
-    try:
-        rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
-        make_folder(output)
-        number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
-    except (ProfileError, UnknownDeviceError, UnknownGroupError, RefusedError) as error:
-        fail(str(error), EXIT_WRONG_USE)
-    except (RigBusyError, AddressError) as error:
-        fail(str(error), EXIT_FAILED)
+    rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
+    make_folder(output)
+    number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -79,26 +72,11 @@ DaemonOf = Annotated[
 
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
-    """Connect to the daemon of a profile; whatever goes wrong with it ends the command."""
+    """Connect to the daemon of a profile."""
     from rigd.daemon import Client
 
-    with _failing_by_the_daemon(), Client(_socket_of(profile)) as client:
+    with Client(_socket_of(profile)) as client:
         yield client
-
-
-@contextmanager
-def _failing_by_the_daemon() -> Iterator[None]:
-    """End the command with what a daemon says, or with what is known of one that is gone."""
-    from rigd.daemon import AddressError, DaemonGoneError, RefusedByDaemonError
-
-    try:
-        yield
-    except AddressError as error:
-        fail(str(error), EXIT_FAILED)
-    except DaemonGoneError as error:
-        fail(error.after_looking(), EXIT_FAILED)
-    except RefusedByDaemonError as error:
-        fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
 
 
 def _socket_of(profile: str | None) -> "Path":
@@ -166,13 +144,12 @@ def stop(
     """
     from rigd.daemon import await_end, stop_session
 
-    with _failing_by_the_daemon():
-        path = _socket_of(profile)
-        told = stop_session(path)
-        if told["stopping"] and no_wait:
-            typer.echo("The session is being stopped; rigd status shows when it has ended.")
-            return
-        status = await_end(path, _END_PATIENCE_S)
+    path = _socket_of(profile)
+    told = stop_session(path)
+    if told["stopping"] and no_wait:
+        typer.echo("The session is being stopped; rigd status shows when it has ended.")
+        return
+    status = await_end(path, _END_PATIENCE_S)
     if status is None:
         fail(
             f"The daemon was asked to stop, and its session was not seen to end within "
@@ -231,10 +208,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Have the daemon of a profile, or the only one there is, reset its rig; False: there is none.
-
-    A refusal or a failure ends the command.
-    """
+    """Have the daemon of a profile, or the only one there is, reset its rig; False if none is."""
     from rigd.daemon import running, socket_path
 
     sockets = running()
@@ -263,7 +237,7 @@ def _watch(profile: str | None) -> None:
     from rich.live import Live
 
     from rigd.cli.status_view import status_table
-    from rigd.daemon import AddressError, Client, DaemonGoneError, RefusedByDaemonError, find
+    from rigd.daemon import Client, find
 
     name = rig_name(profile)
     with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:
@@ -274,7 +248,7 @@ def _watch(profile: str | None) -> None:
                 told = link.ask("status")
                 name = name or told["daemon"]["profile"]
                 live.update(status_table(told), refresh=True)
-            except (DaemonGoneError, AddressError, RefusedByDaemonError) as error:
+            except RigdError as error:
                 if link is not None:
                     link.close()
                     link = None

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rigd.cli.options import EXIT_FAILED, AsJson, fail, progress
+from rigd.cli.options import EXIT_FAILED, AsJson, progress
 
 
 def info(
@@ -17,12 +17,9 @@ def info(
 
     Example: rigd info sessions/20261120-101500-chirp.mcap
     """
-    from rigd.session import SessionError, describe
+    from rigd.session import describe
 
-    try:
-        found = describe(path)
-    except SessionError as error:
-        fail(str(error), EXIT_FAILED)
+    found = describe(path)
     typer.echo(json.dumps(found.as_dict()) if as_json else "\n".join(found.lines()))
 
 

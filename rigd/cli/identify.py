@@ -9,7 +9,6 @@ import typer
 from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
-    EXIT_WRONG_USE,
     SESSIONS,
     AsJson,
     Fast,
@@ -17,7 +16,6 @@ from rigd.cli.options import (
     Output,
     ProfileName,
     Seed,
-    fail,
     profile_named,
 )
 from rigd.cli.start import CrewGroup, start_crew
@@ -130,7 +128,7 @@ def _run_sessions(
         trial_session,
         tuned,
     )
-    from rigd.runner import Crew, ForegroundError, run_in_foreground
+    from rigd.runner import Crew, run_in_foreground
     from rigd.runtime import ignore
 
     def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
@@ -171,24 +169,18 @@ def _run_sessions(
             run(session, tune, number, Crew(live=False))
             for number, session in enumerate((multisine_session, speeds_session), start=1)
         ]
-    except ForegroundError as error:
-        fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
     finally:
         ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
 
 
 def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
-    from rigd.identification import EstimateError, estimate_motor, propose, read_recording
-    from rigd.session import SessionError
+    from rigd.identification import estimate_motor, propose, read_recording
 
     profile = profile_named(profile_name)
-    try:
-        recording = read_recording(files, profile.rig.actuation.delay_s)
-        estimate = estimate_motor(
-            recording.windows,
-            recording.timing,
-            tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
-        )
-    except (SessionError, EstimateError) as error:
-        fail(str(error), EXIT_FAILED)
+    recording = read_recording(files, profile.rig.actuation.delay_s)
+    estimate = estimate_motor(
+        recording.windows,
+        recording.timing,
+        tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
+    )
     return estimate, propose(estimate, profile, unusable=recording.unusable)

@@ -161,13 +161,10 @@ def _how_to_start(profile: str | None) -> str:
 
 def _show(view: "LiveAddress") -> None:
     """Keep a window open, on the live view that there is, until it is closed."""
-    from rigd.live import RerunError, Viewer
+    from rigd.live import Viewer
 
     with ended_gently(), scratch_folder() as scratch:
-        try:
-            viewer = Viewer(view, scratch)
-        except RerunError as error:
-            fail(str(error), EXIT_FAILED)
+        viewer = Viewer(view, scratch)
         typer.echo(
             f"The live view of {view.rig} is shown; close the window, or press Ctrl-C, to end.",
             err=True,
@@ -250,17 +247,12 @@ def replay(
             f"rigd replay {path} --web prints an address for a browser; {elsewhere}.",
             EXIT_FAILED,
         )
-    from rigd.live import RerunError
-
     with ended_gently(), scratch_folder() as scratch:
         recording = _as_recording(path, scratch)
-        try:
-            if web:
-                _serve(recording, scratch, path)
-            else:
-                _open_window(recording, scratch, path)
-        except RerunError as error:
-            fail(str(error), EXIT_FAILED)
+        if web:
+            _serve(recording, scratch, path)
+        else:
+            _open_window(recording, scratch, path)
 
 
 def _save(path: Path, out: Path, *, web: bool) -> None:
@@ -279,38 +271,29 @@ def _save(path: Path, out: Path, *, web: bool) -> None:
 
 
 def _check_shown(path: Path) -> None:
-    """End the command if a file is not of a kind that is shown, as far as its beginning tells."""
-    from rigd.session import SessionError, check_beginning
+    """Raise an error if a file is not of a kind that is shown, as far as its beginning tells."""
+    from rigd.session import check_beginning
 
-    try:
-        if path.suffix == SUFFIX:
-            check_rrd_file(path)
-        else:
-            check_beginning(path)
-    except (RrdFileError, SessionError) as error:
-        fail(str(error), EXIT_FAILED)
+    if path.suffix == SUFFIX:
+        check_rrd_file(path)
+    else:
+        check_beginning(path)
 
 
 def _convert(path: Path, out: Path) -> None:
-    """Write a session as a recording for Rerun; what keeps it from that ends the command."""
-    from rigd.session import SessionError, read_session, read_timings
+    """Write a session as a recording for Rerun."""
+    from rigd.session import read_session, read_timings
     from rigd.view import draw_session
 
-    try:
-        session, timings = read_session(path), read_timings(path)
-        with progress(path.name) as on_progress, new_rrd_file(out) as stream:
-            draw_session(stream, session, timings, on_progress=on_progress)
-    except (SessionError, RrdFileError) as error:
-        fail(str(error), EXIT_FAILED)
+    session, timings = read_session(path), read_timings(path)
+    with progress(path.name) as on_progress, new_rrd_file(out) as stream:
+        draw_session(stream, session, timings, on_progress=on_progress)
 
 
 def _as_recording(path: Path, scratch: Path) -> Path:
     """Return a file that Rerun's viewer shows in our layout, made in a folder if need be."""
     if path.suffix == SUFFIX:
-        try:
-            check_rrd_file(path)
-        except RrdFileError as error:
-            fail(str(error), EXIT_FAILED)
+        check_rrd_file(path)
         return path
     recording = scratch / f"session{SUFFIX}"
     _convert(path, recording)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from rigd.errors import RigdError
+
 if TYPE_CHECKING:
     from rigd.profile import Profile
 
@@ -20,6 +22,15 @@ def fail(message: str, code: int) -> NoReturn:
     """Tell what is wrong on standard error and leave with an exit code."""
     typer.echo(f"Error: {message}", err=True)
     raise typer.Exit(code)
+
+
+@contextlib.contextmanager
+def errors_told() -> Iterator[None]:
+    """End the command with what an error of the rig says: 2 for wrong use, else 1."""
+    try:
+        yield
+    except RigdError as error:
+        fail(error.told(), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
 
 
 # Progress
@@ -112,10 +123,7 @@ def session_notes(operator: str, specimen: str, note: str) -> dict[str, str]:
 
 
 def profile_named(name: str) -> "Profile":
-    """Load a profile; one that cannot be used ends the command."""
-    from rigd.profile import ProfileError, load_profile
+    """Load a profile: imported only now, because it takes its time."""
+    from rigd.profile import load_profile
 
-    try:
-        return load_profile(name)
-    except ProfileError as error:
-        fail(str(error), EXIT_WRONG_USE)
+    return load_profile(name)

@@ -87,7 +87,7 @@ def copy(
 
     Example: rigd profiles copy sim my_rig
     """
-    from rigd.profile import WORKING_FOLDER, ProfileError, copy_profile, profile_files, user_folder
+    from rigd.profile import WORKING_FOLDER, copy_profile, profile_files, user_folder
 
     profile = profile_named(name)
     folder = WORKING_FOLDER if here else user_folder()
@@ -101,10 +101,7 @@ def copy(
     if Path(stem).name != stem or stem.endswith(".toml"):
         fail(f"{stem}: is a path; a copy has a name only, without .toml.", EXIT_WRONG_USE)
     path = folder / f"{stem}.toml"
-    try:
-        copy_profile(profile, path, new_name)
-    except ProfileError as error:
-        fail(str(error), EXIT_WRONG_USE)
+    copy_profile(profile, path, new_name)
     files = profile_files()[stem]
     place = [file.path.resolve() for file in files].index(path.resolve())
     if place:
@@ -134,19 +131,13 @@ def new(
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
-    from rigd.devices import EdsError, read_eds
-    from rigd.profile import Draft, ProfileError, UnusableDriveError, check_new, write_new
+    from rigd.devices import read_eds
+    from rigd.profile import Draft, check_new, write_new
 
     base = profile_named(start_from)
-    try:
-        check_new(output)
-        draft = Draft(base, read_eds(eds), output)
-        text = _asked(draft) if is_terminal() else draft.text()
-        write_new(output, text)
-    except ProfileError as error:
-        fail(str(error), EXIT_WRONG_USE)
-    except (EdsError, UnusableDriveError) as error:
-        fail(str(error), EXIT_FAILED)
+    check_new(output)
+    draft = Draft(base, read_eds(eds), output)
+    write_new(output, _asked(draft) if is_terminal() else draft.text())
     for doubt in draft.doubts:
         typer.echo(f"Note: {doubt}", err=True)
     missing = draft.unanswered()

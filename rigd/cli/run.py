@@ -16,7 +16,6 @@ import typer
 from rigd.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
-    EXIT_WRONG_USE,
     SESSIONS,
     AsJson,
     Fast,
@@ -113,7 +112,7 @@ def run_sessions(
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note)
     stop, crew = start_crew(live=live)
-    from rigd.runner import ForegroundError, excitation_for, run_in_foreground
+    from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore
 
     try:
@@ -132,10 +131,10 @@ def run_sessions(
             quiet_stdout=as_json,
             hardware=hardware,
         )
-    except ForegroundError as error:
-        if as_json and not error.wrong_use:
+    except SeriesFailedError as error:
+        if as_json:
             _write_json(error.results)
-        fail(str(error), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
+        raise
     finally:
         ignore()  # nothing is left to stop, and an impatient Ctrl-C must not change the exit code
     if as_json:

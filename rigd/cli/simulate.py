@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, ProfileName, fail, profile_named
+from rigd.cli.options import ProfileName, profile_named
 
 
 def simulate(
@@ -42,24 +42,17 @@ def simulate(
 
     Example: rigd simulate --profile antenna_can --fault drop,from=drive,frames=3@10
     """
-    from rigd.devices import DeviceError
     from rigd.devices import simulator as simulator_of
 
     simulator = simulator_of()
-    try:
-        options = simulator.SimulatorOptions(
-            lock_step=lock_step,
-            log=log,
-            faults=tuple(simulator.parse_fault(spec) for spec in fault or ()),
-            quiet=quiet,
-            eds=eds,
-        )
-        code = simulator.run_simulator(profile_named(profile).rig, options)
-    except simulator.WrongUseError as error:
-        fail(str(error), EXIT_WRONG_USE)
-    except DeviceError as error:
-        fail(str(error), EXIT_FAILED)
-    raise typer.Exit(code)
+    options = simulator.SimulatorOptions(
+        lock_step=lock_step,
+        log=log,
+        faults=tuple(simulator.parse_fault(spec) for spec in fault or ()),
+        quiet=quiet,
+        eds=eds,
+    )
+    raise typer.Exit(simulator.run_simulator(profile_named(profile).rig, options))
 
 
 def inject(
@@ -97,16 +90,9 @@ def inject(
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
     """  # noqa: D301 - the mark that keeps lines apart is no raw text
-    from rigd.devices import DeviceError
     from rigd.devices import simulator as simulator_of
 
     simulator = simulator_of()
-    try:
-        rig = profile_named(profile).rig
-        simulator.check_on_wire(rig)
-        lines = simulator.inject(rig.name, fault or [])
-    except simulator.WrongUseError as error:
-        fail(str(error), EXIT_WRONG_USE)
-    except DeviceError as error:
-        fail(str(error), EXIT_FAILED)
-    typer.echo("\n".join(lines))
+    rig = profile_named(profile).rig
+    simulator.check_on_wire(rig)
+    typer.echo("\n".join(simulator.inject(rig.name, fault or [])))

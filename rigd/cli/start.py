@@ -59,7 +59,6 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.engine import ChildError
     from rigd.runner import Crew
     from rigd.runtime import StopRequest
 
@@ -73,8 +72,6 @@ def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
             "of open files (ulimit -n) and of shared memory (/dev/shm).",
             EXIT_FAILED,
         )
-    except ChildError as error:
-        fail(str(error), EXIT_FAILED)
 
 
 def start_sessions(
@@ -158,109 +155,50 @@ def _follow(
     client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool
 ) -> dict[str, Any]:
     """Show the progress of a series to its end, and return what the daemon says of it."""
+    from rigd.engine import Phase
+    from rigd.runner import ProgressLine, result_line
+
     asked = False
-    with _ProgressView() as view:
+    line = ProgressLine()
+    try:
         while True:
             if interrupts.count and not asked:
                 asked = True
                 client.send("stop")
-                view.say("Stopping; Ctrl-C again leaves the rest to the daemon.")
+                line.say("Stopping; Ctrl-C again leaves the rest to the daemon.")
             if interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
-            event = client.event(_POLL_S)
-            kind = None if event is None else event.get("event")
-            if event is None:
-                continue
-            if kind == "progress":
-                view.update(event)
-            elif kind == "message" and event["level"] != "info":
-                view.say(f"{event['level'].capitalize()}: {event['text']}")
-            elif kind == "message" and event["text"].startswith("Live view"):
-                view.say(event["text"])
-            elif kind == "session":
-                view.say(_result_text(event))
-                if not as_json and event["path"] is not None:
-                    view.pause()
-                    typer.echo(event["path"])
-            elif kind == "series" and event["series"] == number:
-                return event
+            event = client.event(_POLL_S) or {}
+            match event.get("event"):
+                case "progress":
+                    line.update(
+                        Phase[event["phase"].upper()],
+                        event["tick"],
+                        event["total"],
+                        missed=event["missed"],
+                        late=event["late"],
+                        number=f"{event['session']}/{event['repeat']}"
+                        if event["repeat"] > 1
+                        else "",
+                    )
+                case "message" if event["level"] != "info":
+                    line.say(f"{event['level'].capitalize()}: {event['text']}")
+                case "message" if event["text"].startswith("Live view"):
+                    line.say(event["text"])
+                case "session":
+                    line.say(result_line(event))
+                    line.close()  # standard output may be the same terminal
+                    if not as_json and event["path"] is not None:
+                        typer.echo(event["path"])
+                    line = ProgressLine()
+                case "series" if event["series"] == number:
+                    return event
+    finally:
+        line.close()
 
 
 def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:
-    typer.echo(
-        f"{plan['record_s']:g} s of record. Predicted peaks: angle {plan['peak_angle_rad']:.3g} "
-        f"rad, speed {plan['peak_velocity_rad_s']:.3g} rad/s, torque "
-        f"{plan['peak_torque_nm']:.3g} N·m.",
-        err=err,
-    )
-    # A daemon of before an update tells none; to fail here would leave its session without Ctrl-C.
-    if words := plan.get("tip_in_words"):
-        typer.echo(words, err=err)
-    for warning in plan["warnings"]:
-        typer.echo(f"Warning: {warning}", err=err)
+    from rigd.runner import plan_lines
 
-
-def _result_text(session: dict[str, Any]) -> str:
-    reason = f" {session['reason']}" if session["reason"] else ""
-    if session["part"] is not None:
-        return f"{session['outcome']}: no whole record, but {session['part']}.{reason}"
-    if session["path"] is None:
-        return f"{session['outcome']}: no record.{reason}"
-    return (
-        f"{session['outcome']}: {session['scheduled']} ticks scheduled = {session['recorded']} "
-        f"recorded + {session['missed']} missed + {session['lost']} lost; "
-        f"{session['late']} late; {session['stale_angles']} stale angles, "
-        f"{session['stale_wrenches']} stale wrenches.{reason}"
-    )
-
-
-class _ProgressView:
-    """One line on standard error that says how far the session is."""
-
-    def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:3.0f} %"),
-            TextColumn("{task.fields[more]}"),
-            console=Console(stderr=True),
-            transient=True,
-            auto_refresh=False,
-        )
-        self._task = self._progress.add_task("preparing", total=None, more="")
-
-    def __enter__(self) -> "_ProgressView":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def update(self, progress: dict[str, Any]) -> None:
-        """Show where the session is."""
-        from rigd.engine import Phase
-
-        number = f" {progress['session']}/{progress['repeat']}" if progress["repeat"] > 1 else ""
-        left = progress["time_left_s"]
-        more = "" if left is None else f"{left:.0f} s left"
-        if progress["missed"]:
-            more += f"; {progress['missed']} missed, {progress['late']} late"
-        self._progress.update(
-            self._task,
-            description=Phase[progress["phase"].upper()].words + number,
-            completed=progress["tick"],
-            total=progress["total"],
-            more=more,
-        )
-        self._progress.refresh()
-
-    def say(self, text: str) -> None:
-        """Write a line above it."""
-        self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-    def pause(self) -> None:
-        """Leave the line to standard output for a moment."""
-        self._progress.refresh()
+    for line in plan_lines(plan):
+        typer.echo(line, err=err)

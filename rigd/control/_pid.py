@@ -15,8 +15,10 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+from rigd.errors import UserError
 
-class ControlDesignError(ValueError):
+
+class ControlDesignError(UserError, ValueError):
     """The controller asked for cannot be designed, or its closed loop is unstable."""
 
 

@@ -6,31 +6,28 @@ import os
 import socket
 import stat
 import struct
-from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
-from rigd.runtime import runtime_folder
+from rigd.errors import FailureError, UserError
+from rigd.runtime import address_files, answers, file_name, runtime_folder
 
 COMMON = Path("/run/rigd")
 """Folder of daemons that a group may use: a user's own runtime folder is closed to others."""
 _SUFFIX = ".daemon"
-_PROBE_S = 1.0
 _CREDENTIALS = struct.Struct("3i")
 
 
-class AddressError(Exception):
+class AddressError(FailureError):
     """There can be no socket, or no daemon is found; the message is for the operator."""
 
 
-class UnknownGroupError(AddressError):
+class UnknownGroupError(UserError):
     """There is no group of that name."""
 
 
 def socket_path(rig: str, folder: Path | None = None) -> Path:
     """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise."""
-    plain = "".join(c if c.isalnum() else "-" for c in rig).strip("-")
-    return (folder or runtime_folder()) / f"{plain}{_SUFFIX}"
+    return (folder or runtime_folder()) / f"{file_name(rig)}{_SUFFIX}"
 
 
 def peer_of(link: socket.socket) -> tuple[int, int]:
@@ -89,22 +86,10 @@ def bind(path: Path, group: str | None) -> socket.socket:
     return listener
 
 
-def answers(path: Path) -> bool:
-    """Whether a daemon listens there: what a dead one left does not."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(_PROBE_S)
-        try:
-            probe.connect(os.fspath(path))
-        except (BlockingIOError, TimeoutError):
-            return True  # its queue is full
-        except OSError:
-            return False
-    return True
-
-
 def running() -> list[Path]:
     """Return the sockets of all daemons that this user can reach."""
-    return sorted(path for path in _sockets() if answers(path))
+    sockets = address_files(f"*{_SUFFIX}", runtime_folder(), COMMON)
+    return [path for path in sockets if answers(path)]
 
 
 def find(rig: str | None) -> Path:
@@ -130,12 +115,6 @@ def find(rig: str | None) -> Path:
         rigs = ", ".join(path.name.removesuffix(_SUFFIX) for path in found)
         raise AddressError(f"Several daemons are running ({rigs}); name one with --profile.")
     return found[0]
-
-
-def _sockets() -> Iterator[Path]:
-    for folder in (runtime_folder(), COMMON):
-        with suppress(OSError):
-            yield from folder.glob(f"*{_SUFFIX}")
 
 
 def _group_number(group: str) -> int:

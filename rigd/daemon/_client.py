@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from rigd.daemon._address import peer_of, running
+from rigd.errors import FailureError, RigdError
 from rigd.live import LiveAddress
 from rigd.live import running as running_views
 
@@ -44,7 +45,7 @@ _UNKNOWN = (
 # Connection
 
 
-class DaemonGoneError(Exception):
+class DaemonGoneError(FailureError):
     """The daemon cannot be reached, or is gone; the message is for the operator.
 
     Parameters
@@ -59,12 +60,12 @@ class DaemonGoneError(Exception):
         super().__init__(message)
         self._lost = lost
 
-    def after_looking(self) -> str:
+    def told(self) -> str:
         """Say what there still is of a daemon that was lost, which takes up to 3 s to see."""
         return str(self) if self._lost is None else what_is_left(*self._lost)
 
 
-class RefusedByDaemonError(Exception):
+class RefusedByDaemonError(RigdError):
     """The daemon refuses a request, or it failed; the message is the daemon's."""
 
     def __init__(self, message: str, *, wrong_use: bool) -> None:
@@ -461,5 +462,5 @@ def _status(path: Path) -> dict[str, Any] | None:
     try:
         with Client(path) as client:
             return client.ask("status")
-    except (DaemonGoneError, RefusedByDaemonError):
+    except RigdError:
         return None

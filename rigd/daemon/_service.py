@@ -16,8 +16,6 @@ from math import inf
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from rigd.beam import RealisationError
-from rigd.control import ControlDesignError
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._log import NAME
 from rigd.daemon._states import (
@@ -29,31 +27,24 @@ from rigd.daemon._states import (
     daemon_document,
     histories,
     peer_document,
-    plan_document,
     progress_document,
     rig_document,
     transition_document,
 )
 from rigd.devices import Reality, what_moves
 from rigd.engine import Event
-from rigd.excitation import Excitation, ExcitationError
+from rigd.errors import RigdError, UserError
 from rigd.profile import Profile
 from rigd.runner import (
     NoRoomError,
-    Order,
-    Plan,
-    RefusedError,
     RigError,
     RigStatus,
+    Series,
     SessionFailedError,
     SessionProgress,
     SessionResult,
-    Watcher,
-    always,
-    choose_path,
+    SessionRig,
     excitation_for,
-    make_room,
-    plan_session,
     what_is_kept,
 )
 from rigd.runtime import StopRequest
@@ -80,7 +71,7 @@ T = TypeVar("T")
 _log = logging.getLogger(NAME)
 
 
-class RigControl(Protocol):
+class RigControl(SessionRig, Protocol):
     """Part of :class:`rigd.runner.Rig` that the daemon uses."""
 
     connected: bool
@@ -88,18 +79,6 @@ class RigControl(Protocol):
 
     def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
         """Connect the devices."""
-
-    def run(
-        self,
-        order: Order,
-        stop: StopRequest,
-        watcher: Watcher,
-        listens: Callable[[], bool] = always,
-    ) -> SessionResult:
-        """Run one session."""
-
-    def show(self, order: Order, stop: StopRequest) -> str:
-        """Start its live view."""
 
     def tare(self) -> dict[str, Any]:
         """Average the sensor at rest."""
@@ -117,7 +96,7 @@ class RigControl(Protocol):
         """Close everything."""
 
 
-class CommandError(Exception):
+class CommandError(RigdError):
     """A request is refused, or failed; the message is for the operator."""
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:
@@ -127,17 +106,18 @@ class CommandError(Exception):
 
 
 @dataclass(slots=True)
-class Series:
-    """Sessions that one request asked for."""
+class ServedSeries:
+    """Sessions that one request asked for, and how far they came."""
 
     number: int
     request: protocol.Start
     stop: StopRequest = field(default_factory=StopRequest)
-    ticks: int = 0
+    planned: Series | None = None
     session: int = 0
     """The one that is run, from 1 on."""
     path: Path | None = None
     results: list[SessionResult] = field(default_factory=list)
+    """Also of one that failed."""
     reason: str = ""
     """Why it ended before its time."""
     running: bool = False
@@ -213,7 +193,7 @@ class Service:
         """Why it went into fault last, but for what failed in resetting it."""
         self._doing = ""
         self._closing = False
-        self._series: Series | None = None
+        self._series: ServedSeries | None = None
         self._task: asyncio.Task[None] | None = None
         self._count = 0
         self._listened_s = inf
@@ -381,10 +361,10 @@ class Service:
             )
         self._count += 1
         last = self._series
-        series = self._series = Series(self._count, request, running=True)
+        series = self._series = ServedSeries(self._count, request, running=True)
         self._doing = "planning"
         try:
-            excitation, plan = await self._call(partial(self._plan, request))
+            planned = await self._call(partial(self._plan, request))
             if series.stop.requested or self._closing:
                 raise CommandError("It was stopped before it began.")
             refusal = self._states.refusal("start")
@@ -395,14 +375,13 @@ class Service:
             raise
         finally:
             self._doing = ""
-        for warning in plan.warnings:
+        for warning in planned.plan.warnings:
             _log.warning("series %d: %s", series.number, warning)
-        series.ticks = excitation.reference_rad.size
+        series.planned = planned
         times = f", {request.repeat} sessions" if request.repeat > 1 else ""
         self._states.move(State.RUNNING, f"{request.excitation} was started{times}")
-        self._task = asyncio.create_task(self._follow(series, excitation))
-        plan_told = plan_document(plan, series.ticks / self._profile.rig.rate_hz)
-        return {"series": series.number, "plan": plan_told}
+        self._task = asyncio.create_task(self._follow(series, planned))
+        return {"series": series.number, "plan": planned.plan_document()}
 
     async def _measure(self, name: str, measure: Callable[[], Document]) -> Document:
         self._check(name)
@@ -470,30 +449,34 @@ class Service:
 
     # Series
 
-    def _plan(self, request: protocol.Start) -> tuple[Excitation, Plan]:
+    def _plan(self, request: protocol.Start) -> Series:
         """Make the excitation and see that it may be run; in the second thread."""
         profile = self._profile
         try:
-            excitation = excitation_for(profile, request.excitation, request.parameters)
-            plan = plan_session(profile, excitation, force=request.force)
-            make_room(self._folder, excitation, profile.limits)
-        except NoRoomError as error:
+            return Series(
+                profile,
+                excitation_for(profile, request.excitation, request.parameters),
+                self._folder,
+                repeat=request.repeat,
+                notes={str(name): text for name, text in request.notes.items()},
+                force=request.force,
+            )
+        except NoRoomError as error:  # the same request may succeed later
             raise CommandError(str(error)) from error
-        except (ExcitationError, RefusedError, ControlDesignError, RealisationError) as error:
-            raise CommandError(str(error), wrong_use=True) from error
+        except RigdError as error:
+            raise CommandError(str(error), wrong_use=error.wrong_use) from error
         except MemoryError:
             raise CommandError("There is not enough memory to plan such a session.") from None
-        return excitation, plan
 
-    async def _follow(self, series: Series, excitation: Excitation) -> None:
+    async def _follow(self, series: ServedSeries, planned: Series) -> None:
         """Run a series to its end, whatever that is."""
         fault = ""
         loop = asyncio.get_running_loop()
         try:
-            await self._call(partial(self._run_series, series, excitation, loop))
-        except (RefusedError, RigError, SessionFailedError) as error:
+            await self._call(partial(self._run_series, series, planned, loop))
+        except (UserError, RigError, SessionFailedError) as error:
             series.reason = str(error)
-            if not isinstance(error, RefusedError):
+            if not error.wrong_use:
                 path = error.path if isinstance(error, SessionFailedError) else None
                 fault = series.reason = f"{error} {what_is_kept(path)}"
         except Exception as error:
@@ -522,46 +505,19 @@ class Service:
             _log.exception("the rig could not be let go")
 
     def _run_series(
-        self, series: Series, excitation: Excitation, loop: asyncio.AbstractEventLoop
+        self, series: ServedSeries, planned: Series, loop: asyncio.AbstractEventLoop
     ) -> None:
         """Run the sessions one after the other; in the second thread."""
 
         def publish(event: Document) -> None:
             loop.call_soon_threadsafe(self._publish, event)
 
-        def tell(level: str, text: str) -> None:
-            _log.log(_LOGGED[level], "series %d: %s", series.number, text)
-            publish({"event": "message", "level": level, "text": text})
-
-        def watcher(_: SessionProgress, events: list[Event]) -> None:
-            for event in events:
-                if event.level in _LOGGED:
-                    tell(event.level, event.message)
-
-        request = series.request
-        for number in range(1, request.repeat + 1):
-            if series.stop.requested:
-                return
-            if not self._listens():
-                raise RigError("The daemon hears nobody: no further session is begun.")
-            make_room(self._folder, excitation, self._profile.limits)
-            numbered = number if request.repeat > 1 else None
-            path = choose_path(self._folder, excitation.kind, numbered)
-            notes = {str(name): text for name, text in request.notes.items() if text}
-            if request.repeat > 1:
-                notes["series"] = f"{number} of {request.repeat}"
-            series.session, series.path = number, path
-            order = Order(self._profile, excitation, path, tuple(notes.items()))
-            if self._live:
-                tell("info", self._rig.show(order, series.stop))
-            try:
-                result = self._rig.run(order, series.stop, watcher, self._listens)
-            except SessionFailedError as error:
-                _note_end(series, error.result(), publish)
-                raise
-            _note_end(series, result, publish)
-            if not result.went_well:
-                return
+        told = _Told(series, publish, self._listens)
+        try:
+            planned.run(self._rig, series.stop, told, live=self._live, listens=self._listens)
+        except SessionFailedError as error:
+            told.ended(error.result())
+            raise
 
     def _listens(self) -> bool:
         """Whether somebody who asks for a stop is heard; asked from the second thread.
@@ -574,10 +530,10 @@ class Service:
 
     def _progress(self) -> Document | None:
         series, look = self._series, self._look
-        if series is None or not series.running or not series.ticks or look is None:
+        if series is None or not series.running or series.planned is None or look is None:
             return None
         rate_hz = None if self._fast else self._profile.rig.rate_hz
-        document = progress_document(look, series.ticks, rate_hz)
+        document = progress_document(look, series.planned.ticks, rate_hz)
         return {"session": series.session, "repeat": series.request.repeat, **document}
 
     def _rates(self) -> dict[str, float | None]:
@@ -603,34 +559,59 @@ class Service:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
 
 
-def _note_end(series: Series, result: SessionResult, publish: Publish) -> None:
-    """Keep, log and tell how a session ended."""
-    series.results.append(result)
-    counts = {
-        "ticks scheduled": result.scheduled,
-        "recorded": result.recorded,
-        "missed": result.missed,
-        "late": result.late,
-        "lost": result.lost,
-        "stale angles": result.stale_angles,
-        "stale wrenches": result.stale_wrenches,
-        "not shown live": result.live_dropped,
-    }
-    _log.log(
-        logging.INFO if result.went_well else logging.WARNING,
-        "series %d: session %d of %d: %s, %s: %s%s",
-        series.number,
-        series.session,
-        series.request.repeat,
-        result.path or result.part or "no file",
-        result.outcome,
-        ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
-        f": {result.reason}" if result.reason else "",
-    )
-    publish({"event": "session", "number": series.session, **result.as_dict()})
+class _Told:
+    """Notes, logs and publishes what becomes of a series; called in the second thread."""
+
+    def __init__(self, series: ServedSeries, publish: Publish, listens: Callable[[], bool]) -> None:
+        self._series = series
+        self._publish = publish
+        self._listens = listens
+
+    def begins(self, number: int, path: Path) -> None:
+        if not self._listens():
+            raise RigError("The daemon hears nobody: no further session is begun.")
+        self._series.session, self._series.path = number, path
+
+    def shown(self, where: str) -> None:
+        self._tell("info", where)
+
+    def update(self, progress: SessionProgress, events: list[Event]) -> None:  # noqa: ARG002
+        for event in events:
+            if event.level in _LOGGED:
+                self._tell(event.level, event.message)
+
+    def ended(self, result: SessionResult) -> None:
+        series = self._series
+        series.results.append(result)
+        counts = {
+            "ticks scheduled": result.scheduled,
+            "recorded": result.recorded,
+            "missed": result.missed,
+            "late": result.late,
+            "lost": result.lost,
+            "stale angles": result.stale_angles,
+            "stale wrenches": result.stale_wrenches,
+            "not shown live": result.live_dropped,
+        }
+        _log.log(
+            logging.INFO if result.went_well else logging.WARNING,
+            "series %d: session %d of %d: %s, %s: %s%s",
+            series.number,
+            series.session,
+            series.request.repeat,
+            result.path or result.part or "no file",
+            result.outcome,
+            ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
+            f": {result.reason}" if result.reason else "",
+        )
+        self._publish({"event": "session", "number": series.session, **result.as_dict()})
+
+    def _tell(self, level: str, text: str) -> None:
+        _log.log(_LOGGED[level], "series %d: %s", self._series.number, text)
+        self._publish({"event": "message", "level": level, "text": text})
 
 
-def _after(series: Series, fault: str) -> tuple[State, str]:
+def _after(series: ServedSeries, fault: str) -> tuple[State, str]:
     if fault:
         return State.FAULT, fault
     if series.stop.requested:

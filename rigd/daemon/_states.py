@@ -13,7 +13,7 @@ from typing import Any
 
 from rigd.engine import PROCESSES, Phase
 from rigd.live import LiveAddress
-from rigd.runner import Plan, ProcessStatus, RigStatus
+from rigd.runner import ProcessStatus, RigStatus
 
 _REMEMBERED = 50
 
@@ -177,16 +177,6 @@ class Peer:
 def peer_document(peer: Peer | None) -> Document | None:
     """Tell who controls."""
     return None if peer is None else {"pid": peer.pid, "uid": peer.uid, "user": peer.user}
-
-
-def plan_document(plan: Plan, record_s: float) -> Document:
-    """Tell what a session is predicted to do."""
-    return {
-        "record_s": record_s,
-        **asdict(plan.prediction),
-        "tip_in_words": plan.tip_in_words,
-        "warnings": list(plan.warnings),
-    }
 
 
 def transition_document(transition: Transition) -> Document:

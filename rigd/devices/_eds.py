@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rigd.errors import FailureError
 from rigd.printable import printable
 
 MAX_BYTES: Final = 4_000_000
@@ -48,7 +49,7 @@ Sections = dict[str, dict[str, str]]
 """Keys and values of a file, by the names of its sections; both in lower case."""
 
 
-class EdsError(ValueError):
+class EdsError(FailureError, ValueError):
     """A file cannot be used as an EDS; the message is one sentence that names it."""
 
 

@@ -10,6 +10,7 @@ from typing import cast
 from rigd.devices._simulator import differences, find_simulator
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import RigParameters, Selection
+from rigd.errors import UserError
 
 # Drive and sensor share a plant or a bus, so drivers are opened by the pair.
 _OPENERS = {
@@ -19,7 +20,7 @@ _OPENERS = {
 }
 
 
-class UnknownDeviceError(ValueError):
+class UnknownDeviceError(UserError, ValueError):
     """A profile names drivers that do not exist or do not belong together."""
 
 

@@ -5,15 +5,14 @@ looks here first, so that a motor never moves where a simulation was meant.
 """
 
 import json
-import os
 import re
-import socket
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigd.runtime import runtime_folder
+from rigd.runtime import announce as write_address
+from rigd.runtime import answers, read_address, runtime_folder
 
 if TYPE_CHECKING:  # numpy, which it brings, takes longer than a stop may
     from rigd.devices.parameters import RigParameters
@@ -59,10 +58,7 @@ def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
 def announce(rig_name: str, address: SimulatorAddress) -> Path:
     """Write down where the simulator of a rig is, until `forget`; return the file."""
     path = _address_file(rig_name)
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    fresh = path.with_suffix(f".{os.getpid()}")
-    fresh.write_text(json.dumps(asdict(address)), encoding="utf-8")
-    fresh.replace(path)
+    write_address(path, asdict(address))
     return path
 
 
@@ -74,18 +70,11 @@ def forget(rig_name: str) -> None:
 def find_simulator(rig_name: str) -> SimulatorAddress | None:
     """Return the running simulator of a rig, or None; what a dead one left is not one."""
     try:
-        address = SimulatorAddress(**json.loads(_address_file(rig_name).read_text("utf-8")))
-    except (OSError, ValueError, TypeError):
+        address = SimulatorAddress(**read_address(_address_file(rig_name)))
+    except TypeError:  # it has other members
         return None
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(1.0)
-        try:
-            probe.connect(address.control_socket)
-        except (BlockingIOError, TimeoutError):
-            pass  # it listens, only its queue is full: alive
-        except (OSError, TypeError, ValueError):
-            return None
-    return address
+    found = isinstance(address.control_socket, str) and answers(address.control_socket)
+    return address if found else None
 
 
 def unreachable_simulators(rig_name: str) -> list[Path]:

@@ -15,11 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from rigd.errors import FailureError
+
 Wrench = tuple[float, float, float, float, float, float]
 """fx, fy, fz in N and tx, ty, tz in N·m, in the sensor's frame, as read (not tared)."""
 
 
-class DeviceError(Exception):
+class DeviceError(FailureError):
     """A device did not do what it was asked: the message names device, expectation and reply."""
 
 

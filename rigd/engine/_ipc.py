@@ -1,20 +1,16 @@
-"""The processes of a rig: their table, how they are started, and the messages to and from them.
+"""The processes of a rig: their table, how they are started, and both ends of their pipes.
 
 One table, `PROCESSES`, says how each process is started, watched, and ended. Every process counts
 up its word on the `Board` several times a second. A dead process is noticed at once, a hung one by
 its heartbeat; the table says what happens then.
 
-A child is ``python -m MODULE``. Its standard input brings its job and then messages, a JSON line
-each; a line that announces a pickled object is followed by its bytes. The end of standard input
-means that the supervisor is gone. Its standard output brings JSON lines, few and short, so that
-they fit into a pipe's buffer and no child ever waits for its supervisor.
+A child is ``python -m MODULE``. Its standard input brings its job and then messages; the end of it
+means that the supervisor is gone. Its standard output brings its answers (`_messages`).
 """
 
 import contextlib
 import ctypes
-import json
 import os
-import pickle
 import select
 import signal
 import subprocess
@@ -24,7 +20,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rigd.engine._messages import MessageReader, encode, is_ready
 from rigd.engine._shared_state import Word
+from rigd.errors import FailureError
 from rigd.runtime import SINGLE_THREADED, held_back
 
 _WRITE_PATIENCE_S = 5.0
@@ -33,12 +31,10 @@ _KILLED_GRACE_S = 2.0
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-# Messages
-
-Message = dict[str, Any]
+# Both ends
 
 
-class ChildError(Exception):
+class ChildError(FailureError):
     """A child process ended, or answered something else than it was asked."""
 
 
@@ -85,25 +81,21 @@ class Child:
             with contextlib.suppress(OSError):  # it has ended already: poll() tells
                 os.sched_setaffinity(self._process.pid, cores)
         os.set_blocking(self._stdin_fd, False)
-        self._lines = LineReader(self._stdout_fd)
+        self._messages = MessageReader(self._stdout_fd)
 
     def start(self, job: object) -> None:
-        """Hand over its job.
+        """Hand over its job: the first message."""
+        self.send(job)
+
+    def send(self, message: object) -> None:
+        """Send one message; a child that is gone is noticed when it is next listened to.
 
         Raises
         ------
         ChildError
-            If it does not take it.
+            If it does not take it in time.
         """
-        self.send_object("job", job)
-
-    def send(self, **message: object) -> None:
-        """Send one message; a child that is gone is noticed when it is next listened to."""
-        self._write(json.dumps(message).encode() + b"\n")
-
-    def send_object(self, name: str, value: object) -> None:
-        """Send a message ``{name: value}`` whose value is no JSON."""
-        self._write(packed_object(name, value))
+        self._write(encode(message))
 
     @property
     def pid(self) -> int:
@@ -115,7 +107,7 @@ class Child:
         """Whether it has not ended."""
         return self._process.poll() is None
 
-    def poll(self, timeout_s: float) -> Message | None:
+    def poll(self, timeout_s: float) -> object | None:
         """Return its next message, or None if none comes in time.
 
         Raises
@@ -124,7 +116,7 @@ class Child:
             If the child has ended.
         """
         try:
-            return self._lines.next(timeout_s)
+            return self._messages.next(timeout_s)
         except EOFError:
             code = self._process.wait()
             how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
@@ -162,7 +154,7 @@ class Child:
         """Wait until its output ends, which is noticed at once; waiting for a process polls."""
         deadline = time.monotonic() + patience_s
         while (left_s := deadline - time.monotonic()) > 0:
-            if _is_ready(self._stdout_fd, select.POLLIN, left_s) and not os.read(
+            if is_ready(self._stdout_fd, select.POLLIN, left_s) and not os.read(
                 self._stdout_fd, 65536
             ):
                 return True
@@ -183,70 +175,12 @@ class Child:
         deadline = time.monotonic() + _WRITE_PATIENCE_S
         while rest:
             patience_s = max(0.0, deadline - time.monotonic())
-            if not _is_ready(self._stdin_fd, select.POLLOUT, patience_s):
+            if not is_ready(self._stdin_fd, select.POLLOUT, patience_s):
                 raise ChildError(f"The {self.name} process does not listen.")
             try:
                 rest = rest[os.write(self._stdin_fd, rest) :]
             except BrokenPipeError:
                 return  # poll() tells how it ended
-
-
-def packed_object(name: str, value: object) -> bytes:
-    """Return the bytes of a message ``{name: value}`` whose value is no JSON."""
-    data = pickle.dumps(value)
-    return json.dumps({"pickled": name, "size": len(data)}).encode() + b"\n" + data
-
-
-class LineReader:
-    """JSON lines from a descriptor, without ever blocking longer than asked."""
-
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
-        self._pending = b""
-
-    def next(self, timeout_s: float | None) -> Message | None:
-        """Return the next message, or None if none is complete in time (None: wait for ever).
-
-        Raises
-        ------
-        EOFError
-            If the other end is gone and nothing is left to read.
-        """
-        while b"\n" not in self._pending:
-            if not _is_ready(self._fd, select.POLLIN, timeout_s):
-                return None
-            data = os.read(self._fd, 65536)
-            if not data:
-                raise EOFError
-            self._pending += data
-        line, self._pending = self._pending.split(b"\n", 1)
-        message: Message = json.loads(line)
-        return message
-
-    def exactly(self, size: int) -> bytes:
-        """Wait for the bytes that a message announced.
-
-        Raises
-        ------
-        EOFError
-            If the other end is gone before they are there.
-        """
-        pieces, left = [self._pending[:size]], size - len(self._pending)
-        self._pending = self._pending[size:]
-        while left > 0:
-            data = os.read(self._fd, left)
-            if not data:
-                raise EOFError
-            pieces.append(data)
-            left -= len(data)
-        return b"".join(pieces)
-
-
-def _is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
-    waiting = select.poll()
-    waiting.register(fd, event)
-    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))
 
 
 class Parent:
@@ -256,38 +190,31 @@ class Parent:
     """
 
     def __init__(self) -> None:
-        # Read without a buffer: what follows the job must stay in the pipe for select to see it.
-        self._fd = sys.stdin.fileno()
-        self._lines = LineReader(self._fd)
+        self._messages = MessageReader(sys.stdin.fileno())
         self._pid = int(sys.argv[1])
         _go_on_when_orphaned()
 
     def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
         """Wait for the job; ends the process quietly if the supervisor ends without one."""
         try:
-            message = self.poll(None)
+            return self.poll(None)
         except EOFError:
             sys.exit(0)
-        assert message is not None
-        return message["job"]
 
-    def poll(self, timeout_s: float | None) -> Message | None:
-        """Return the next message, or None if none begins in time (None: wait for ever).
+    def poll(self, timeout_s: float | None) -> object | None:
+        """Return the next message, or None if none comes in time (None: wait for ever).
 
         Raises
         ------
         EOFError
             If the supervisor is gone.
         """
-        message = self._lines.next(timeout_s)
-        if message is not None and "pickled" in message:
-            return {message["pickled"]: pickle.loads(self._lines.exactly(message["size"]))}
-        return message
+        return self._messages.next(timeout_s)
 
-    def send(self, **message: object) -> None:
+    def send(self, message: object) -> None:
         """Send one short message; nobody may be left to hear it."""
         with contextlib.suppress(BrokenPipeError):
-            os.write(sys.stdout.fileno(), json.dumps(message).encode() + b"\n")
+            os.write(sys.stdout.fileno(), encode(message))
 
     def alive(self) -> bool:
         """Whether the supervisor still runs; cheap enough for the loop."""

@@ -22,8 +22,19 @@ from rigd.engine._cycle import (
     recalled_heat_nm2,
     remember_heat,
 )
-from rigd.engine._ipc import Message, Parent
-from rigd.engine._jobs import ControlJob, SessionJob
+from rigd.engine._ipc import Parent
+from rigd.engine._messages import (
+    Connected,
+    ControlJob,
+    Ended,
+    Finished,
+    Measured,
+    Ready,
+    Refused,
+    SessionJob,
+    Tare,
+    Zero,
+)
 from rigd.engine._publish import Display
 from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine._ring import map_reference
@@ -59,7 +70,7 @@ def main() -> None:
     try:
         devices = open_devices(job.profile.rig, job.moving)
     except DeviceError as error:
-        parent.send(ended=str(error))
+        parent.send(Ended(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
     attend(job.profile, devices, clock, channels, parent, stop, obtained)
@@ -97,11 +108,12 @@ def attend(
         channels.board[Word.PHASE] = Phase.OFF
         attendance.take_up_standstill()
         parent.send(
-            connected=True,
-            calibration=devices.sensor.calibration(),
-            drive=drive.statement() if isinstance(drive, StatedDrive) else {},
-            realtime=obtained,
-            simulated=devices.simulated,
+            Connected(
+                calibration=devices.sensor.calibration(),
+                drive=drive.statement() if isinstance(drive, StatedDrive) else {},
+                realtime=obtained,
+                simulated=devices.simulated,
+            )
         )
         attendance.serve()
     except (DeviceError, OSError) as error:
@@ -111,7 +123,7 @@ def attend(
         channels.board[Word.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    parent.send(ended=f"{failure} {devices.drive.off_doubt}".strip())
+    parent.send(Ended(f"{failure} {devices.drive.off_doubt}".strip()))
 
 
 class _Attendance:
@@ -172,20 +184,21 @@ class _Attendance:
         DeviceError, OSError
             If a device failed.
         """
-        while (message := self._await_order()) is not None:
-            if "session" in message:
-                try:
-                    self._run_session(message["session"])
-                finally:
-                    self.remember()
-                self.take_up_standstill()
-                gc.collect()  # the torque is off: the only time for it
-            elif "tare" in message:
-                self._answer(self._tare)
-            elif "zero" in message:
-                self._answer(self._zero)
+        while (order := self._await_order()) is not None:
+            match order:
+                case SessionJob():
+                    try:
+                        self._run_session(order)
+                    finally:
+                        self.remember()
+                    self.take_up_standstill()
+                    gc.collect()  # the torque is off: the only time for it
+                case Tare():
+                    self._answer(self._tare)
+                case Zero():
+                    self._answer(self._zero)
 
-    def _await_order(self) -> Message | None:
+    def _await_order(self) -> object | None:
         """Observe with the torque off until there is something to do; None: nothing any more.
 
         Virtual time stands still meanwhile, but for a tick now and then where there are lines: at
@@ -265,7 +278,7 @@ class _Attendance:
             tare = procedure.tare()
             devices.drive.enable(procedure.stop_asked)
             procedure.hold()
-            self._parent.send(ready=tare)
+            self._parent.send(Ready(tare))
             procedure.wait_for_go()
             procedure.record()
             recorded = True
@@ -289,12 +302,14 @@ class _Attendance:
             # What happens after the last tick does not make the record any less complete.
             outcome, reason = "complete", f"After the record: {reason}"
         self._parent.send(
-            finished=outcome,
-            reason=reason,
-            fault=fault,
-            counts=asdict(procedure.counts),
-            results=procedure.results,
-            device_failed=device_failed,
+            Finished(
+                outcome=outcome,
+                reason=reason,
+                fault=fault,
+                counts=asdict(procedure.counts),
+                results=procedure.results,
+                device_failed=device_failed,
+            )
         )
         if device_failed:
             raise DeviceError(failure)
@@ -302,9 +317,9 @@ class _Attendance:
     def _answer(self, measure: Callable[[], dict[str, object]]) -> None:
         """Do something at rest and tell what came out, or why it could not be done."""
         try:
-            self._parent.send(done=measure())
+            self._parent.send(Measured(measure()))
         except SessionEnd as end:
-            self._parent.send(refused=end.reason)
+            self._parent.send(Refused(end.reason))
 
     def _tare(self) -> dict[str, object]:
         """Average the sensor; each session does so for itself, this is for the operator's eyes."""

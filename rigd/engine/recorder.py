@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from math import ceil
 from pathlib import Path
 
-from rigd.engine._ipc import Message, Parent
-from rigd.engine._jobs import RecorderJob
+from rigd.engine._ipc import Parent
+from rigd.engine._messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
 from rigd.engine._realtime import Precedence
 from rigd.engine._shared_state import Board, Phase, Word, read_events
 from rigd.engine._topics import (
@@ -48,15 +48,15 @@ def main() -> None:
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
-        parent.send(error=str(error), taken=isinstance(error, SessionExistsError))
+        parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
     _show_free_space(channels.board, job.path.parent)
-    parent.send(opened=str(job.path), realtime=obtained)
+    parent.send(Opened(obtained))
     try:
         _record(parent, channels, writer, job.path.parent)
     except SessionError as error:
         text, kept = _abandoned(writer)
-        parent.send(error=f"{error}{text}", kept=None if kept is None else str(kept))
+        parent.send(Failed(f"{error}{text}", kept=kept))
         raise SystemExit(1) from None
 
 
@@ -90,20 +90,18 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
         except EOFError:
             recorder.finish_orphaned()
             return
-        if message is None:
-            continue
-        if "begin" in message:
-            recorder.header = message["begin"]
-            parent.send(armed=True)
-        elif "close" in message:
-            recorder.transfer()
-            if not recorder.begun:
-                writer.discard()
-                parent.send(closed=None)
-            else:
-                path, counts, outcome = recorder.close(message["close"])
-                parent.send(closed=str(path), counts=counts, outcome=outcome)
-            return
+        match message:
+            case FileHeader():
+                recorder.header = message
+                parent.send(Armed())
+            case Close(outcome):
+                recorder.transfer()
+                if recorder.begun:
+                    parent.send(recorder.close(outcome))
+                else:
+                    writer.discard()
+                    parent.send(Closed())
+                return
 
 
 def _show_free_space(board: Board, folder: Path) -> None:
@@ -143,16 +141,14 @@ class Recorder:
             if topic.logged
         ]
         self._recorded = 0
-        self.header: Message | None = None
-        """Metadata, segments and attachments of the session, once the supervisor has sent them."""
+        self.header: FileHeader | None = None
+        """Of the session, once the supervisor has sent it."""
         self.begun = False
 
-    def _begin(self, header: Message) -> None:
-        segments = {name: (first, end) for name, (first, end) in header["segments"].items()}
-        attachments = {name: text.encode() for name, text in header["attachments"].items()}
-        self._writer.begin(
-            self._channels.board[Word.START_UTC_NS], header["metadata"], segments, attachments
-        )
+    def _begin(self, header: FileHeader) -> None:
+        attachments = {name: text.encode() for name, text in header.attachments.items()}
+        start_utc_ns = self._channels.board[Word.START_UTC_NS]
+        self._writer.begin(start_utc_ns, header.metadata, header.segments, attachments)
         self.begun = True
 
     def transfer(self) -> bool:
@@ -178,8 +174,8 @@ class Recorder:
         self._writer.write_samples(block)
         self._recorded += len(block) // SAMPLE_SIZE
 
-    def close(self, outcome: Mapping[str, str]) -> tuple[Path, dict[str, int], tuple[str, str]]:
-        """Write the rest and the outcome; return the file, its counts, outcome and reason."""
+    def close(self, outcome: Mapping[str, str]) -> Closed:
+        """Write the rest and the outcome."""
         while self.transfer():
             pass
         accounted = self._recorded + int(outcome["missed"])
@@ -193,7 +189,8 @@ class Recorder:
         if counts["lost"] and outcome["outcome"] == "complete":
             outcome = {**outcome, "outcome": "fault", "reason": "Samples were lost on their way."}
         counted = {**outcome, **{name: str(count) for name, count in counts.items()}}
-        return self._writer.close(counted), counts, (outcome["outcome"], outcome["reason"])
+        path = self._writer.close(counted)
+        return Closed(path, counts, outcome["outcome"], outcome["reason"])
 
     def finish_orphaned(self) -> None:
         """Close what there is once the loop has stopped, the supervisor being gone."""
@@ -208,7 +205,7 @@ class Recorder:
             self._writer.discard()
             return
         scheduled = board[Word.SCHEDULED]
-        whole = scheduled == max(end for _, end in self.header["segments"].values())
+        whole = scheduled == max(end for _, end in self.header.segments.values())
         self.close(
             {
                 "outcome": "complete" if whole else "fault",

@@ -7,6 +7,8 @@ from math import isfinite, pi
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.errors import UserError
+
 FloatArray = NDArray[np.float64]
 
 SAMPLES_PER_PERIOD = 4
@@ -16,7 +18,7 @@ MAX_TICKS = 7_200_000
 """Two hours at 1 kHz: beyond, predicting the session takes gigabytes of memory."""
 
 
-class ExcitationError(ValueError):
+class ExcitationError(UserError, ValueError):
     """An option of an excitation is absurd; the message names option, value, unit and remedy."""
 
 

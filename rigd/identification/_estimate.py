@@ -22,6 +22,8 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.errors import FailureError
+
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
@@ -286,7 +288,7 @@ _SCALES = (0.5, 2.0)
 torque constant."""
 
 
-class EstimateError(ValueError):
+class EstimateError(FailureError, ValueError):
     """The windows do not determine the motor's data; the message says why."""
 
 

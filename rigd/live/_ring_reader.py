@@ -81,6 +81,13 @@ class LiveEnd:
     reason: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class LiveShown:
+    """A session is shown from now on."""
+
+    recording_id: str
+
+
 # Rings
 
 Records = TypeVar("Records")

@@ -11,18 +11,18 @@ import os
 import signal
 import time
 from collections.abc import Iterable
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
-from rigd.engine import SAMPLE, TOPICS, Channels, Message, Parent, Word, attach_channels
+from rigd.engine import SAMPLE, TOPICS, Channels, Failed, Parent, Word, attach_channels
 from rigd.live._feed import Feed
-from rigd.live._ring_reader import Intake, LiveEnd
-from rigd.live._server import Outlet, RerunError
+from rigd.live._program import RerunError
+from rigd.live._ring_reader import Intake, LiveEnd, LiveSession, LiveShown
+from rigd.live._server import Outlet
 from rigd.runtime import ignore as ignore_signals
 from rigd.view import Health, outcome_note, settle_sdk
 
 if TYPE_CHECKING:
-    from rigd.live._ring_reader import LiveJob, LiveSession
+    from rigd.live._ring_reader import LiveJob
     from rigd.view import Drawing
 
 
@@ -53,7 +53,7 @@ def main() -> None:
 
         outlet.wait()
     except (RerunError, ImportError) as error:
-        parent.send(error=str(error))
+        parent.send(Failed(str(error)))
         raise SystemExit(1) from None
     publisher = _Publisher(parent, channels, outlet)
     publisher.serve()
@@ -81,8 +81,11 @@ class _Publisher:
                 message = self._parent.poll(self._pause_s)
             except EOFError:
                 break
-            if message is not None:
-                self._obey(message)
+            match message:
+                case LiveSession():
+                    self._begin(message)
+                case LiveEnd():
+                    self._finish(message)
         self._finish(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
 
     def linger(self, linger_s: float) -> None:
@@ -102,19 +105,13 @@ class _Publisher:
         waits = self._feed.stalled or (shown is not None and bool(shown.backlog))
         return _PERIOD_S if waits else _IDLE_PERIOD_S
 
-    def _obey(self, message: Message) -> None:
-        if "session" in message:
-            self._begin(message["session"])
-        elif "finish" in message:
-            self._finish(message["finish"])
-
-    def _begin(self, session: "LiveSession") -> None:
+    def _begin(self, session: LiveSession) -> None:
         self._finish(LiveEnd(session.begins))
         self._shown = _Shown(session, self._channels)
         self._outlet.begin_session()
         self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
         self._step()
-        self._parent.send(shown=session.recording_id)
+        self._parent.send(LiveShown(session.recording_id))
 
     def _finish(self, end: LiveEnd) -> None:
         if self._shown is not None and not self._shown.over:
@@ -136,13 +133,13 @@ class _Publisher:
         address = self._outlet.address
         if address is not None and address.server != self._told:
             self._told = address.server
-            self._parent.send(address=asdict(address))
+            self._parent.send(address)
 
 
 class _Shown:
     """The session that is shown, or was last."""
 
-    def __init__(self, session: "LiveSession", channels: Channels) -> None:
+    def __init__(self, session: LiveSession, channels: Channels) -> None:
         board = self._board = channels.board
         begin, seen = session.begins[TOPICS.index(SAMPLE)], board[Word.LIVE_SEEN]
         # A session that another publisher has shown up to there keeps its count.

@@ -20,6 +20,7 @@ from rigd.devices.cia402 import (
     Grade,
     judge,
 )
+from rigd.errors import FailureError
 from rigd.profile._load import ProfileError, profile_of
 from rigd.profile._schema import Profile, keys
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
@@ -30,7 +31,7 @@ _MAKERS_OWN = range(0x2000, 0x6000)
 _MOST_NAMED = 4
 
 
-class UnusableDriveError(ValueError):
+class UnusableDriveError(FailureError, ValueError):
     """A drive that no profile can make fit; the message names what it lacks."""
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd.devices import RigParameters
+from rigd.errors import UserError
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._places import profile_files
 from rigd.profile._schema import (
@@ -29,7 +30,7 @@ from rigd.profile._schema import (
 )
 
 
-class ProfileError(ValueError):
+class ProfileError(UserError, ValueError):
     """A profile cannot be used; the message has one line a problem, each with its remedy."""
 
 

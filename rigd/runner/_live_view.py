@@ -4,8 +4,8 @@ import time
 import uuid
 from collections.abc import Callable
 
-from rigd.engine import LIVE, ChildError, Event, Level, Message, Pulse, Word
-from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession
+from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
+from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown
 from rigd.runner._process_group import Crew
 from rigd.runner._request import Order
 from rigd.runtime import StopRequest
@@ -69,7 +69,7 @@ class LiveView:
         begins = tuple(ring.written for ring in self._crew.channels.rings)
         self._session = LiveSession(subject_of(order), str(uuid.uuid4()), begins)
         self._shown = False
-        self._send(session=self._session)
+        self._send(self._session)
         # So that it is there from the first sample on; a session does not depend on it.
         self._await(lambda: self._shown, _BEGIN_PATIENCE_S, stop)
         if self._lost:
@@ -96,7 +96,7 @@ class LiveView:
         if self._session is not None:
             self._session = None
             ends = tuple(ring.written for ring in self._crew.channels.rings)
-            self._send(finish=LiveEnd(ends, outcome, reason))
+            self._send(LiveEnd(ends, outcome, reason))
 
     def _await(self, met: Callable[[], bool], patience_s: float, stop: StopRequest) -> None:
         """Listen until something is met, or cannot be any more, or there is no time for it."""
@@ -114,16 +114,15 @@ class LiveView:
         except ChildError as error:
             self._lost, self.address = str(error), None
             return
-        self._send(job=self._job)
+        self._send(self._job)
         if self._session is not None:
-            self._send(session=self._session)
+            self._send(self._session)
 
-    def _send(self, **message: object) -> None:
+    def _send(self, message: object) -> None:
         if self._lost:
             return
-        ((name, value),) = message.items()
         try:
-            self._crew[LIVE].send_object(name, value)
+            self._crew[LIVE].send(message)
         except ChildError as error:
             self._restart(str(error))
 
@@ -136,20 +135,20 @@ class LiveView:
             if answer is not None:
                 self._understand(answer)
 
-    def _understand(self, answer: Message) -> None:
-        if "shown" in answer:
-            self._shown = True
-            return
-        if "address" not in answer:
-            # It says why it cannot do its work, and ends.
-            self._lost, self.address = str(answer.get("error", answer)), None
-            if self._session is not None:
-                self._note("warning", f"No live view: {self._lost} The session goes on.")
-            return
-        before, self.address = self.address, LiveAddress(**answer["address"])
-        self._heard = True
-        if before is not None and before.viewer_url != self.address.viewer_url:
-            self._note("info", f"Live view: {self.address.viewer_url}")
+    def _understand(self, answer: object) -> None:
+        match answer:
+            case LiveShown():
+                self._shown = True
+            case LiveAddress():
+                before, self.address = self.address, answer
+                self._heard = True
+                if before is not None and before.viewer_url != answer.viewer_url:
+                    self._note("info", f"Live view: {answer.viewer_url}")
+            case _:
+                self._lost = answer.reason if isinstance(answer, Failed) else str(answer)
+                self.address = None
+                if self._session is not None:
+                    self._note("warning", f"No live view: {self._lost} The session goes on.")
 
     def _feel_pulse(self) -> None:
         assert LIVE.hung_after_s is not None

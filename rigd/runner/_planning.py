@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, tip_motion
 from rigd.control import ClosedLoop, LoopResponse, check_stability, close_loop
+from rigd.errors import UserError
 from rigd.excitation import Excitation, Value, make_excitation
 from rigd.profile import Profile
 
@@ -17,7 +18,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
-class RefusedError(Exception):
+class RefusedError(UserError):
     """A session would leave the limits of the profile; the message says which, and the remedy."""
 
 

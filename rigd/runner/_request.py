@@ -9,6 +9,7 @@ import os
 import platform
 import shlex
 import shutil
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -24,7 +25,7 @@ from rigd.devices import (
     unreachable_simulators,
     what_moves,
 )
-from rigd.engine import Message
+from rigd.engine import Connected, FileHeader
 from rigd.excitation import Excitation
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
@@ -232,7 +233,7 @@ def what_is_kept(path: Path | None) -> str:
     )
 
 
-def file_header(order: Order, connected: Message, tare: Message) -> Message:
+def file_header(order: Order, connected: Connected, tare: Mapping[str, str]) -> FileHeader:
     """Return metadata, segments and attachments of a session.
 
     Parameters
@@ -244,17 +245,17 @@ def file_header(order: Order, connected: Message, tare: Message) -> Message:
     tare
         Metadata of the tare.
     """
-    return {
-        "metadata": _metadata(order, connected, tare),
-        "segments": order.excitation.segments,
-        "attachments": {
+    return FileHeader(
+        metadata=_metadata(order, connected, tare),
+        segments=dict(order.excitation.segments),
+        attachments={
             "profile.toml": order.profile.text,
-            "calibration.json": json.dumps(connected["calibration"], indent=1),
+            "calibration.json": json.dumps(connected.calibration, indent=1),
         },
-    }
+    )
 
 
-def _metadata(order: Order, connected: Message, tare: Message) -> dict[str, str]:
+def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> dict[str, str]:
     rig = order.profile.rig
     metadata = {
         "id": order.path.stem,
@@ -271,12 +272,12 @@ def _metadata(order: Order, connected: Message, tare: Message) -> dict[str, str]
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,
-        "simulated": str(connected["simulated"]).lower(),
+        "simulated": str(connected.simulated).lower(),
         "profile": order.profile.name,
         "software": f"rigd {__version__}",
         "host": platform.node(),
-        **{f"realtime_{name}": value for name, value in connected["realtime"].items()},
-        **connected.get("drive", {}),
+        **{f"realtime_{name}": value for name, value in connected.realtime.items()},
+        **connected.drive,
         **tare,
         **dict(order.notes),
     }

@@ -14,13 +14,19 @@ from rigd.engine import (
     LIVE,
     Board,
     ChildError,
+    Connected,
     ControlJob,
-    Message,
+    Ended,
+    Measured,
     Precedence,
     Pulse,
+    Refused,
     Stop,
+    Tare,
     Word,
+    Zero,
 )
+from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import Crew
@@ -35,7 +41,7 @@ _ANSWER_PATIENCE_S = 10.0
 """Time to wait for an answer, beyond the time that is measured."""
 
 
-class RigError(Exception):
+class RigError(FailureError):
     """The rig cannot do what is asked, or is lost; the message is for the operator."""
 
 
@@ -70,7 +76,7 @@ class Rig:
         self._fast = fast
         self._live = live
         self._crew = crew
-        self._told: Message = {}
+        self._told: Connected | None = None
         self._view: LiveView | None = None
         self._zero_set = False
         self._pulse = Pulse()
@@ -83,7 +89,7 @@ class Rig:
     @property
     def simulated(self) -> bool:
         """Whether no motor moves; known once connected."""
-        return bool(self._told.get("simulated", False))
+        return self._told is not None and self._told.simulated
 
     def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
@@ -110,8 +116,9 @@ class Rig:
             _lay_out(crew, self._profile.rig.rate_hz, fast=self._fast)
             job = ControlJob(self._profile, moving, crew.channels.specs, self._fast)
             crew.fresh(CONTROL).start(job)
-            self._told = self._ask(_CONNECT_PATIENCE_S)
-            self._told["realtime"] |= granted
+            told = self._ask(_CONNECT_PATIENCE_S)
+            assert isinstance(told, Connected)
+            self._told = replace(told, realtime={**told.realtime, **granted})
         except (RigError, ChildError, OSError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
@@ -147,6 +154,7 @@ class Rig:
             If the file cannot be written, or the recorder died.
         """
         crew = self._require()
+        assert self._told is not None
         if self.zero_lost:
             raise RigError(
                 "The zero of the angle was lost with the connection, and the limits with it; move "
@@ -206,7 +214,7 @@ class Rig:
         RigError
             If it cannot be done.
         """
-        return self._order("tare", self._profile.session.tare_s)
+        return self._order(Tare(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
         """Make the angle where the motor stands the zero to which the limits are relative.
@@ -221,7 +229,7 @@ class Rig:
         RigError
             If the motor moves.
         """
-        answer = self._order("zero", 0.0)
+        answer = self._order(Zero(), 0.0)
         self._zero_set, self.zero_lost = True, False
         return answer
 
@@ -239,19 +247,20 @@ class Rig:
         try:
             message = crew.control.poll(0.0)
         except ChildError as error:
-            message = {"ended": str(error)}
+            message = Ended(str(error))
         board = crew.channels.board
         board.beat(Word.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
         still_s = self._pulse.look(board[Word.CONTROL_BEAT], time.monotonic())
         if message is None and still_s > CONTROL.hung_after_s:
             crew.control.kill()
-            message = {
-                "ended": f"The control process has not moved for {still_s:.1f} s. Check CPU load."
-            }
+            message = Ended(
+                f"The control process has not moved for {still_s:.1f} s. Check CPU load."
+            )
         if message is not None:
             self.disconnect()
-            raise RigError(message.get("ended") or "The control process was asked to end.")
+            reason = message.reason if isinstance(message, Ended) else ""
+            raise RigError(reason or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
         """Return the status from shared memory, from any thread; None while there is none."""
@@ -294,21 +303,21 @@ class Rig:
             raise RigError("The rig is not connected.")
         return self._crew
 
-    def _order(self, name: str, duration_s: float) -> dict[str, Any]:
+    def _order(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
         """Have the control process measure something between sessions."""
         crew = self._require()
         try:
-            crew.control.send(**{name: True})
+            crew.control.send(order)
             answer = self._ask(_ANSWER_PATIENCE_S + duration_s)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if "refused" in answer:
-            raise RigError(answer["refused"])
-        measured: dict[str, Any] = answer["done"]
-        return measured
+        if isinstance(answer, Refused):
+            raise RigError(answer.reason)
+        assert isinstance(answer, Measured)
+        return answer.values
 
-    def _ask(self, patience_s: float) -> Message:
+    def _ask(self, patience_s: float) -> object:
         """Wait for what the control process answers.
 
         Raises
@@ -325,8 +334,8 @@ class Rig:
                 f"The control process does not answer within {patience_s:g} s; see whether the "
                 "devices are on, and check CPU load."
             )
-        if "ended" in answer:
-            raise RigError(answer["ended"] or "It was stopped.")
+        if isinstance(answer, Ended):
+            raise RigError(answer.reason or "It was stopped.")
         return answer
 
     def _await_end(self) -> None:

@@ -10,18 +10,26 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Final, TypeVar
 
 from rigd.engine import (
     CONTROL,
     RECORDER,
     REFUSED,
+    Armed,
     ChildError,
+    Close,
+    Closed,
+    Connected,
+    Ended,
     Event,
-    Message,
+    Failed,
+    Finished,
     Observer,
+    Opened,
     Phase,
     Pulse,
+    Ready,
     RecorderJob,
     SessionJob,
     Stop,
@@ -29,6 +37,7 @@ from rigd.engine import (
     put_reference,
     read_events,
 )
+from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import Crew
 from rigd.runner._request import Order, another_path, file_header, part_of
@@ -54,7 +63,7 @@ _COUNTED = {
 _NO_TICKS: Final[Mapping[str, int]] = MappingProxyType(dict.fromkeys(_COUNTED, 0))
 
 
-class SessionFailedError(Exception):
+class SessionFailedError(FailureError):
     """A session could not be run or ended; the message says why, in the operator's words.
 
     Attributes
@@ -161,6 +170,7 @@ class SessionProgress:
 
 
 Watcher = Callable[[SessionProgress, list[Event]], None]
+T = TypeVar("T")
 
 
 class Session:
@@ -192,7 +202,7 @@ class Session:
         self,
         order: Order,
         crew: Crew,
-        connected: Message,
+        connected: Connected,
         live: LiveView | None,
         watcher: Watcher,
         listens: Callable[[], bool],
@@ -205,7 +215,7 @@ class Session:
         self._events = Observer(crew.channels.events)
         self._watcher = watcher
         self._listens = listens
-        self._virtual = connected["realtime"]["clock"] == "virtual"
+        self._virtual = connected.realtime["clock"] == "virtual"
         self._pulse = Pulse()
         self._recorder_lost: str | None = None
         self._control_at_work = False
@@ -258,15 +268,16 @@ class Session:
         order = self._order
         self._control_at_work = True
         job = SessionJob(order.profile, reference, self._refused_to_supervision())
-        crew.control.send_object("session", job)
+        crew.control.send(job)
         answer = self._listen_to_control()
-        if "ready" in answer:
-            crew.recorder.send(begin=file_header(order, self._connected, answer["ready"]))
-            self._ask_recorder("armed")
+        if isinstance(answer, Ready):
+            crew.recorder.send(file_header(order, self._connected, answer.tare))
+            self._ask_recorder(Armed)
             self._board[Word.GO] = 1
             answer = self._listen_to_control()
         if self._recorder_lost is not None:
             raise SessionFailedError(self._recorder_lost)
+        assert isinstance(answer, Finished)
         return self._close(answer)
 
     def _open_file(self) -> None:
@@ -277,17 +288,15 @@ class Session:
             job = RecorderJob(self._order.path, crew.channels.specs, realtime)
             crew.fresh(RECORDER).start(job)
             try:
-                opened = self._ask_recorder("opened", _START_PATIENCE_S)
+                opened = self._ask_recorder(Opened, _START_PATIENCE_S)
             except _NameTakenError as error:
                 taken = error
                 self._order = replace(self._order, path=another_path(self._order.path))
             else:
                 self._opened = self._order.path
-                granted = {f"recorder_{name}": text for name, text in opened["realtime"].items()}
-                self._connected = {
-                    **self._connected,
-                    "realtime": self._connected["realtime"] | granted,
-                }
+                granted = {f"recorder_{name}": text for name, text in opened.realtime.items()}
+                before = self._connected.realtime
+                self._connected = replace(self._connected, realtime={**before, **granted})
                 return
         raise taken
 
@@ -295,11 +304,11 @@ class Session:
         """Return what the scheduler did not grant supervisor and recorder, and why."""
         return {
             name: text
-            for name, text in self._connected["realtime"].items()
+            for name, text in self._connected.realtime.items()
             if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
         }
 
-    def _listen_to_control(self) -> Message:
+    def _listen_to_control(self) -> Ready | Finished:
         """Wait for the control process's next message, watching everybody meanwhile."""
         deadline, phase = 0.0, -1
         while True:
@@ -329,24 +338,27 @@ class Session:
                 if self._recorder_lost is not None:
                     self._board[Word.STOP] = Stop.NO_RECORDER
 
-    def _understood(self, answer: Message) -> Message:
-        if "ended" in answer:  # before the session began
-            finished = self._control_died(str(answer["ended"]))
-            if not answer["ended"]:  # the signal for a stop reached it between two sessions
-                finished |= {
-                    "finished": "stopped",
-                    "reason": "Stopped by the operator.",
-                    "fault": False,
-                }
-            return finished
-        if "finished" in answer:
-            self._control_at_work = False
-            if answer["device_failed"]:
-                self.device_failed = True
-                self._drive_at_end = answer["reason"]
-        return answer
+    def _understood(self, answer: object) -> Ready | Finished:
+        match answer:
+            case Ended(reason):  # before the session began
+                finished = self._control_died(reason)
+                if reason:
+                    return finished
+                # The signal for a stop reached it between two sessions.
+                return replace(
+                    finished, outcome="stopped", reason="Stopped by the operator.", fault=False
+                )
+            case Finished():
+                self._control_at_work = False
+                if answer.device_failed:
+                    self.device_failed = True
+                    self._drive_at_end = answer.reason
+                return answer
+            case Ready():
+                return answer
+        raise SessionFailedError(f"The control process answers {answer}.")
 
-    def _kill_control(self, why: str) -> Message:
+    def _kill_control(self, why: str) -> Finished:
         """End a control process that hangs: the drive's own watch is what switches off then."""
         self._crew.control.kill()
         return self._control_died(
@@ -354,23 +366,22 @@ class Session:
             "itself off. See that it has."
         )
 
-    def _control_died(self, reason: str) -> Message:
+    def _control_died(self, reason: str) -> Finished:
         self._control_at_work = False
         self.device_failed = True
         self._drive_at_end = reason
         return self._as_finished(reason)
 
-    def _as_finished(self, reason: str) -> Message:
+    def _as_finished(self, reason: str) -> Finished:
         """Make up the control process's result from its words on the board."""
         counts = self._counts()
         whole = counts["scheduled"] == self._order.excitation.reference_rad.size
-        return {
-            "finished": "complete" if whole else "fault",
-            "reason": f"After the record: {reason}" if whole else reason,
-            "fault": True,
-            "counts": counts,
-            "results": {},
-        }
+        return Finished(
+            outcome="complete" if whole else "fault",
+            reason=f"After the record: {reason}" if whole else reason,
+            fault=True,
+            counts=counts,
+        )
 
     def _counts(self) -> dict[str, int]:
         board = self._board
@@ -382,16 +393,12 @@ class Session:
             message = self._crew.recorder.poll(0.0)
         except ChildError as error:
             return str(error)
-        if message is None:
-            return None
-        self._note_kept(message)
-        return str(message.get("error", message))
+        if isinstance(message, Failed):
+            self._kept = message.kept
+            return message.reason
+        return None if message is None else str(message)
 
-    def _note_kept(self, message: Message) -> None:
-        if message.get("kept"):
-            self._kept = Path(message["kept"])
-
-    def _ask_recorder(self, expected: str, patience_s: float = _PATIENCE_S) -> Message:
+    def _ask_recorder(self, expected: type[T], patience_s: float = _PATIENCE_S) -> T:
         """Wait for its answer, going on watching: the motor may be held meanwhile."""
         deadline = time.monotonic() + patience_s
         message = None
@@ -403,11 +410,10 @@ class Session:
                 f"The recorder process does not answer within {patience_s:g} s. Check CPU load and "
                 "disk."
             )
-        if "error" in message:
-            self._note_kept(message)
-            failed = _NameTakenError if message.get("taken") else SessionFailedError
-            raise failed(message["error"])
-        if expected not in message:
+        if isinstance(message, Failed):
+            self._kept = message.kept
+            raise (_NameTakenError if message.taken else SessionFailedError)(message.reason)
+        if not isinstance(message, expected):
             raise SessionFailedError(f"The recorder process answers {message}.")
         return message
 
@@ -428,23 +434,23 @@ class Session:
             events,
         )
 
-    def _close(self, finished: Message) -> SessionResult:
+    def _close(self, finished: Finished) -> SessionResult:
         self._report()
-        counts = finished["counts"]
         outcome = {
-            "outcome": finished["finished"],
-            "reason": finished["reason"],
-            **{name: str(count) for name, count in counts.items()},
-            **finished["results"],
+            "outcome": finished.outcome,
+            "reason": finished.reason,
+            **{name: str(count) for name, count in finished.counts.items()},
+            **finished.results,
         }
         self._crew.recorder.wake()
-        self._crew.recorder.send(close=outcome)
-        closed = self._ask_recorder("closed", 2 * _PATIENCE_S)
+        self._crew.recorder.send(Close(outcome))
+        closed = self._ask_recorder(Closed, 2 * _PATIENCE_S)
         # What the recorder counted in the file has the last word.
-        counts = {**_NO_TICKS, **counts, **closed.get("counts", {})}
-        ended, reason = closed.get("outcome", (finished["finished"], finished["reason"]))
+        counts = {**_NO_TICKS, **finished.counts, **closed.counts}
+        whole = closed if closed.path is not None else finished
+        ended, reason = whole.outcome, whole.reason
         return SessionResult(
-            path=None if closed["closed"] is None else Path(closed["closed"]),
+            path=closed.path,
             outcome=ended,
             reason=reason,
             scheduled=counts["scheduled"],
@@ -454,7 +460,7 @@ class Session:
             lost=counts.get("lost", 0),
             stale_angles=counts["stale_angles"],
             stale_wrenches=counts["stale_wrenches"],
-            fault=finished["fault"] or ended == "fault",
+            fault=finished.fault or ended == "fault",
             live_dropped=self._board[Word.LIVE_DROPPED],
         )
 

@@ -1,6 +1,7 @@
-"""What the processes of a user share with the system: folder, locks, signals.
+"""What the processes of a user share with the system: folder, addresses, locks, signals.
 
-Offers the folder for sockets and addresses (`runtime_folder`), a lock that names its holder
+Offers the folder for sockets and addresses (`runtime_folder`), addresses in it (`announce`,
+`read_address`) and whether a process is still there (`answers`), a lock that names its holder
 (`HeldFile`), one program at a time on a rig (`RigLock`), and the signals that ask for an end
 (`raise_on` for commands; `StopRequest`, `ignore`, `held_back` for the processes of a rig). The
 ground floor: it knows nothing of rigs but their names.

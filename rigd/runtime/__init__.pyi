@@ -1,3 +1,9 @@
+from ._addresses import address_files as address_files
+from ._addresses import announce as announce
+from ._addresses import answers as answers
+from ._addresses import file_name as file_name
+from ._addresses import read_address as read_address
+from ._addresses import started_at as started_at
 from ._folder import runtime_folder as runtime_folder
 from ._linear_algebra import SINGLE_THREADED as SINGLE_THREADED
 from ._linear_algebra import use_one_thread as use_one_thread

@@ -9,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
+from rigd.errors import FailureError
+from rigd.runtime._addresses import file_name
 from rigd.runtime._folder import runtime_folder
 
 _COMMON = Path("/run/lock")
@@ -33,7 +35,7 @@ class HeldFile:
     """
 
     def __init__(self, name: str, *, everybody: bool) -> None:
-        plain = "".join(c if c.isalnum() else "-" for c in name).strip("-")
+        plain = file_name(name)
         common = everybody and os.access(_COMMON, os.W_OK)
         self.path = _COMMON / f"rigd-{plain}.lock" if common else runtime_folder() / f"{plain}.lock"
         self._fd: int | None = None
@@ -112,7 +114,7 @@ def _others(fd: int, said: str) -> str:
 # One program at a time on a rig
 
 
-class RigBusyError(Exception):
+class RigBusyError(FailureError):
     """Another program runs the rig; the message says which."""
 
 

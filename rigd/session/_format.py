@@ -18,8 +18,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from rigd.errors import FailureError
 
-class SessionError(Exception):
+
+class SessionError(FailureError):
     """A session file cannot be read or written; the message names the file and the remedy."""
 
 

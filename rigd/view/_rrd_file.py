@@ -12,6 +12,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from rigd.errors import FailureError
+
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
@@ -43,7 +45,7 @@ def settle_sdk() -> None:
     os.environ["RUST_LOG"] = "off"
 
 
-class RrdFileError(Exception):
+class RrdFileError(FailureError):
     """A file of Rerun's cannot be written, or is none."""
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.engine._messages import FileHeader
 from rigd.engine._ring import shared_memory_fd
 from rigd.engine._shared_state import Phase, Word
 from rigd.engine._topics import DESCRIPTORS, create_channels
@@ -39,11 +40,8 @@ def channels():
 def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcome, reason):
     board, ring = channels.board, channels.samples
     recorder = Recorder(channels, SessionWriter(tmp_path / "alone.mcap"))
-    recorder.header = {
-        "metadata": {"rate_hz": "1000.0"},
-        "segments": {"rest": [0, 100], "sweep": [100, 300]},
-        "attachments": {},
-    }
+    segments = {"rest": (0, 100), "sweep": (100, 300)}
+    recorder.header = FileHeader({"rate_hz": "1000.0"}, segments, attachments={})
     for tick in range(ticks):
         pack_sample_into(ring.buffer, ring.slot(), tick * 10**6, tick, *[0.0] * 10, 0, 0, 0)
         ring.publish()

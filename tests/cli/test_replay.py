@@ -570,7 +570,7 @@ def test_the_viewer_shows_it(rerun_program, recording, tmp_path, way):
     """In Rerun's own viewer, without a screen: opened as the window is, and as browsers do."""
     from rerun.experimental import ViewerClient
 
-    from rigd.live._server import RerunProgram
+    from rigd.live._program import RerunProgram
     from rigd.live._viewer import PageOfFile, Window
 
     headless = ("--headless", "--window-size", "960x600")

@@ -138,7 +138,7 @@ class ThreadParent:
         self.child = child
 
     def receive_job(self):
-        return self.poll(None)["job"]
+        return self.poll(None)
 
     def poll(self, timeout_s):
         if self.child.killed:
@@ -153,7 +153,7 @@ class ThreadParent:
             raise EOFError
         return message
 
-    def send(self, **message):
+    def send(self, message):
         self.child.outbox.put(message)
 
     def alive(self):
@@ -194,13 +194,10 @@ class ThreadChild:
 
     def start(self, job):
         self.thread.start()
-        self.send_object("job", job)
+        self.send(job)
 
-    def send(self, **message):
+    def send(self, message):
         self.inbox.put(message)
-
-    def send_object(self, name, value):
-        self.inbox.put({name: value})
 
     @property
     def running(self):

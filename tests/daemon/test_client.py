@@ -138,7 +138,7 @@ def test_a_daemon_that_hears_nobody_gets_a_signal_and_no_success_is_claimed(
     with pytest.raises(DaemonGoneError) as raised:
         stop_session(path)
     assert process.stdout.readline() == "asked to stop\n"
-    said = raised.value.after_looking()
+    said = raised.value.told()
     assert f"process {process.pid}" in said
     assert STOP_SIGNAL.name in said
     assert "not known" in said
@@ -152,7 +152,7 @@ def test_a_process_that_does_not_know_the_signal_is_not_ended_by_it(path, deaf, 
     with pytest.raises(DaemonGoneError) as raised:
         stop_session(path)
     assert process.poll() is None
-    assert "though it runs" in raised.value.after_looking()
+    assert "though it runs" in raised.value.told()
 
 
 @pytest.fixture

@@ -14,9 +14,10 @@ import pytest
 
 from rigd.daemon import _address as address
 from rigd.daemon import _server as server
-from rigd.daemon._address import AddressError, answers, bind, find, running, socket_path
+from rigd.daemon._address import AddressError, UnknownGroupError, bind, find, running, socket_path
 from rigd.daemon._server import MOST_CLIENTS, MOST_SILENT, MOST_WATCHERS, Server
 from rigd.daemon._states import Peer, State
+from rigd.runtime import answers
 
 LONG = {
     "command": "start",
@@ -342,7 +343,7 @@ def test_a_group_may_use_it_if_asked_for(runtime_folder):
     with bind(path, group):
         assert mode(path) == 0o660
         assert path.stat().st_gid == os.getgid()
-    with pytest.raises(AddressError, match="no such group"):
+    with pytest.raises(UnknownGroupError, match="no such group"):
         bind(path, "nobody-has-this-group")
 
 

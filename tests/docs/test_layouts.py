@@ -164,7 +164,7 @@ def look(session):
     """
     from rerun.experimental import ViewerClient
 
-    from rigd.live._server import RerunProgram
+    from rigd.live._program import RerunProgram
 
     def shown(*files: str, is_right) -> tuple[dict[str, np.ndarray], list]:
         program = RerunProgram(

@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench._measure import measurement
-from rigd.live._server import LiveAddress, RerunProgram, find
+from rigd.live._address import LiveAddress, find
+from rigd.live._program import RerunProgram
 from rigd.live._viewer import Viewer
 from rigd.session import read_session
 

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.devices._registry import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine._jobs import SessionJob
+from rigd.engine._messages import Finished, SessionJob
 from rigd.engine._ring import put_reference, shared_memory_fd
 from rigd.engine._shared_state import Phase, Word, read_events
 from rigd.engine._timing import VirtualClock
@@ -103,11 +103,11 @@ class FakeParent:
             raise EOFError
         return self.orders.pop(0)
 
-    def said(self, what):
+    def said(self, kind):
         """The messages of a kind."""
-        return [message for message in self.messages if what in message]
+        return [message for message in self.messages if isinstance(message, kind)]
 
-    def send(self, **message):
+    def send(self, message):
         self.messages.append(message)
 
     def alive(self):
@@ -159,7 +159,7 @@ class Session:
         """Order a session: this one's, or one with another excitation."""
         reference_rad = (excitation or self.excitation).reference_rad
         reference = put_reference(shared_memory_fd(), reference_rad)
-        return {"session": SessionJob(self.profile, reference)}
+        return SessionJob(self.profile, reference)
 
     def obey(self, *orders):
         """Attend to the rig from connecting to closing, with these orders in between."""
@@ -177,7 +177,7 @@ class Session:
 
     @property
     def finished(self):
-        return self.parent.said("finished")[-1]
+        return self.parent.said(Finished)[-1]
 
     @property
     def samples(self):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.devices.contracts import DeviceError, LineHealth
+from rigd.engine._messages import Ended, Finished, Measured, Ready, Refused, Tare, Zero
 from rigd.engine._shared_state import Phase, Word
 from rigd.engine._timing import SuspendWatch, VirtualClock
 from rigd.excitation import hold, step
@@ -30,15 +31,15 @@ def test_sessions_follow_each_other_on_one_connection(make_session):
     connect = session.drive.connect
     session.drive.connect = lambda: (connects.append(1), connect())
     session.obey(short(session), short(session))
-    first, second = session.parent.said("finished")
-    assert (first["finished"], second["finished"]) == ("complete", "complete")
-    assert first["counts"] == second["counts"] == {
+    first, second = session.parent.said(Finished)
+    assert (first.outcome, second.outcome) == ("complete", "complete")
+    assert first.counts == second.counts == {
         "scheduled": 1200, "missed": 0, "late": 0, "lost": 0,
         "stale_angles": 0, "stale_wrenches": 0,
     }  # fmt: skip
     assert connects == [1]
     assert session.samples["tick"].tolist() == [*range(1200), *range(1200)]
-    assert session.parent.said("ended") == [{"ended": ""}]
+    assert session.parent.said(Ended) == [Ended("")]
     session.assert_safe()
 
 
@@ -46,10 +47,10 @@ def test_sessions_follow_each_other_on_one_connection(make_session):
 def test_the_zero_is_where_the_operator_says_and_stays_there(make_session, clock):
     session = make_session(clock=clock())
     session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 0.3
-    session.obey(short(session), {"zero": True}, short(session), short(session))
-    (zeroed,) = session.parent.said("done")
-    assert zeroed["done"]["moved_rad"] == pytest.approx(0.3, abs=3 * 7e-5)
-    starts = [float(m["ready"]["start_angle_rad"]) for m in session.parent.said("ready")]
+    session.obey(short(session), Zero(), short(session), short(session))
+    (zeroed,) = session.parent.said(Measured)
+    assert zeroed.values["moved_rad"] == pytest.approx(0.3, abs=3 * 7e-5)
+    starts = [float(m.tare["start_angle_rad"]) for m in session.parent.said(Ready)]
     assert starts == pytest.approx([0.3, 0.0, 0.0], abs=3 * 7e-5)
     samples = session.samples
     assert np.abs(samples["angle_rad"][-2400:]).max() < 1e-2
@@ -59,31 +60,31 @@ def test_limits_are_relative_to_the_zero(make_session):
     session = make_session()
     limit_rad = session.profile.limits.angle_rad
     session.drive.fault_at, session.drive.fault = 1, lambda angle: angle + 1.1 * limit_rad
-    session.obey(short(session), {"zero": True}, short(session))
-    refused, fine = session.parent.said("finished")
-    assert refused["finished"] == "fault"
-    assert "outside limits.angle_rad" in refused["reason"]
-    assert refused["device_failed"] is False
-    assert fine["finished"] == "complete"
+    session.obey(short(session), Zero(), short(session))
+    refused, fine = session.parent.said(Finished)
+    assert refused.outcome == "fault"
+    assert "outside limits.angle_rad" in refused.reason
+    assert refused.device_failed is False
+    assert fine.outcome == "complete"
 
 
 def test_no_zero_while_the_motor_moves(make_session):
     session = make_session()
     session.drive.fault_at = 1
     session.drive.fault = lambda angle: angle + 1e-5 * session.drive.reads
-    session.obey({"zero": True})
-    (refused,) = session.parent.said("refused")
-    assert "rest_velocity_rad_s" in refused["refused"]
+    session.obey(Zero())
+    (refused,) = session.parent.said(Refused)
+    assert "rest_velocity_rad_s" in refused.reason
     session.assert_safe()
 
 
 def test_a_tare_between_sessions_tells_what_the_sensor_reads(make_session):
     session = make_session()
-    session.obey({"tare": True})
-    (tared,) = session.parent.said("done")
+    session.obey(Tare())
+    (tared,) = session.parent.said(Measured)
     offset = session.profile.rig.simulation.offset
-    assert tared["done"]["mean"]["fz_n"] == pytest.approx(offset[2], abs=0.01)
-    assert tared["done"]["torque_std_nm"] < session.profile.session.rest_torque_nm
+    assert tared.values["mean"]["fz_n"] == pytest.approx(offset[2], abs=0.01)
+    assert tared.values["torque_std_nm"] < session.profile.session.rest_torque_nm
     assert session.drive.torques == []
 
 
@@ -92,12 +93,12 @@ def test_a_session_waits_until_the_beam_has_come_to_rest(make_session):
     rate_hz = session.profile.rig.rate_hz
     kick = step(rate_hz=rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0)
     session.obey(short(session, excitation=kick), short(session))
-    first, second = session.parent.said("finished")
-    assert (first["finished"], second["finished"]) == ("complete", "complete")
+    first, second = session.parent.said(Finished)
+    assert (first.outcome, second.outcome) == ("complete", "complete")
     waits = [event.message for event in session.events if "Waiting until" in event.message]
     assert len(waits) == 1
     assert "The beam is not at rest" in waits[0]
-    tares = [float(m["ready"]["tare_std_tz_nm"]) for m in session.parent.said("ready")]
+    tares = [float(m.tare["tare_std_tz_nm"]) for m in session.parent.said(Ready)]
     assert max(tares) <= session.profile.session.rest_torque_nm
 
 
@@ -108,10 +109,10 @@ def test_it_does_not_wait_for_rest_for_ever(make_session):
     rate_hz = session.profile.rig.rate_hz
     kick = step(rate_hz=rate_hz, amplitude_rad=0.1, duration_s=0.5, ring_down_s=0.0)
     session.obey(short(session, excitation=kick), short(session))
-    refused = session.parent.said("finished")[1]
-    assert refused["finished"] == "fault"
-    assert "rest_timeout_s = 3 s" in refused["reason"]
-    assert refused["counts"]["scheduled"] == 0
+    refused = session.parent.said(Finished)[1]
+    assert refused.outcome == "fault"
+    assert "rest_timeout_s = 3 s" in refused.reason
+    assert refused.counts["scheduled"] == 0
     session.assert_safe()
 
 
@@ -124,7 +125,7 @@ def test_a_device_that_fails_between_sessions_ends_the_attendance(make_session):
     polls = []
     session.parent.poll = polls.append  # nobody orders anything
     session.obey()
-    assert session.parent.said("ended") == [{"ended": "The drive is gone."}]
+    assert session.parent.said(Ended) == [Ended("The drive is gone.")]
     session.assert_safe()
 
 
@@ -133,8 +134,8 @@ def test_a_sensor_that_is_silent_between_sessions_is_told(make_session):
     session.drive.stale_at = 50
     session.parent.poll = lambda timeout_s: None
     session.obey()
-    (ended,) = session.parent.said("ended")
-    assert "A new angle has not come for 1 s" in ended["ended"]
+    (ended,) = session.parent.said(Ended)
+    assert "A new angle has not come for 1 s" in ended.reason
     session.assert_safe()
 
 
@@ -145,7 +146,7 @@ def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monk
 
     def stale(drive):
         """In the middle of the first record for long enough to end it; once in the next tare."""
-        ended = len(session.parent.said("finished"))
+        ended = len(session.parent.said(Finished))
         if ended and not ends:
             ends.append(drive.reads)
         return (not ended and drive.reads > tare + 900) or (
@@ -154,10 +155,10 @@ def test_stale_readings_of_a_session_do_not_count_in_the_next(make_session, monk
 
     monkeypatch.setattr(type(session.drive), "angle_stale", property(stale))
     session.obey(short(session), short(session))
-    first, second = session.parent.said("finished")
-    assert first["finished"] == "fault"
-    assert "angle" in first["reason"]
-    assert (second["finished"], second["reason"]) == ("complete", "")
+    first, second = session.parent.said(Finished)
+    assert first.outcome == "fault"
+    assert "angle" in first.reason
+    assert (second.outcome, second.reason) == ("complete", "")
 
 
 def test_a_device_that_fails_in_a_session_ends_the_attendance_after_it(make_session):
@@ -167,10 +168,10 @@ def test_a_device_that_fails_in_a_session_ends_the_attendance_after_it(make_sess
     session = make_session()
     session.drive.fault_at, session.drive.fault = 2000, fail
     session.obey(short(session), short(session))
-    (finished,) = session.parent.said("finished")
-    assert finished["finished"] == "fault"
-    assert finished["device_failed"] is True
-    assert session.parent.said("ended") == [{"ended": "The drive is gone."}]
+    (finished,) = session.parent.said(Finished)
+    assert finished.outcome == "fault"
+    assert finished.device_failed is True
+    assert session.parent.said(Ended) == [Ended("The drive is gone.")]
     session.assert_safe()
 
 
@@ -187,8 +188,8 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
     session.parent.alive = alive
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert session.finished["reason"] == (
+    assert session.finished.outcome == "fault"
+    assert session.finished.reason == (
         "Supervisor watchdog timeout (2 s); session aborted. Check CPU load."
     )
     samples = session.samples
@@ -213,8 +214,8 @@ def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     session.drive.read_angle = suspended
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert "suspended for 90.0 s" in session.finished["reason"]
+    assert session.finished.outcome == "fault"
+    assert "suspended for 90.0 s" in session.finished.reason
     assert 1000 < len(session.samples) <= 1066
 
 
@@ -268,21 +269,21 @@ def test_an_encoder_that_slips_between_two_orders_is_noticed(
     session = make_session(clock=clock())
 
     def order(name):
-        return short(session) if name == "session" else {name: True}
+        return short(session) if name == "session" else {"zero": Zero(), "tare": Tare()}[name]
 
     orders = [order(name) for name in (first, then) if name is not None]
     jump_between(session, len(orders) - 1, counts)
     session.obey(*orders)
-    (ended,) = session.parent.said("ended")
-    assert "The encoder jumped by " in ended["ended"]
-    assert f"{counts * 7e-5:.2g}"[:-1] in ended["ended"]
-    assert "set the zero again" in ended["ended"]
-    told = session.parent.said("finished")
+    (ended,) = session.parent.said(Ended)
+    assert "The encoder jumped by " in ended.reason
+    assert f"{counts * 7e-5:.2g}"[:-1] in ended.reason
+    assert "set the zero again" in ended.reason
+    told = session.parent.said(Finished)
     if then == "session" and clock is VirtualClock:
-        assert told[-1]["finished"] == "fault"
-        assert told[-1]["device_failed"] is True
-        assert told[-1]["counts"]["scheduled"] == 0
-    assert session.parent.said("refused") == []
+        assert told[-1].outcome == "fault"
+        assert told[-1].device_failed is True
+        assert told[-1].counts["scheduled"] == 0
+    assert session.parent.said(Refused) == []
     session.assert_safe()
 
 
@@ -291,19 +292,19 @@ def test_an_encoder_that_slips_in_the_pause_before_the_tare_is_noticed(make_sess
     session = make_session()
     session.drive.fault_at, session.drive.fault = 500, lambda angle_rad: angle_rad + 0.56
     session.obey(short(session))
-    (finished,) = session.parent.said("finished")
-    assert finished["device_failed"] is True
-    assert "The encoder jumped by 0.56 rad within one tick" in finished["reason"]
+    (finished,) = session.parent.said(Finished)
+    assert finished.device_failed is True
+    assert "The encoder jumped by 0.56 rad within one tick" in finished.reason
 
 
 def test_an_encoder_that_slips_in_a_session_loses_the_connection_and_so_the_zero(make_session):
     session = make_session()
     session.drive.fault_at, session.drive.fault = 2000, lambda angle_rad: angle_rad + 0.05
-    session.obey({"zero": True}, short(session), short(session))
-    (finished,) = session.parent.said("finished")
-    assert "encoder's jump of" in finished["reason"]
-    assert finished["device_failed"] is True
-    assert len(session.parent.said("ended")) == 1
+    session.obey(Zero(), short(session), short(session))
+    (finished,) = session.parent.said(Finished)
+    assert "encoder's jump of" in finished.reason
+    assert finished.device_failed is True
+    assert len(session.parent.said(Ended)) == 1
     session.assert_safe()
 
 
@@ -320,19 +321,19 @@ def test_a_hand_may_turn_the_motor_between_sessions(make_session, speed_rad_s):
 
     session.drive.fault_at, session.drive.fault = 1, hand
     looks = [None] * 20
-    session.parent.poll = lambda timeout_s: looks.pop() if looks else {"zero": True}
+    session.parent.poll = lambda timeout_s: looks.pop() if looks else Zero()
     done = session.parent.send
 
-    def send(**message):
-        done(**message)
-        if "done" in message:
+    def send(message):
+        done(message)
+        if isinstance(message, Measured):
             session.stop.request()
 
     session.parent.send = send
     session.obey()
-    assert session.parent.said("ended") == [{"ended": ""}]
-    (zeroed,) = session.parent.said("done")
-    assert zeroed["done"]["moved_rad"] == pytest.approx(turned[-1], abs=1e-3)
+    assert session.parent.said(Ended) == [Ended("")]
+    (zeroed,) = session.parent.said(Measured)
+    assert zeroed.values["moved_rad"] == pytest.approx(turned[-1], abs=1e-3)
 
 
 @pytest.mark.parametrize("bits", [None, 0])

@@ -10,6 +10,7 @@ import pytest
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
 from rigd.engine._cycle import make_watch
+from rigd.engine._messages import Finished, Tare
 from rigd.engine._shared_state import Word
 from rigd.engine._timing import VirtualClock
 from rigd.excitation import chirp, hold
@@ -224,14 +225,14 @@ def test_an_interlock_ends_the_session_without_torque(make_session, name):
     session.assert_safe()
     assert not session.drive.inner._plant.enabled
     finished = session.finished
-    assert finished["finished"] == ("stopped" if row.action is Action.STOP else "fault")
-    assert re.match(case.says, finished["reason"]), finished["reason"]
+    assert finished.outcome == ("stopped" if row.action is Action.STOP else "fault")
+    assert re.match(case.says, finished.reason), finished.reason
     if row.limit:
-        assert f"({row.limit}). {row.remedy}" in finished["reason"]
+        assert f"({row.limit}). {row.remedy}" in finished.reason
     samples = session.samples
     assert samples["status"][-1] & Status.TORQUE_OFF
     assert samples["torque_command_nm"][-1] == 0.0
-    counts = finished["counts"]
+    counts = finished.counts
     assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
     assert counts["scheduled"] < 5000
 
@@ -246,13 +247,13 @@ def test_a_zero_that_moves_during_a_session_is_told(make_session):
     sensor(session, wrong_from=8700, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.05])
     finished = session.run().finished
     session.assert_safe()
-    assert finished["finished"] == "complete"  # the record is what it is
+    assert finished.outcome == "complete"  # the record is what it is
     assert re.match(
         r"After the record: The drift of the coupling torque's zero of 0\.0\d+ N·m exceeds its "
         r"limit of 0\.01 N·m \(limits\.tare_drift_nm\)",
-        finished["reason"],
+        finished.reason,
     )
-    assert 0.049 < float(finished["results"]["tare_drift_nm"]) < 0.051
+    assert 0.049 < float(finished.results["tare_drift_nm"]) < 0.051
 
 
 @pytest.mark.parametrize("operator_tares", [False, True])
@@ -262,24 +263,24 @@ def test_a_zero_that_moves_between_two_sessions_is_refused_unless_it_is_tared(
     session = make_session()
     sensor(session, wrong_from=10_001, added=[0.0, 0.0, 0.0, 0.0, 0.0, -0.05])
     job = session.order()
-    session.obey(*[job, *([{"tare": True}] if operator_tares else []), job])
+    session.obey(*[job, *([Tare()] if operator_tares else []), job])
     session.assert_safe()
-    first, second = session.parent.said("finished")
-    assert (first["finished"], first["reason"]) == ("complete", "")
+    first, second = session.parent.said(Finished)
+    assert (first.outcome, first.reason) == ("complete", "")
     if operator_tares:
-        assert (second["finished"], second["reason"]) == ("complete", "")
+        assert (second.outcome, second.reason) == ("complete", "")
     else:
-        assert second["finished"] == "fault"
-        assert re.match(r"The drift of .* zero of -0\.0\d+ N·m exceeds", second["reason"])
-        assert "rigd tare" in second["reason"]
-        assert second["counts"]["scheduled"] == 0
+        assert second.outcome == "fault"
+        assert re.match(r"The drift of .* zero of -0\.0\d+ N·m exceeds", second.reason)
+        assert "rigd tare" in second.reason
+        assert second.counts["scheduled"] == 0
 
 
 def test_a_small_drift_is_a_warning(make_session):
     session = resting(make_session)
     sensor(session, wrong_from=8700, added=[0.0, 0.0, 0.0, 0.0, 0.0, 0.005])
     finished = session.run().finished
-    assert (finished["finished"], finished["reason"]) == ("complete", "")
+    assert (finished.outcome, finished.reason) == ("complete", "")
     [warning] = [event for event in session.events if event.level == "warning"]
     assert re.match(
         r"The drift of the .* zero of 0\.00\d+ N·m is past its warning", warning.message
@@ -290,7 +291,7 @@ def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(mak
     session = make_session()
     limit(session, angle_rad=0.028)  # of which 0.8 are 0.0224; the chirp reaches 0.025
     finished = session.run().finished
-    assert finished["finished"] == "complete", finished
+    assert finished.outcome == "complete", finished
     samples = session.samples
     flagged = samples["status"] & Status.LIMIT_WARNING != 0
     near = abs(samples["angle_rad"]) >= 0.8 * 0.028
@@ -308,10 +309,10 @@ def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session)
     motor(session, continuous_torque_nm=(1.5 * heat_nm2) ** 0.5, thermal_time_constant_s=1e4)
     job = session.order()
     session.obey(job, job)
-    first, second = session.parent.said("finished")
-    assert (first["finished"], first["reason"]) == ("complete", "")
-    assert second["finished"] == "fault"
-    assert "i²t" in second["reason"]
+    first, second = session.parent.said(Finished)
+    assert (first.outcome, first.reason) == ("complete", "")
+    assert second.outcome == "fault"
+    assert "i²t" in second.reason
     session.assert_safe()
 
 
@@ -354,7 +355,7 @@ def test_an_angle_that_counts_the_other_way_round_is_told_from_too_much_amplitud
     if slow:  # the limits of a real rig
         limit(session, velocity_rad_s=4.0, tracking_error_rad=0.1)
     session.drive.fault_at, session.drive.fault = 1, lambda angle_rad: -angle_rad
-    reason = session.run().finished["reason"]
+    reason = session.run().finished.reason
     session.assert_safe()
     assert "exceeds its limit" in reason
     assert "against the torque" in reason
@@ -368,7 +369,7 @@ def test_a_push_on_the_beam_is_not_taken_for_a_wrong_sign(make_session, push_nm)
     session = make_session()
     limit(session, velocity_rad_s=2.0, tracking_error_rad=0.02)
     sensor(session, added=[0.0, 0.0, 0.0, 0.0, 0.0, push_nm])
-    reason = session.run().finished["reason"]
+    reason = session.run().finished.reason
     assert "exceeds its limit" in reason
     assert "against the torque" not in reason
 
@@ -376,7 +377,7 @@ def test_a_push_on_the_beam_is_not_taken_for_a_wrong_sign(make_session, push_nm)
 def test_too_great_an_amplitude_is_not_taken_for_a_wrong_sign(make_session):
     session = make_session()
     limit(session, velocity_rad_s=0.4)
-    reason = session.run().finished["reason"]
+    reason = session.run().finished.reason
     assert "The speed of" in reason
     assert "lower the amplitude" in reason
     assert "against the torque" not in reason

@@ -8,6 +8,7 @@ import pytest
 
 from rigd.engine import _cycle as watch
 from rigd.engine._cycle import make_watch, recalled_heat_nm2, remember_heat
+from rigd.engine._messages import Finished
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 
@@ -80,7 +81,7 @@ def test_connections_in_a_row_add_up_on_hardware_alone(make_session, runtime_fol
             ring_down_s=0.0,
         )
         session.obey(session.order(sweep))
-        assert session.parent.said("finished")[0]["finished"] == "complete"
+        assert session.parent.said(Finished)[0].outcome == "complete"
         if not simulated:
             heat.append(json.loads(watch._heat_file(session.profile).read_text())["heat_nm2"])
     if simulated:

@@ -10,6 +10,7 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
+from rigd.engine._messages import Connected, Finished, Ready
 from rigd.engine._shared_state import Phase, Stop, Word
 from rigd.engine._timing import VirtualClock
 from rigd.excitation import hold
@@ -23,16 +24,16 @@ def books(**counts):
 
 
 def assert_books_balance(session, samples):
-    counts = session.finished["counts"]
+    counts = session.finished.counts
     assert counts["scheduled"] == len(samples) + counts["missed"] + counts["lost"]
 
 
 def test_a_complete_session_has_every_tick(make_session):
     session = make_session().run()
     samples = session.samples
-    assert session.finished["finished"] == "complete"
-    assert session.finished["reason"] == ""
-    assert session.finished["counts"] == books(scheduled=5000)
+    assert session.finished.outcome == "complete"
+    assert session.finished.reason == ""
+    assert session.finished.counts == books(scheduled=5000)
     assert np.array_equal(samples["tick"], np.arange(5000))
     assert np.array_equal(samples["t_ns"], 1_000_000 * np.arange(5000))
     assert not samples["lateness_ns"].any()
@@ -51,7 +52,7 @@ def test_the_reference_starts_where_the_motor_stands_and_follows_the_excitation(
 
 def test_the_tare_takes_the_offset_away(make_session):
     session = make_session().run()
-    ready = session.parent.said("ready")[0]["ready"]
+    ready = session.parent.said(Ready)[0].tare
     offset = session.profile.rig.simulation.offset
     axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     for axis, expected in zip(axes, offset, strict=True):
@@ -133,16 +134,16 @@ def test_a_stop_leaves_the_torque_off(make_session, action, outcome, words, at_s
     session.clock = StopAt(int(at_s * 1e9), lambda: action(session))
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == outcome
-    assert words in session.finished["reason"]
+    assert session.finished.outcome == outcome
+    assert words in session.finished.reason
     samples = session.samples
     if samples is not None:
         assert samples["status"][-1] & Status.TORQUE_OFF
         assert samples["torque_command_nm"][-1] == 0.0
-        assert samples["tick"][-1] + 1 == session.finished["counts"]["scheduled"]
+        assert samples["tick"][-1] + 1 == session.finished.counts["scheduled"]
         assert_books_balance(session, samples)
     else:
-        assert session.finished["counts"]["scheduled"] == 0
+        assert session.finished.counts["scheduled"] == 0
 
 
 @pytest.mark.parametrize(
@@ -161,10 +162,10 @@ def test_a_reading_beyond_its_limit_ends_in_a_fault_in_the_same_tick(
     session.drive.fault_at, session.drive.fault = read, fault
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert words in session.finished["reason"]
+    assert session.finished.outcome == "fault"
+    assert words in session.finished.reason
     # With the session over, two more tell where the motor stands, unless the encoder failed.
-    after = 0 if session.finished["device_failed"] else 2
+    after = 0 if session.finished.device_failed else 2
     assert session.drive.reads == read + after
     samples = session.samples
     if samples is not None:
@@ -183,7 +184,7 @@ def test_a_device_that_fails_leaves_the_torque_off(make_session, read, error):
     session.drive.fault_at, session.drive.fault = read, fail
     if isinstance(error, DeviceError):
         session.run()
-        assert "The drive is gone." in session.finished["reason"]
+        assert "The drive is gone." in session.finished.reason
         samples = session.samples
         if read == 3000:
             expected = Status.TORQUE_OFF | Status.ANGLE_STALE | Status.WRENCH_STALE
@@ -202,8 +203,8 @@ def test_an_encoder_that_falls_silent_does_not_let_the_motor_run_away(make_sessi
     session.drive.stale_at = read
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert "without a new angle" in session.finished["reason"]
+    assert session.finished.outcome == "fault"
+    assert "without a new angle" in session.finished.reason
     after = 2 if read > 1000 else 0  # the same here, unless that was the tare
     assert session.drive.reads == read + 3 + after  # three are let through
     samples = session.samples
@@ -229,9 +230,9 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
         session.run()
     finally:
         type(session.drive).angle_stale = kept
-    assert session.finished["finished"] == "complete"
+    assert session.finished.outcome == "complete"
     assert np.flatnonzero(session.samples["status"] & Status.ANGLE_STALE).size == len(stale)
-    assert session.finished["counts"] == books(scheduled=5000, stale_angles=len(stale))
+    assert session.finished.counts == books(scheduled=5000, stale_angles=len(stale))
     assert session.board[Word.STALE_ANGLES] == len(stale)
     # Six per cent of ten seconds, of which there may be ten: said once, and past the half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
@@ -246,10 +247,10 @@ def test_two_of_three_angles_may_not_be_old(make_session):
     session.run()
     session.assert_safe()
     finished = session.finished
-    assert finished["finished"] == "fault"
-    assert "part of ticks without a new angle of 1.01 %" in finished["reason"]
-    assert "acquisition.deadline_us" in finished["reason"]
-    counts, samples = finished["counts"], session.samples
+    assert finished.outcome == "fault"
+    assert "part of ticks without a new angle of 1.01 %" in finished.reason
+    assert "acquisition.deadline_us" in finished.reason
+    counts, samples = finished.counts, session.samples
     assert counts["stale_angles"] in (101, 102), "one may come with the last sample"
     assert counts["stale_wrenches"] == 0
     assert np.flatnonzero(samples["status"] & Status.ANGLE_STALE).size == counts["stale_angles"]
@@ -262,8 +263,8 @@ def test_old_readings_before_the_record_do_not_count(make_session):
     session.drive.stale_at, session.drive.stale_pattern = 0, (False, True, True)
     session.clock = StopAt(1_500_000_000, lambda: setattr(session.drive, "stale_at", None))
     session.run()
-    assert session.finished["finished"] == "complete"
-    assert session.finished["counts"]["stale_angles"] <= 2
+    assert session.finished.outcome == "complete"
+    assert session.finished.counts["stale_angles"] <= 2
 
 
 def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session):
@@ -276,7 +277,7 @@ def test_a_device_that_fails_at_the_stop_does_not_spoil_the_ending(make_session)
     session.run()
     session.assert_safe()
     samples = session.samples
-    assert session.finished["finished"] == "stopped"
+    assert session.finished.outcome == "stopped"
     assert samples["status"][-1] & Status.TORQUE_OFF
     assert samples["torque_command_nm"][-1] == 0.0
     assert_books_balance(session, samples)
@@ -289,8 +290,8 @@ def test_it_refuses_to_start_while_the_motor_moves(make_session):
     session.run()
     session.assert_safe()
     assert session.drive.torques == []
-    assert session.finished["finished"] == "fault"
-    assert "not at rest" in session.finished["reason"]
+    assert session.finished.outcome == "fault"
+    assert "not at rest" in session.finished.reason
 
 
 class LateAt(VirtualClock):
@@ -312,8 +313,8 @@ def test_missed_ticks_are_skipped_flagged_and_counted(make_session):
     session = make_session(clock=LateAt({2_000_000_000: 3_200_000, 2_500_000_000: 700_000}))
     session.run()
     samples = session.samples
-    counts = session.finished["counts"]
-    assert session.finished["finished"] == "complete"
+    counts = session.finished.counts
+    assert session.finished.outcome == "complete"
     assert counts == books(scheduled=5000, missed=3, late=1)
     assert_books_balance(session, samples)
     gap = int(np.flatnonzero(np.diff(samples["tick"]) > 1)[0])
@@ -352,7 +353,7 @@ def test_a_long_record_starts_without_a_gap(make_session):
     session = make_session(excitation=hold(rate_hz=rate_hz, duration_s=3600.0, rest_s=0.0))
     session.clock = WorkingClock(3_000_000_000, session.stop.request)
     session.run()
-    assert session.finished["finished"] == "stopped"
+    assert session.finished.outcome == "stopped"
     assert session.samples["tick"][0] <= 2
 
 
@@ -361,9 +362,9 @@ def test_too_many_missed_ticks_in_a_row_end_the_session(make_session):
     session.run()
     session.assert_safe()
     samples = session.samples
-    assert session.finished["finished"] == "fault"
-    assert "missed ticks" in session.finished["reason"]
-    assert session.finished["counts"]["missed"] == 80
+    assert session.finished.outcome == "fault"
+    assert "missed ticks" in session.finished.reason
+    assert session.finished.counts["missed"] == 80
     assert samples["status"][-1] & Status.TORQUE_OFF
     assert_books_balance(session, samples)
 
@@ -385,8 +386,8 @@ def test_a_drive_that_ends_right_after_missed_ticks_ended_for_the_computers_sake
     session.drive.read_angle = read_angle
     session.run()
     session.assert_safe()
-    assert session.finished["counts"]["missed"] == 40
-    assert session.finished["reason"] == (
+    assert session.finished.counts["missed"] == 40
+    assert session.finished.reason == (
         "The drive reports an error. It came after 40 missed ticks. "
         "The computer is overloaded: close other programs."
     )
@@ -399,8 +400,8 @@ def test_ticks_missed_beyond_the_end_of_the_record_do_not_count(make_session):
     late = make_session(clock=LateAt({int(end_ns): 10_400_000}))
     late.run()
     samples = late.samples
-    counts = late.finished["counts"]
-    assert late.finished["finished"] == "complete"
+    counts = late.finished.counts
+    assert late.finished.outcome == "complete"
     assert counts["scheduled"] == 5000
     assert_books_balance(late, samples)
 
@@ -420,9 +421,9 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
     session.run()
     session.assert_safe()
     samples = np.concatenate([decode_samples(read_late[0]), session.samples])
-    assert session.finished["finished"] == "fault"
-    assert "recorder" in session.finished["reason"]
-    assert session.finished["counts"] == books(scheduled=16_002, lost=1)
+    assert session.finished.outcome == "fault"
+    assert "recorder" in session.finished.reason
+    assert session.finished.counts == books(scheduled=16_002, lost=1)
     assert_books_balance(session, samples)
     assert samples["tick"][-2:].tolist() == [15_999, 16_001]
     assert session.drive.torques[-1] != 0.0
@@ -444,9 +445,9 @@ def test_a_computer_that_stands_still_takes_no_recorder_s_time(make_session, mon
     clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=stand_still)
     monkeypatch.setattr("rigd.engine._publish.time", clock)
     session.run()
-    assert session.finished["finished"] == "complete", session.finished["reason"]
+    assert session.finished.outcome == "complete", session.finished.reason
     samples = np.concatenate([decode_samples(taken[1]), session.samples])
-    assert samples["tick"].tolist() == list(range(session.finished["counts"]["scheduled"]))
+    assert samples["tick"].tolist() == list(range(session.finished.counts["scheduled"]))
 
 
 def test_a_recorder_that_does_not_read_is_not_waited_for_for_ever(make_session, monkeypatch):
@@ -457,8 +458,8 @@ def test_a_recorder_that_does_not_read_is_not_waited_for_for_ever(make_session, 
     monkeypatch.setattr("rigd.engine._publish.time", clock)
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert session.finished["counts"]["lost"] == 2  # and the one that has the torque off
+    assert session.finished.outcome == "fault"
+    assert session.finished.counts["lost"] == 2  # and the one that has the torque off
     assert_books_balance(session, session.samples)
 
 
@@ -470,8 +471,8 @@ def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
     )
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert session.finished["counts"]["lost"] == 1
+    assert session.finished.outcome == "fault"
+    assert session.finished.counts["lost"] == 1
     assert_books_balance(session, session.samples)
 
 
@@ -480,9 +481,9 @@ def test_ticks_missed_up_to_the_end_are_judged_like_all_others(make_session):
     session = make_session(clock=LateAt({6_402_000_000: 150_000_000}))
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert "missed" in session.finished["reason"]
-    counts = session.finished["counts"]
+    assert session.finished.outcome == "fault"
+    assert "missed" in session.finished.reason
+    counts = session.finished.counts
     assert counts["scheduled"] == 5000
     assert counts["missed"] == 101
     assert_books_balance(session, session.samples)
@@ -498,10 +499,10 @@ def test_a_swinging_beam_is_not_taken_for_a_drift_of_the_sensor(make_session):
         )
     )
     session.run()
-    assert session.finished["finished"] == "complete"
+    assert session.finished.outcome == "complete"
     assert any("still swings" in event.message for event in session.events)
     assert not any(event.level == "warning" for event in session.events)
-    assert "tare_drift_nm" not in session.finished["results"]
+    assert "tare_drift_nm" not in session.finished.results
 
 
 def test_settings_that_were_not_granted_are_told_and_logged(make_session):
@@ -510,14 +511,14 @@ def test_settings_that_were_not_granted_are_told_and_logged(make_session):
     session.run()
     [warning] = [event for event in session.events if event.level == "warning"]
     assert "memory (refused: no), scheduling (refused: never)" in warning.message
-    assert session.parent.said("connected")[0]["realtime"] == session.obtained
+    assert session.parent.said(Connected)[0].realtime == session.obtained
 
 
 def test_what_supervisor_and_recorder_were_refused_is_told_as_well(make_session):
     session = make_session()
     order = session.order()
     refused = {"supervisor_scheduling": "refused: not permitted"}
-    session.obey({"session": replace(order["session"], refused=refused)})
+    session.obey(replace(order, refused=refused))
     [warning] = [event for event in session.events if event.level == "warning"]
     assert warning.message == (
         "The system did not grant supervisor_scheduling (refused: not permitted): a computer that "
@@ -531,9 +532,9 @@ def test_a_supervisor_that_does_nothing_does_not_keep_the_torque_on(make_session
     session.board[Word.GO] = 0
     session.run()
     session.assert_safe()
-    assert session.finished["finished"] == "fault"
-    assert "did not start the record" in session.finished["reason"]
-    assert session.finished["counts"]["scheduled"] == 0
+    assert session.finished.outcome == "fault"
+    assert "did not start the record" in session.finished.reason
+    assert session.finished.counts["scheduled"] == 0
 
 
 def test_the_drive_is_disabled_by_the_cycle_after_the_session_and_at_the_end(make_session):
@@ -551,8 +552,8 @@ def test_a_drive_that_may_still_be_on_is_told(make_session):
     session = make_session()
     session.drive.doubt = "Drive: it does not show that it is off."
     finished = session.run().finished
-    assert finished["finished"] == "complete"  # the record is what it is
-    assert finished["reason"] == "After the record: Drive: it does not show that it is off."
+    assert finished.outcome == "complete"  # the record is what it is
+    assert finished.reason == "After the record: Drive: it does not show that it is off."
 
 
 class StallOnTheWayBack(VirtualClock):
@@ -573,7 +574,7 @@ def test_standing_still_on_the_way_back_has_its_limit_too(make_session):
     session = make_session(clock=clock)
     clock.board = session.board
     finished = session.run().finished
-    assert "stood still for 60 ticks" in finished["reason"]
+    assert "stood still for 60 ticks" in finished.reason
     session.assert_safe()
 
 
@@ -582,7 +583,7 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
     health = session.devices.sensor.health
 
     def doubtful():
-        late = session.board[Word.SCHEDULED] > 1000 or session.parent.said("finished")
+        late = session.board[Word.SCHEDULED] > 1000 or session.parent.said(Finished)
         return replace(health(), doubt="Records are late." if late else "")
 
     session.devices.sensor.health = doubtful
@@ -592,4 +593,4 @@ def test_a_doubt_about_the_age_of_readings_is_told_once_in_each_session(make_ses
     assert [event.level for event in told] == ["warning", "warning"]
     assert told[0].t_ns > 1_000_000_000
     assert told[1].t_ns == 0, "in its tare"
-    assert [m["finished"] for m in session.parent.said("finished")] == ["complete"] * 2
+    assert [m.outcome for m in session.parent.said(Finished)] == ["complete"] * 2

@@ -1,5 +1,6 @@
 """Processes and what they are sent: no message is long, and nothing that fails is fatal."""
 
+import contextlib
 import errno
 import os
 import subprocess
@@ -7,8 +8,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from rigd.engine._ipc import Child, ChildError, packed_object
-from rigd.engine._jobs import SessionJob
+from rigd.engine._ipc import Child, ChildError
+from rigd.engine._messages import Ended, MessageReader, Ready, SessionJob, encode
 from rigd.engine._ring import map_reference, put_reference, shared_memory_fd
 from rigd.excitation._signals import MAX_TICKS
 from rigd.profile import load_profile
@@ -34,7 +35,38 @@ def test_a_reference_is_found_where_it_was_placed(memory):
 
 def test_a_loop_takes_the_longest_session_without_waiting_for_its_bytes(memory):
     job = SessionJob(load_profile("sim"), put_reference(memory, np.zeros(MAX_TICKS)))
-    assert len(packed_object("session", job)) < PIPE_BYTES
+    assert len(encode(job)) < PIPE_BYTES
+
+
+@pytest.fixture
+def pipe():
+    ends = os.pipe()
+    yield ends
+    for end in ends:
+        with contextlib.suppress(OSError):
+            os.close(end)
+
+
+def test_nobody_waits_for_the_rest_of_a_message(pipe):
+    read, write = pipe
+    reader, message = MessageReader(read), Ready({"start_angle_rad": "0.1"})
+    for byte in (data := encode(message))[:-1]:
+        os.write(write, bytes([byte]))
+        assert reader.next(0.0) is None
+    os.write(write, data[-1:] + encode(Ended("")) + data[:7])
+    assert reader.next(0.0) == message
+    assert reader.next(None) == Ended("")
+    assert reader.next(0.01) is None
+    os.close(write)
+    with pytest.raises(EOFError):
+        reader.next(None)
+
+
+def test_what_is_no_message_is_not_waited_for(pipe):
+    read, write = pipe
+    os.write(write, b"Warning: something has been printed\n")
+    with pytest.raises(ValueError, match="no message, but b'Warning: "):
+        MessageReader(read).next(0.0)
 
 
 def test_a_process_may_be_stopped_twice():

@@ -1,10 +1,8 @@
 """A fake control loop that fills a real ring, and the publisher as a real child process."""
 
 import importlib.util
-import json
 import math
 import os
-import select
 import subprocess
 import sys
 import threading
@@ -16,12 +14,12 @@ import pytest
 from processes import children, eventually, state_of
 
 from rigd.beam import Beam, Damping
-from rigd.engine._ipc import packed_object
+from rigd.engine._messages import Failed, MessageReader, encode
 from rigd.engine._ring import Ring, shared_memory_fd
 from rigd.engine._shared_state import Board, Event, Word, write_event
 from rigd.engine._topics import DESCRIPTORS, TOPICS, Channels
-from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession
-from rigd.live._server import LiveAddress
+from rigd.live._address import LiveAddress
+from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession, LiveShown
 from rigd.session._format import pack_sample_into, pack_timing_into
 from rigd.view._session_info import Subject
 
@@ -126,18 +124,19 @@ class Publisher:
             [sys.executable, *run, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            bufsize=0,  # so that what waits there is seen
+            bufsize=0,
             stderr=subprocess.PIPE,
             pass_fds=producer.fds,
             env={**os.environ, **environment},
         )
+        self._messages = MessageReader(self.process.stdout.fileno())
         self._job = LiveJob("rig under test", producer.channels.specs, linger_s)
 
     def begin(self) -> None:
         """Set it to work, and have it show a session with all that was ever written."""
-        self.send("job", self._job)
-        self.answer = self._hear("address")
-        if "address" in self.answer:
+        self.send(self._job)
+        self.answer = self._hear(LiveAddress)
+        if isinstance(self.answer, LiveAddress):
             self.show()
 
     def show(self, name: str = "chirp under test", begins: tuple[int, ...] | None = None) -> None:
@@ -145,24 +144,25 @@ class Publisher:
         begins = begins or (0,) * len(TOPICS)
         ticks = 120_000
         subject = Subject(name, RATE_HZ, ticks, (0, ticks), BEAM, Damping(zeta=1e-3))
-        self.send("session", LiveSession(subject, f"recording of {name}", begins))
-        self._hear("shown")
+        self.send(LiveSession(subject, f"recording of {name}", begins))
+        self._hear(LiveShown)
 
     def finish(self) -> None:
         """Tell it that the session is over."""
         ends = tuple(ring.written for ring in self.producer.channels.rings)
-        self.send("finish", LiveEnd(ends, "stopped", "The test is over."))
+        self.send(LiveEnd(ends, "stopped", "The test is over."))
 
-    def send(self, name: str, value: object) -> None:
-        send_object(self.process.stdin, name, value)
+    def send(self, message: object) -> None:
+        send_message(self.process.stdin, message)
 
     @property
     def address(self) -> LiveAddress:
-        return LiveAddress(**self.answer["address"])
+        assert isinstance(self.answer, LiveAddress)
+        return self.answer
 
     def next_address(self) -> LiveAddress:
         """Wait for word of another server, which is that of :attr:`address` from now on."""
-        self.answer = self._hear("address")
+        self.answer = self._hear(LiveAddress)
         return self.address
 
     @property
@@ -199,18 +199,17 @@ class Publisher:
         for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
             pipe.close()
 
-    def _hear(self, what: str) -> dict:
-        """Return its next message that has this to say, or an error."""
+    def _hear(self, kind: type) -> object:
+        """Return its next message of a kind, or why it fails."""
         while True:
-            ready, _, _ = select.select([self.process.stdout], [], [], 60.0)
-            assert ready, "the publisher does not answer"
-            message = json.loads(self.process.stdout.readline())
-            if what in message or "error" in message:
+            message = self._messages.next(60.0)
+            assert message is not None, "the publisher does not answer"
+            if isinstance(message, kind | Failed):
                 return message
 
 
-def send_object(pipe, name: str, value: object) -> None:
-    pipe.write(packed_object(name, value))
+def send_message(pipe, message: object) -> None:
+    pipe.write(encode(message))
     pipe.flush()
 
 
@@ -344,7 +343,7 @@ def receive(save):
 
 @pytest.fixture
 def send():
-    return send_object
+    return send_message
 
 
 @pytest.fixture

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from processes import eventually
 
-from rigd.live._server import LiveAddress, announce, find, free_port, running, withdraw
+from rigd.live._address import LiveAddress, announce, find, running, withdraw
+from rigd.live._server import free_port
 from rigd.runtime._folder import runtime_folder
 
 

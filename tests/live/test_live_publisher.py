@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from processes import eventually, has_ended, listeners, sockets
 
+from rigd.engine._messages import Failed
 from rigd.engine._shared_state import Word
+from rigd.live._address import LiveAddress, find
 from rigd.live._ring_reader import LiveJob
-from rigd.live._server import find
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
@@ -41,7 +42,7 @@ def accepts(port: int) -> bool:
 
 
 def test_first_line_is_where_the_view_is(publisher):
-    assert set(publisher.answer) == {"address"}
+    assert isinstance(publisher.answer, LiveAddress)
     address = publisher.address
     assert (address.rig, address.pid) == ("rig under test", publisher.process.pid)
     assert find("rig under test") == address
@@ -156,7 +157,7 @@ def test_ends_when_its_parent_dies_though_its_input_stays_open(producer, send):
     )
     with middle:
         pid = int(middle.stderr.readline())
-        send(middle.stdin, "job", LiveJob("orphan", producer.channels.specs, linger_s=60.0))
+        send(middle.stdin, LiveJob("orphan", producer.channels.specs, linger_s=60.0))
         assert b"address" in middle.stdout.readline()
         (server,) = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
         middle.kill()
@@ -273,8 +274,8 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
     (package / "rerun").write_text(script)
     (package / "rerun").chmod(mode)
     publisher = start_publisher(PYTHONPATH=str(tmp_path))
-    assert set(publisher.answer) == {"error"}
-    assert publisher.answer["error"].endswith(sentence)
+    assert isinstance(publisher.answer, Failed)
+    assert publisher.answer.reason.endswith(sentence)
     assert publisher.end() == (1, "", "")
 
 

@@ -12,7 +12,7 @@ from processes import eventually
 
 from rigd.engine._shared_state import Word
 from rigd.excitation._named import make_excitation
-from rigd.live._server import find
+from rigd.live._address import find
 from rigd.profile import load_profile
 from rigd.runner import _live_view as live_view
 from rigd.runner._request import Order
@@ -181,7 +181,7 @@ class StillCrew:
 
     def __getitem__(self, process):
         return SimpleNamespace(
-            poll=lambda timeout_s: None, kill=lambda: None, send_object=lambda name, value: None
+            poll=lambda timeout_s: None, kill=lambda: None, send=lambda message: None
         )
 
 

@@ -4,7 +4,7 @@ from typing import NoReturn, Protocol
 
 import pytest
 
-from rigd.live._server import _NO_GRAPHICS
+from rigd.live._program import _NO_GRAPHICS
 
 NO_GRAPHICS = "LIVE VIEW NOT TESTED: no Vulkan driver for the viewer (package mesa-vulkan-drivers)"
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rigd.devices.contracts import DeviceError
+from rigd.errors import UserError
 
 
-class WrongUseError(ValueError):
+class WrongUseError(UserError, ValueError):
     """A request that cannot be met; the message says why, for the operator."""
 
 

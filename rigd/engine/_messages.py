@@ -1,0 +1,257 @@
+"""Messages between the processes of a rig: what each of them says, and how it travels.
+
+The supervisor gives jobs and orders, the others answer:
+
+============  =============================================  ================================
+process       is told                                        tells
+============  =============================================  ================================
+control       ControlJob, then SessionJob, Tare, Zero        Connected, then Ready, Finished;
+                                                             Measured or Refused; last Ended
+recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
+live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
+============  =============================================  ================================
+
+A message is one of these objects, pickled, behind its length. Each is short enough for a pipe's
+buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` would wait for
+the rest of a message of which a hung child has written half; nobody here does.
+"""
+
+import os
+import pickle
+import select
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:  # children start before the supervisor has imported any of these
+    from rigd.devices import Reality
+    from rigd.engine._ring import ReferenceSpec
+    from rigd.engine._topics import ChannelSpecs
+    from rigd.profile import Profile, RealtimeSettings
+
+_LENGTH: Final = struct.Struct("=I")
+_MOST_BYTES: Final = 1 << 24
+"""No message is longer: something else has been written into the pipe, such as a text."""
+
+
+# Control
+
+
+@dataclass(frozen=True, slots=True)
+class ControlJob:
+    """The rig to attend to."""
+
+    profile: "Profile"
+    moving: "Reality | None"
+    """What the operator was told would move, and nothing else may; None: nothing was told."""
+    channels: "ChannelSpecs"
+    fast: bool
+    """Run under the virtual clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionJob:
+    """The session to run on it."""
+
+    profile: "Profile"
+    """The rig's; its controller and limits may be others."""
+    reference: "ReferenceSpec"
+    """Angles relative to the one at the start."""
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """What the system did not grant supervisor and recorder, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tare:
+    """Average the sensor at rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """Make the present angle the zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """The devices are connected, and the torque is off."""
+
+    calibration: Mapping[str, Any]
+    drive: Mapping[str, str]
+    """What the drive states of itself, for the file."""
+    realtime: Mapping[str, str]
+    """The real-time settings that were granted, for the file."""
+    simulated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The motor is held where it stands; the record may begin."""
+
+    tare: Mapping[str, str]
+    """Metadata of the tare."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A session has ended, and the torque is off."""
+
+    outcome: str
+    reason: str
+    fault: bool
+    """Something failed, in the record or after it."""
+    counts: Mapping[str, int]
+    results: Mapping[str, str] = field(default_factory=dict)
+    """Results for the record's outcome, in addition to the counts."""
+    device_failed: bool = False
+    """The control process lets go of all, and ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was measured between sessions."""
+
+    values: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """Why it could not be measured."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The devices are closed; the last message."""
+
+    reason: str
+    """Empty if it was asked for."""
+
+
+# Recorder
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderJob:
+    """The file to write."""
+
+    path: Path
+    channels: "ChannelSpecs"
+    realtime: "RealtimeSettings | None" = None
+    """What it may ask of the scheduler; None: nothing, for it is not in real time."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileHeader:
+    """What stands in the file before its first sample."""
+
+    metadata: Mapping[str, str]
+    segments: Mapping[str, tuple[int, int]]
+    attachments: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Close:
+    """Close the file with its outcome."""
+
+    outcome: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """The file is there."""
+
+    realtime: Mapping[str, str]
+    """What the scheduler granted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Armed:
+    """The record may begin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Closed:
+    """The file is whole."""
+
+    path: Path | None = None
+    """None: no record had begun, and there is none."""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """What was counted in it."""
+    outcome: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A recorder or a live publisher cannot do its work, and ends."""
+
+    reason: str
+    taken: bool = False
+    """The file is there already, and is somebody else's."""
+    kept: Path | None = None
+    """Where the record was saved, if not under the file's own name."""
+
+
+# On their way
+
+
+def encode(message: object) -> bytes:
+    """Return the bytes of a message."""
+    data = pickle.dumps(message)
+    return _LENGTH.pack(len(data)) + data
+
+
+class MessageReader:
+    """Messages from a descriptor, without ever waiting longer than asked.
+
+    Parameters
+    ----------
+    fd
+        Descriptor to read from.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._pending = bytearray()
+
+    def next(self, timeout_s: float | None) -> object | None:
+        """Return the next message, or None if none is complete in time (None: wait for ever).
+
+        Raises
+        ------
+        EOFError
+            If the other end is gone and no whole message is left.
+        ValueError
+            If what comes is no message.
+        """
+        while (message := self._whole()) is None:
+            if not is_ready(self._fd, select.POLLIN, timeout_s):
+                return None
+            data = os.read(self._fd, 65_536)
+            if not data:
+                raise EOFError
+            self._pending += data
+        return message
+
+    def _whole(self) -> object | None:
+        if len(self._pending) < _LENGTH.size:
+            return None
+        (length,) = _LENGTH.unpack_from(self._pending)
+        if length > _MOST_BYTES:
+            raise ValueError(f"no message, but {bytes(self._pending[:80])!r}")
+        end = _LENGTH.size + length
+        if len(self._pending) < end:
+            return None
+        message: object = pickle.loads(self._pending[_LENGTH.size : end])
+        del self._pending[:end]
+        return message
+
+
+def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
+    """Wait for a descriptor; unlike `select`, `poll` takes numbers beyond 1023."""
+    waiting = select.poll()
+    waiting.register(fd, event)
+    return bool(waiting.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))

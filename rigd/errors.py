@@ -1,0 +1,57 @@
+"""Errors of the rig: the classes from which every error that an operator may be told derives.
+
+::
+
+    RigdError
+     +-- UserError             the request has to be another: exit code 2
+     |    +-- ProfileError          a key of the profile is missing, or its value is out of range
+     |    +-- UnknownDeviceError    [devices] names a driver that does not exist
+     |    +-- ExcitationError       --amplitude 0, or a CSV file with semicolons
+     |    +-- ControlDesignError    the closed loop would be unstable
+     |    +-- RealisationError      the beam's damping has no stable state space
+     |    +-- RefusedError          the predicted angle exceeds limits.angle_rad
+     |    |    +-- NoRoomError          the disk is too full for the session
+     |    +-- UnknownGroupError     --group names no group of this computer
+     |    +-- WrongUseError         rigd inject with a fault that does not exist
+     +-- FailureError          the same request may succeed later: exit code 1
+     |    +-- DeviceError           the drive does not answer, or reports a fault
+     |    +-- ChildError            the control process was killed
+     |    +-- RigError              the rig is not connected, or its zero is lost
+     |    +-- SessionFailedError    the recorder died; part of the record is kept
+     |    +-- SeriesFailedError     either of the two, after some sessions of a series
+     |    +-- RigBusyError          another program runs the rig
+     |    +-- AddressError          no daemon is running, or its socket cannot be made
+     |    +-- DaemonGoneError       the daemon was killed while it was asked
+     |    +-- SessionError          a session file is damaged, or the disk is full
+     |    +-- RrdFileError          a recording for Rerun exists already
+     |    +-- RerunError            Rerun's program cannot be run
+     |    +-- EdsError, UnusableDriveError    the file of a drive is none, or lacks what is needed
+     |    +-- EstimateError         the sessions do not determine the motor's data
+     |    +-- LoopError, CyclictestError      rigd bench could not measure
+     +-- CommandError, RefusedByDaemonError   of either kind, as the daemon says
+
+The command line translates them in one place (`rigd.cli.options.errors_told`). What is no
+`RigdError` is a mistake in the program, and ends with a traceback; the control process ends with
+the torque off whatever it was.
+"""
+
+
+class RigdError(Exception):
+    """An error whose message is for the operator."""
+
+    wrong_use = False
+    """The request itself has to be another; otherwise the same one may succeed later."""
+
+    def told(self) -> str:
+        """Return the message for the operator; it may take some seconds to find out more."""
+        return str(self)
+
+
+class UserError(RigdError):
+    """A request that cannot be met as it is."""
+
+    wrong_use = True
+
+
+class FailureError(RigdError):
+    """Something failed that was asked for rightly."""

@@ -1,0 +1,141 @@
+"""What a terminal shows of sessions: their plan, their progress, and how they ended.
+
+`rigd run` and `rigd start` show the same. Plans and results are taken as JSON documents have them,
+for `rigd start` gets them from the daemon.
+"""
+
+import contextlib
+import threading
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from rigd.engine import Phase
+
+_PATIENCE_S: Final = 2.0
+"""Longest wait for a terminal that was stopped, at the end of a session."""
+
+
+def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
+    """Say what a session is predicted to do.
+
+    Parameters
+    ----------
+    plan
+        As in the reply to ``start``. A daemon of before an update leaves some of it out: to fail
+        here would leave its session without Ctrl-C.
+    """
+    limits = plan.get("limits", {})
+
+    def peak(name: str, unit: str) -> str:
+        limit = f" of {limits[name]:g}" if name in limits else ""
+        return f"{plan[f'peak_{name}']:.3g}{limit} {unit}"
+
+    what = f"{plan['excitation']} on {plan['profile']}: " if "profile" in plan else ""
+    yield f"{what}{plan['record_s']:g} s of record."
+    yield (
+        f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
+        f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
+    )
+    if words := plan.get("tip_in_words"):
+        yield words
+    for warning in plan["warnings"]:
+        yield f"Warning: {warning}"
+
+
+def result_line(session: Mapping[str, Any]) -> str:
+    """Say how a session ended.
+
+    Parameters
+    ----------
+    session
+        As :meth:`rigd.runner.SessionResult.as_dict` gives it.
+    """
+    reason = f" {session['reason']}" if session["reason"] else ""
+    if session["part"] is not None:
+        return f"{session['outcome']}: no whole record, but {session['part']}.{reason}"
+    if session["path"] is None:
+        return f"{session['outcome']}: no record.{reason}"
+    return (
+        f"{session['outcome']}: {session['scheduled']} ticks scheduled = {session['recorded']} "
+        f"recorded + {session['missed']} missed + {session['lost']} lost; "
+        f"{session['late']} late; {session['stale_angles']} stale angles, "
+        f"{session['stale_wrenches']} stale wrenches.{reason}"
+    )
+
+
+class ProgressLine:
+    """One line on standard error that says how far a session is, and messages above it.
+
+    It is written by a thread of its own: a terminal that was stopped (Ctrl-S), or a pipe that
+    nobody reads, must not keep the supervisor from its session.
+    """
+
+    def __init__(self) -> None:
+        # Only now: the processes of the session are on their way.
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:3.0f} %"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[counts]}"),
+            console=Console(stderr=True),
+            transient=True,
+            auto_refresh=False,
+        )
+        self._task = self._progress.add_task("preparing", total=None, counts="")
+        self._lock = threading.Lock()
+        self._state: dict[str, Any] = {}
+        self._messages: list[str] = []
+        self._closed = False
+        self._changed = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def update(
+        self, phase: Phase, tick: int, total: int, *, missed: int, late: int, number: str = ""
+    ) -> None:
+        """Show how far the session is; `number` says which of a series."""
+        self._state = {
+            "description": f"{phase.words} {number}".rstrip(),
+            "completed": tick,
+            "total": total,
+            "counts": f"{missed} missed, {late} late" if missed else "",
+        }
+        self._changed.set()
+
+    def say(self, message: str) -> None:
+        """Write a message above the line."""
+        with self._lock:
+            self._messages.append(message)
+        self._changed.set()
+
+    def close(self) -> None:
+        """Take the line away, once all is written or the terminal takes nothing for a while."""
+        self._closed = True
+        self._changed.set()
+        self._thread.join(_PATIENCE_S)
+
+    def _work(self) -> None:
+        closed = False
+        while not closed:
+            self._changed.wait()
+            self._changed.clear()
+            closed = self._closed  # looked at first: what was said before is still written
+            with self._lock:
+                messages, self._messages = self._messages, []
+            with contextlib.suppress(OSError):  # the terminal is gone; the session is not
+                self._show(messages)
+        if self._progress.live.is_started:  # otherwise it would only leave an empty line
+            with contextlib.suppress(OSError):
+                self._progress.stop()
+
+    def _show(self, messages: list[str]) -> None:
+        for message in messages:
+            self._progress.console.print(message, markup=False, highlight=False, soft_wrap=True)
+        if self._state:
+            self._progress.start()
+            self._progress.update(self._task, **self._state)
+            self._progress.refresh()

@@ -1,0 +1,176 @@
+"""Series: the sessions of one request, planned once and run one after the other.
+
+`rigd run` and the daemon run their sessions by it; whom they tell of it is theirs to say
+(`SeriesWatcher`).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+from rigd.engine import Event
+from rigd.excitation import Excitation
+from rigd.profile import Profile
+from rigd.runner._planning import plan_session
+from rigd.runner._request import Order, choose_path, make_room
+from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
+from rigd.runtime import StopRequest
+
+
+class SessionRig(Protocol):
+    """Part of :class:`rigd.runner.Rig` that runs sessions."""
+
+    def run(
+        self,
+        order: Order,
+        stop: StopRequest,
+        watcher: Watcher,
+        listens: Callable[[], bool] = always,
+    ) -> SessionResult:
+        """Run one session."""
+
+    def show(self, order: Order, stop: StopRequest) -> str:
+        """Start its live view."""
+
+
+class SeriesWatcher(Protocol):
+    """Whoever is told of a series, in the order of these methods for each of its sessions."""
+
+    def begins(self, number: int, path: Path) -> None:
+        """Take note of the next session, from 1 on, and its file; an error ends the series."""
+
+    def shown(self, where: str) -> None:
+        """Take note of where its live view is, or why there is none."""
+
+    def update(self, progress: SessionProgress, events: list[Event]) -> None:
+        """Take note of the progress and of what happened, some twenty times a second."""
+
+    def ended(self, result: SessionResult) -> None:
+        """Take note of how it ended."""
+
+
+class Series:
+    """Sessions of one excitation on one connection, checked against limits and disk.
+
+    Parameters
+    ----------
+    profile, excitation
+        Rig and excitation of each session.
+    folder
+        Where the files go; made if it does not exist.
+    repeat
+        Number of sessions.
+    notes
+        Operator, specimen, note; what is empty is left out.
+    force
+        See :func:`rigd.runner._planning.plan_session`.
+
+    Attributes
+    ----------
+    plan
+        What each session is predicted to do.
+    results
+        How the sessions so far ended.
+
+    Raises
+    ------
+    RefusedError, ControlDesignError, RealisationError
+        If the sessions would leave the limits, or cannot be predicted.
+    NoRoomError
+        If there is no room for the first one.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        excitation: Excitation,
+        folder: Path,
+        *,
+        repeat: int = 1,
+        notes: Mapping[str, str] | None = None,
+        force: bool = False,
+    ) -> None:
+        self._profile = profile
+        self._excitation = excitation
+        self._folder = folder
+        self._repeat = repeat
+        self._notes = {name: text for name, text in (notes or {}).items() if text}
+        self.plan = plan_session(profile, excitation, force=force)
+        self.results: list[SessionResult] = []
+        self._make_room()
+
+    @property
+    def ticks(self) -> int:
+        """Ticks of each session's record."""
+        return int(self._excitation.reference_rad.size)
+
+    def plan_document(self) -> dict[str, Any]:
+        """Return the plan as JSON documents have it."""
+        profile = self._profile
+        return {
+            "excitation": self._excitation.kind,
+            "profile": profile.name,
+            "record_s": self.ticks / profile.rig.rate_hz,
+            **asdict(self.plan.prediction),
+            "limits": {
+                "angle_rad": profile.limits.angle_rad,
+                "velocity_rad_s": profile.limits.velocity_rad_s,
+                "torque_nm": profile.rig.motor.peak_torque_nm,
+            },
+            "tip_in_words": self.plan.tip_in_words,
+            "warnings": list(self.plan.warnings),
+        }
+
+    def run(
+        self,
+        rig: SessionRig,
+        stop: StopRequest,
+        watcher: SeriesWatcher,
+        *,
+        live: bool,
+        listens: Callable[[], bool] = always,
+    ) -> None:
+        """Run the sessions, up to a stop or the first that does not end well.
+
+        Each waits until the beam has come to rest from the one before.
+
+        Parameters
+        ----------
+        rig
+            Connected.
+        stop
+            The operator's.
+        watcher
+            Whoever is told.
+        live
+            Show each session in a live view.
+        listens
+            See :class:`rigd.runner._session.Session`.
+
+        Raises
+        ------
+        NoRoomError
+            If there is no room for a further session.
+        RigError, SessionFailedError
+            If a session cannot be run, or failed; it is not among the results.
+        """
+        for number in range(1, self._repeat + 1):
+            if stop.requested:
+                return
+            self._make_room()
+            counted = self._repeat > 1
+            path = choose_path(self._folder, self._excitation.kind, number if counted else None)
+            notes = self._notes | ({"series": f"{number} of {self._repeat}"} if counted else {})
+            watcher.begins(number, path)
+            order = Order(self._profile, self._excitation, path, tuple(notes.items()))
+            if live:
+                watcher.shown(rig.show(order, stop))
+            result = rig.run(order, stop, watcher.update, listens)
+            self.results.append(result)
+            watcher.ended(result)
+            if not result.went_well:
+                return
+
+    def _make_room(self) -> None:
+        make_room(self._folder, self._excitation, self._profile.limits)

@@ -1,0 +1,89 @@
+"""Addresses: where a process of this user is found, and whether it is still there.
+
+A process is found in the runtime folder: by a Unix socket on which it listens, or by a small JSON
+file that it announces. What a dead process left is recognised by nobody listening (`answers`), or
+by that process being gone (`started_at`).
+"""
+
+import json
+import os
+import socket
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from rigd.runtime._folder import runtime_folder
+
+_PROBE_S: Final = 1.0
+_MOST_BYTES: Final = 65_536
+
+
+def file_name(rig: str) -> str:
+    """Return a rig's name as file names have it: all but letters and digits as ``-``."""
+    return "".join(c if c.isalnum() else "-" for c in rig).strip("-")
+
+
+def address_files(pattern: str, *folders: Path) -> list[Path]:
+    """Return the files of a pattern in some folders (default: the user's own)."""
+    found: list[Path] = []
+    for folder in folders or (runtime_folder(),):
+        with suppress(OSError):
+            found += folder.glob(pattern)
+    return sorted(found)
+
+
+def announce(path: Path, address: Mapping[str, object]) -> None:
+    """Write down an address for this user only, until it is withdrawn.
+
+    Whoever reads it meanwhile gets the old or the new one. The folder is made.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    fresh = path.with_suffix(f".{os.getpid()}")
+    fresh.unlink(missing_ok=True)
+    fresh.touch(mode=0o600)
+    fresh.write_text(json.dumps(address), encoding="utf-8")
+    fresh.replace(path)
+
+
+def read_address(path: Path) -> dict[str, Any]:
+    """Return what was announced; empty if nothing was, or something else lies there."""
+    try:
+        # Anything may lie there, even what blocks whoever opens it.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+        with os.fdopen(descriptor, "rb") as file:
+            found = json.loads(file.read(_MOST_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def answers(path: str | Path) -> bool:
+    """Whether somebody listens on a Unix socket: on what a dead process left nobody does."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(_PROBE_S)
+        try:
+            probe.connect(os.fspath(path))
+        except (BlockingIOError, TimeoutError):
+            return True  # its queue is full
+        except (OSError, ValueError):  # the latter where it can be no path
+            return False
+    return True
+
+
+def started_at(pid: int) -> int | None:
+    """Return when a process was started, in clock ticks since the computer was.
+
+    No other process has both numbers. None if it does not run.
+    """
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text("utf-8")
+    except OSError:
+        return None
+    state, *rest = text.rpartition(")")[2].split()  # the name before may hold anything
+    return None if state in "ZX" else int(rest[18])

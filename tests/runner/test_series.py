@@ -1,0 +1,135 @@
+"""Sessions of a series, and what a terminal shows of them, without processes."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from rigd.excitation import hold
+from rigd.profile import load_profile
+from rigd.runner._console import ProgressLine, plan_lines, result_line
+from rigd.runner._request import NoRoomError
+from rigd.runner._series import Series
+from rigd.runner._session import SessionResult
+from rigd.runtime import StopRequest
+
+WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
+
+
+class Rig:
+    """Runs nothing, and notes what it was to run."""
+
+    def __init__(self, *results):
+        self.results = list(results)
+        self.orders = []
+
+    def show(self, order, stop):
+        return "Live view: there"
+
+    def run(self, order, stop, watcher, listens):
+        self.orders.append(order)
+        return self.results.pop(0)
+
+
+class Watcher:
+    def __init__(self):
+        self.told = []
+
+    def __getattr__(self, name):
+        return lambda *what: self.told.append((name, *what))
+
+
+@pytest.fixture
+def make_series(tmp_path):
+    profile = load_profile("sim")
+    excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+
+    def make(**options):
+        return Series(profile, excitation, tmp_path / "out", **options)
+
+    return make
+
+
+def test_a_series_ends_with_the_first_session_that_does_not_go_well(make_series):
+    series = make_series(repeat=4, notes={"operator": "Ada", "note": ""})
+    bad = replace(WELL, outcome="fault")
+    rig, watcher = Rig(WELL, bad), Watcher()
+    series.run(rig, StopRequest(), watcher, live=True)
+    assert series.results == [WELL, bad]
+    assert [dict(order.notes) for order in rig.orders] == [
+        {"operator": "Ada", "series": "1 of 4"},
+        {"operator": "Ada", "series": "2 of 4"},
+    ]
+    first, second = (order.path for order in rig.orders)
+    assert first.stem.endswith("-hold-01")
+    assert watcher.told == [
+        ("begins", 1, first), ("shown", "Live view: there"), ("ended", WELL),
+        ("begins", 2, second), ("shown", "Live view: there"), ("ended", bad),
+    ]  # fmt: skip
+
+
+def test_a_lone_session_is_not_numbered(make_series):
+    rig = Rig(WELL)
+    make_series().run(rig, StopRequest(), Watcher(), live=False)
+    (order,) = rig.orders
+    assert order.notes == ()
+    assert order.path.stem.endswith("-hold")
+
+
+def test_after_a_stop_no_session_begins(make_series):
+    stop, watcher = StopRequest(), Watcher()
+    stop.request()
+    make_series(repeat=2).run(Rig(), stop, watcher, live=False)
+    assert watcher.told == []
+
+
+def test_a_disk_that_fills_up_keeps_what_there_is(make_series, tmp_path):
+    series = make_series(repeat=3)
+
+    class Full(Rig):
+        def run(self, *order):
+            (tmp_path / "out").rmdir()
+            (tmp_path / "out").touch()
+            return super().run(*order)
+
+    with pytest.raises(NoRoomError, match="cannot be made a folder"):
+        series.run(Full(WELL), StopRequest(), Watcher(), live=False)
+    assert series.results == [WELL]
+
+
+def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
+    document = json.loads(json.dumps(make_series().plan_document()))
+    first, peaks, *_ = plan_lines(document)
+    assert first == "hold on sim: 1.2 s of record."
+    assert " of 0.9 N·m." in peaks
+    for name in ("excitation", "profile", "limits", "tip_in_words"):  # of before an update
+        del document[name]
+    first, peaks = plan_lines(document)
+    assert first == "1.2 s of record."
+    assert " of " not in peaks
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "complete: no record."),
+        ({"outcome": "fault", "reason": "Gone."}, "fault: no record. Gone."),
+        ({"part": "a.mcap.part"}, "complete: no whole record, but a.mcap.part."),
+        (
+            {"path": "a.mcap", "missed": 1, "lost": 2},
+            "complete: 1200 ticks scheduled = 1200 recorded + 1 missed + 2 lost; 0 late; 0 stale "
+            "angles, 0 stale wrenches.",
+        ),
+    ],
+)
+def test_a_result_is_told_in_a_line(changes, said):
+    assert result_line(WELL.as_dict() | changes) == said
+
+
+def test_what_was_said_last_is_written(capsys):
+    for number in range(20):
+        line = ProgressLine()
+        line.say("[first]")
+        line.say(f"last {number}")
+        line.close()
+        assert capsys.readouterr().err == f"[first]\nlast {number}\n"
