@@ -207,6 +207,11 @@ class Viewer(_Window):
         return self._program.last_words
 
     @property
+    def without_graphics(self) -> bool:
+        """Whether it said that it cannot draw: that the computer has no graphics it can use."""
+        return self._program.without_graphics
+
+    @property
     def control_url(self) -> str:
         """Address at which the viewer accepts commands; empty: none yet."""
         port = self._program.grpc_port
