@@ -410,14 +410,11 @@ class Unknowns:
         parameters = self.parameters(x)
         row = {name: i for i, name in enumerate(self.structure.free)}
         derivative = np.eye(len(row))
-        if "zeta" in row:
-            derivative[row["zeta"], row["zeta"]] = parameters["zeta"]
-            if "alpha" in row:
-                derivative[row["zeta"], row["alpha"]] = -parameters["zeta"] * self.ln_internal_rad_s
-        if "gamma" in row:
-            derivative[row["gamma"], row["gamma"]] = parameters["gamma"]
-            if "lambda" in row:
-                derivative[row["gamma"], row["lambda"]] = (
-                    -parameters["gamma"] * self.ln_external_rad_s
-                )
+        ln_rad_s = {"alpha": self.ln_internal_rad_s, "lambda": self.ln_external_rad_s}
+        for order, coefficient in COEFFICIENT_OF.items():
+            if coefficient in row:
+                derivative[row[coefficient], row[coefficient]] = parameters[coefficient]
+                if order in row:
+                    slope = -parameters[coefficient] * ln_rad_s[order]
+                    derivative[row[coefficient], row[order]] = slope
         return derivative

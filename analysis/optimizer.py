@@ -51,6 +51,17 @@ class NormalEquations:
     gradient: NDArray[np.float64]
     hessian: NDArray[np.float64]
 
+    def scaled_hessian(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Hessian with ones on its diagonal, and the root of its own diagonal, shape (k,)."""
+        scale = np.sqrt(np.maximum(np.diag(self.hessian), np.finfo(float).tiny))
+        return self.hessian / np.outer(scale, scale), scale
+
+    def held(
+        self, x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Whether the cost pushes an unknown against a bound that it rests on, shape (k,)."""
+        return ((x <= lower) & (self.gradient > 0)) | ((x >= upper) & (self.gradient < 0))
+
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
@@ -172,9 +183,7 @@ def descend(
     damping, growth = _FIRST_DAMPING, 2.0
     relief = _LEAST_RELIEF_STRAIGHT if region.straight else _LEAST_RELIEF
     while evaluations < max_evaluations:
-        held = ((x <= region.lower) & (here.gradient > 0)) | (
-            (x >= region.upper) & (here.gradient < 0)
-        )
+        held = here.held(x, region.lower, region.upper)
         free = ~held & (here.hessian.diagonal() > 0)
         if not free.any():
             break

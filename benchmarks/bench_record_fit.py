@@ -96,20 +96,13 @@ def session(plant: Plant, *, ringing: bool = False) -> Session:
     return Session(plant, *((np.fft.irfft(x, padded)[:n] / decay)[first:] for x in (angle, torque)))
 
 
-def weight_under(comparison: Comparison, analysis: RecordAnalysis) -> NDArray[np.float64]:
-    """Weights of the bins under the noise that an analysis found, shape (K,)."""
-    scale = comparison.samples * comparison.decimation.rate_hz
-    weight: NDArray[np.float64] = np.sqrt(4 / (analysis.noise_nm2_per_hz * scale))
-    return weight * analysis.compared
-
-
 class Peer:
     """The same sum of squares, put together anew, for a search that knows nothing of it."""
 
     def __init__(self, measurement: Measurement, name: str, analysis: RecordAnalysis) -> None:
         self.comparison = Comparison.of(measurement, (0.0, 50.0))
         self.unknowns = Unknowns.of(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
-        self.weight = weight_under(self.comparison, analysis)
+        self.weight = analysis.noise.weight
 
     def cost(self, x: NDArray[np.float64]) -> float:
         """Sum of squares, free decay projected out."""
@@ -195,7 +188,7 @@ def tool_inertia_of_either_sign(
     """Estimate a tool's inertia that may come out negative, everything else free as well."""
     comparison = Comparison.of(measurement, (0.0, 50.0))
     unknowns = Unknowns.of(analysis.fits[0].structure, Plant(LINK, Damping()), SETTINGS)
-    weight = weight_under(comparison, analysis)
+    weight = analysis.noise.weight
     objective = Objective(comparison, unknowns)
     steps = Steps.of(unknowns)
     place = unknowns.names.index("tool_inertia_kg_m2")

@@ -36,7 +36,7 @@ class Judged:
         start = time.process_time()
         selection = select(measurement)
         cpu_s = time.process_time() - start
-        return cls(selection, dict(_errors(made, selection)), cpu_s)
+        return cls(selection, dict(errors_of(made, selection)), cpu_s)
 
     @property
     def worst(self) -> tuple[float, str]:
@@ -44,7 +44,7 @@ class Judged:
         return max(((abs(e), name) for name, e in self.errors.items()), default=(0.0, "nothing"))
 
 
-def _errors(made: Record, selection: Selection) -> Iterator[tuple[str, float]]:
+def errors_of(made: Record, selection: Selection) -> Iterator[tuple[str, float]]:
     """Give by name the error of what the headline tells without a flag, in its deviations."""
     told = selection.headline
     for name, true in made.rig.parameters.items():

@@ -28,6 +28,8 @@ TICKS = 136_000
 LENGTH_M, DENSITY, STIFFNESS = 0.98, 4.7e-3, 0.090275
 NOISE_NM = 5e-3
 _AMPLITUDE_RAD = 0.025
+_AIR_KG_M3, _AIR_M2_S = 1.2, 1.5e-5
+"""Density and kinematic viscosity."""
 _ROOTS = np.array([1.8751040687119611, 4.694091132974175, 7.854757438237613, 10.995540734875467])
 """Of 1 + cos z cosh z."""
 
@@ -274,45 +276,99 @@ def stiffens(shares: dict[int, float], power: int, rig: Rig, seed: int) -> Recor
     return _with_forces(record(rig, seed), {m: rising(m, x) for m, x in shares.items()})
 
 
+@dataclass(frozen=True, slots=True)
+class Drag:
+    """A wire in still air, and how far its hub turns.
+
+    Drag is ``rho_air C_D d v abs(v) / 2`` per length. C_D is 1.2, or White's for a cylinder,
+    ``1 + 10 Re^(-2/3)``.
+    """
+
+    rig: Rig
+    diameter_m: float
+    amplitude_rad: float = _AMPLITUDE_RAD
+    cylinder: bool = False
+
+    def laws(self) -> tuple[float, float]:
+        """Give C_D d and what of it goes by the speed to -2/3."""
+        if not self.cylinder:
+            return 1.2 * self.diameter_m, 0.0
+        return self.diameter_m, 10 * self.diameter_m ** (1 / 3) * _AIR_M2_S ** (2 / 3)
+
+    def true_m(self, speed_m_s: float) -> float:
+        """C_D d at a speed."""
+        constant, slowing = self.laws()
+        return float(constant + slowing * speed_m_s ** (-2 / 3))
+
+
 def air_drag(diameter_m: float, rig: Rig, seed: int) -> Record:
-    """Drag of a wire, ``rho_air C_D d v abs(v) / 2`` per length, C_D = 1.2; three modes."""
-    xi = (np.arange(24) + 0.5) / 24
-    shapes = np.array([_shape(z, xi) for z in _ROOTS[:3]])
+    """Drag of a wire, ``rho_air C_D d v abs(v) / 2`` per length, C_D = 1.2."""
+    return drags([Drag(rig, diameter_m)], [seed])[0]
+
+
+def drags(wires: list[Drag], seeds: list[int], noise_nm: float = NOISE_NM) -> list[Record]:
+    """Make records of wires in air, all marched together: six modes, forces at 24 points."""
+    count = len(wires)
+    torque_nm = _braked([*wires, *(replace(wire, diameter_m=0.0) for wire in wires)])
+    made = []
+    for wire, seed, change in zip(wires, seeds, torque_nm[:count] - torque_nm[count:], strict=True):
+        angle_rad, linear_nm = (
+            signal * (wire.amplitude_rad / _AMPLITUDE_RAD) for signal in _exact(wire.rig)
+        )
+        noise = np.random.default_rng(seed).normal(scale=noise_nm, size=TICKS)
+        made.append(Record(wire.rig, angle_rad, linear_nm + change + noise))
+    return made
+
+
+def _braked(wires: list[Drag]) -> Real:
+    """Torque of beams of integer orders in air, shape (wires, n)."""
+    roots = np.concatenate([_ROOTS, (2 * np.arange(5, 7) - 1) * np.pi / 2])
+    node, weight = np.polynomial.legendre.leggauss(24)
+    xi, weight = 0.5 * (node + 1), 0.5 * weight
+    shapes = np.array([_shape(z, xi) for z in roots])
     # In units of an eigenfunction's expansion of the rigid turn x.
-    shares = np.array([2 / z**2 * LENGTH_M * np.sign(_shape(z, np.ones(1))[0]) for z in _ROOTS[:3]])
-    k = (_ROOTS[:3] / LENGTH_M) ** 4
+    shares = 2 / roots**2 * LENGTH_M
+    k = (roots / LENGTH_M) ** 4
     ratio, step = DENSITY / STIFFNESS, 1 / RATE_HZ
-    per_speed = 0.5 * 1.2 * 1.2 * diameter_m / STIFFNESS / 24
-    field = shapes * shares[:, None]
-    norm = per_speed * shapes / shares[:, None]
+    field, back = shapes * shares[:, None], weight[:, None] * (shapes / shares[:, None]).T
+    # What force does to modes beyond these, which follow it at once.
+    arm = STIFFNESS * LENGTH_M * weight * (LENGTH_M * xi - shares @ shapes)
+    zeta, gamma = (
+        np.array([getattr(wire.rig, name) for wire in wires])[:, None] for name in ("zeta", "gamma")
+    )
+    per_speed, slowing = np.array([wire.laws() for wire in wires]).T[:, :, None] * (
+        0.5 * _AIR_KG_M3 / STIFFNESS
+    )
+    slow = bool(slowing.any())
+    size = np.array([wire.amplitude_rad for wire in wires])[:, None] / _AMPLITUDE_RAD
     hub, turning = (np.array(x) for x in _hub())
+    out, rest = np.zeros((TICKS, len(wires), len(roots))), np.zeros((TICKS, len(wires)))
+    y, v = np.zeros((2, len(wires), len(roots)))
 
-    def run(size: float) -> Real:
-        out, y, v = np.zeros((TICKS, 3)), np.zeros(3), np.zeros(3)
+    def pull(j: int, y: Real, v: Real) -> tuple[Real, Real, Real]:
+        elastic = k * (y - hub[j] * size + zeta * (v - turning[j] * size))
+        speed = v @ field
+        magnitude = np.abs(speed)
+        factor = per_speed * magnitude
+        if slow:
+            factor += slowing * np.cbrt(magnitude)
+        drag = factor * speed
+        return elastic, elastic + gamma * v + drag @ back, drag
 
-        def pull(j: int, y: Real, v: Real) -> tuple[Real, Real]:
-            elastic = k * (y - hub[j] + rig.zeta * (v - turning[j]))
-            if size == 0:
-                return elastic, elastic + rig.gamma * v
-            speed = v @ field
-            return elastic, elastic + rig.gamma * v + norm @ (speed * np.abs(speed))
-
-        for i in range(TICKS - 1):
-            j = 2 * i
-            out[i], f = pull(j, y, v)
-            v2 = v - step / 2 * f / ratio
-            d2 = pull(j + 1, y + step / 2 * v, v2)[1]
-            v3 = v - step / 2 * d2 / ratio
-            d3 = pull(j + 1, y + step / 2 * v2, v3)[1]
-            v4 = v - step * d3 / ratio
-            d4 = pull(j + 2, y + step * v3, v4)[1]
-            y = y + step / 6 * (v + 2 * v2 + 2 * v3 + v4)
-            v = v - step / 6 * (f + 2 * d2 + 2 * d3 + d4) / ratio
-        torque: Real = -out @ (4 * LENGTH_M**3 / _ROOTS[:3] ** 4 * STIFFNESS)
-        return torque
-
-    made = record(rig, seed)
-    return replace(made, torque_nm=made.torque_nm + run(1.0) - run(0.0))
+    for i in range(TICKS - 1):
+        j = 2 * i
+        out[i], f, drag = pull(j, y, v)
+        rest[i] = drag @ arm
+        v2 = v - step / 2 * f / ratio
+        d2 = pull(j + 1, y + step / 2 * v, v2)[1]
+        v3 = v - step / 2 * d2 / ratio
+        d3 = pull(j + 1, y + step / 2 * v2, v3)[1]
+        v4 = v - step * d3 / ratio
+        d4 = pull(j + 2, y + step * v3, v4)[1]
+        y = y + step / 6 * (v + 2 * v2 + 2 * v3 + v4)
+        v = v - step / 6 * (f + 2 * d2 + 2 * d3 + d4) / ratio
+    torque: Real = rest.T - (out @ (4 * LENGTH_M**3 / roots**4 * STIFFNESS)).T
+    return torque
 
 
 def _shape(z: float, xi: Real) -> Real:

@@ -58,6 +58,7 @@ def _shared(
         modes=_modes(campaign, pooled, every),
         structures=tuple((each.name, _status(each, pooled)) for each in campaign.structures),
         simpler=_simpler(campaign, pooled),
+        drag_speed_m_s=None,
     )
     named = (
         replace(each.example, sentence=each.sentence, interval=None) for each in verdict.findings

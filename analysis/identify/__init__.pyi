@@ -45,12 +45,9 @@ from ._result import ModeEstimate as ModeEstimate
 from ._result import RecordAnalysis as RecordAnalysis
 from ._result import RecordFit as RecordFit
 from ._result import Ringing as Ringing
-from ._search import resonance_shift as resonance_shift
 from ._select import Selection as Selection
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
-from ._uncertainty import mode_table as mode_table
-from ._uncertainty import parameter_uncertainty as parameter_uncertainty
 from ._verdict import EVEN as EVEN
 from ._verdict import STRONG as STRONG
 from ._verdict import OrderVerdict as OrderVerdict

@@ -11,11 +11,10 @@ from analysis.identify._candidate import Candidate, Kind
 from analysis.identify._channel_checks import wrong_scale
 from analysis.identify._fit import fit_record
 from analysis.identify._leakage import without_leakage
-from analysis.identify._noise import Noise
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
 from analysis.identify._problem import Comparison
-from analysis.identify._refit import Refit, adapted, resonances_kept, vector
+from analysis.identify._refit import FEW, MANY, MISSED, Refit, resonances_kept
 from analysis.identify._residual_tests import whiteness
 from analysis.identify._rivals import with_extras
 from analysis.identify._visible_modes import visible_modes
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from analysis.identify._data import Measurement
     from analysis.identify._drag import DragEstimate
     from analysis.identify._finding import Finding
+    from analysis.identify._noise import Noise
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit
     from analysis.models import Structure
@@ -55,13 +55,7 @@ _FREEST: Final = STRUCTURES["VI"]
 _ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 
 _CROSS_CHECKS: Final = 3
-_FEW: Final = 8
-"""Evaluations that settle a fit under slightly other noise, or show that a start leads nowhere."""
-
-_MANY: Final = 40
 _NEARLY: Final = 1e-3
-_MISSED: Final = 1e-5
-"""Share of a sum of squares, which is some 1e4; BIC counts a parameter as 9."""
 
 _DOUBTFUL: Final = 0.01
 """Probability of a residual's shape by chance, below which all modes are searched for anew."""
@@ -120,7 +114,7 @@ class Field:
         if len(visible_modes(field.comparison, field.noise, likeliest)) > 1:
             field = (
                 field._with_modes_free(likeliest)
-                if _all_but_white(field, likeliest)
+                if field.all_but_white(likeliest)
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
         return with_extras(field.cross_checked())
@@ -131,7 +125,7 @@ class Field:
         comparison = uniform.comparison
         return cls(
             comparison=comparison,
-            noise=_noise(uniform, comparison),
+            noise=uniform.noise,
             free=tuple(name for name in SETTINGS if name not in fixed),
             candidates=_ranked(Candidate(fit.structure, True, fit) for fit in uniform.fits),
             columns=np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128),
@@ -230,17 +224,10 @@ class Field:
         nominal = self.comparison.measurement.nominal
         return Unknowns.of(structure, nominal, self.free, modes, extras)
 
-    def refit(
-        self,
-        structure: Structure,
-        uniform: bool,
-        start: Plant,
-        max_evaluations: int = _MANY,
-        extras: tuple[str, ...] = (),
-    ) -> Refit:
-        """Descend with one structure from a plant that has its damping."""
-        unknowns = self.unknowns(structure, uniform, extras)
-        return self.descent(unknowns, vector(unknowns, start), max_evaluations)
+    def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
+        """Descend from where a candidate is."""
+        unknowns = self.unknowns(candidate.structure, candidate.uniform, candidate.extras)
+        return self.descent(unknowns, unknowns.vector(candidate.fit.plant), max_evaluations)
 
     def descent(
         self, unknowns: Unknowns, start: NDArray[np.float64], max_evaluations: int
@@ -255,18 +242,6 @@ class Field:
             max_evaluations=max_evaluations,
         )
 
-    def candidate(
-        self,
-        structure: Structure,
-        uniform: bool,
-        start: Plant,
-        max_evaluations: int = _MANY,
-        extras: tuple[str, ...] = (),
-    ) -> Candidate:
-        """Fit one structure from a plant."""
-        refit = self.refit(structure, uniform, start, max_evaluations, extras)
-        return Candidate(structure, uniform, refit.fit(), len(self.columns), extras)
-
     def _without_leakage(self) -> Field:
         """Leave out what hum beyond the band spoils."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
@@ -275,11 +250,7 @@ class Field:
     def under(self, noise: Noise) -> Field:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
-        again = _ranked(
-            other.candidate(c.structure, c.uniform, c.fit.plant, _FEW, c.extras)
-            for c in self.candidates
-        )
-        return replace(other, candidates=again)
+        return other.ranked(other.refit(c, FEW).candidate() for c in self.candidates)
 
     def _with_modes_free(self, uniform: RecordFit) -> Field:
         """Free the modes' stiffness from where a uniform beam explains the record."""
@@ -288,9 +259,8 @@ class Field:
         for structure in FREE_STIFFNESS:
             unknowns = self.unknowns(structure, uniform=False)
             start = resonances_kept(unknowns, fits[structure.name], uniform.modes)
-            refit = self.descent(unknowns, start, _MANY)
-            found.append(Candidate(structure, False, refit.fit(), len(self.columns)))
-        return replace(self, candidates=_ranked((*self.candidates, *found)))
+            found.append(self.descent(unknowns, start, MANY).candidate())
+        return self.ranked((*self.candidates, *found))
 
     def _with_modes_searched(
         self,
@@ -302,7 +272,7 @@ class Field:
         loose = fit_record(measurement, FREE_STIFFNESS, fixed=fixed, band_hz=band_hz, uniform=False)
         found = tuple(Candidate(fit.structure, False, fit) for fit in loose.fits)
         every = replace(self, candidates=(*self.candidates, *found))
-        noise, closest = _noise(loose, self.comparison), min(loose.fits, key=lambda f: f.cost)
+        noise, closest = loose.noise, min(loose.fits, key=lambda f: f.cost)
         common = noise.counts & self.noise.counts
         if _deviance(noise, closest, common) > _deviance(self.noise, self.likeliest, common):
             return every.under(self.noise)
@@ -313,38 +283,32 @@ class Field:
         field = self
         for _ in range(_CROSS_CHECKS):
             best = field.best
-            checked = _ranked(
-                c if c is best else field._from_plant(c, best.fit.plant, best.structure)
-                for c in field.candidates
+            field = field.ranked(
+                c if c is best else field._from_plant(c, best.fit.plant) for c in field.candidates
             )
-            field = replace(field, candidates=checked)
             if field.best is best:
                 break
         return field
 
-    def tried_from(self, plant: Plant, of: Structure) -> Field:
-        """Start each from a plant that a search in structure `of` has found."""
-        tried = _ranked(self._from_plant(c, plant, of) for c in self.candidates)
-        return replace(self, candidates=tried).cross_checked()
+    def tried_from(self, plant: Plant) -> Field:
+        """Start each from a plant that a search has found."""
+        return self.ranked(self._from_plant(c, plant) for c in self.candidates).cross_checked()
 
-    def _from_plant(self, candidate: Candidate, plant: Plant, of: Structure) -> Candidate:
-        """Fit a candidate from another's plant, where that has the same kinds of damping."""
-        structure = candidate.structure
-        if (of.internal and not structure.internal) or (of.external and not structure.external):
+    def _from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
+        """Fit a candidate from another's plant, where that has no other kind of damping."""
+        structure, damping = candidate.structure, plant.damping
+        if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
         unknowns = self.unknowns(structure, candidate.uniform, candidate.extras)
-        start = adapted(unknowns, plant, of)
-        outlook = self.descent(unknowns, start, 1)
-        least = candidate.fit.cost * (1 - _MISSED)
+        outlook = self.descent(unknowns, unknowns.vector(plant), 1)
+        least = candidate.fit.cost * (1 - MISSED)
         if outlook.promised_cost > least:
             return candidate
-        first = self.descent(unknowns, start, _FEW)
+        first = self.descent(unknowns, outlook.x, FEW)
         if first.cost > candidate.fit.cost * (1 + _NEARLY):
             return candidate
-        found = self.descent(unknowns, first.x, _MANY)
-        if found.cost > least:
-            return candidate
-        return replace(candidate, fit=found.fit(), columns=len(self.columns))
+        found = self.descent(unknowns, first.x, MANY)
+        return candidate if found.cost > least else found.candidate()
 
     def with_orders_free(self) -> Field:
         """Free the orders too, on a beam of the best's kind, if that was not done."""
@@ -354,28 +318,28 @@ class Field:
         for structure in _FREE_ORDERS:
             if structure.name not in known:
                 unknowns = self.unknowns(structure, best.uniform, best.extras)
-                start = adapted(unknowns, best.fit.plant, best.structure)
-                found.append((structure, self.descent(unknowns, start, _MANY)))
+                found.append(self.descent(unknowns, unknowns.vector(best.fit.plant), MANY))
         if not found:
             return self
-        candidates = (
-            Candidate(structure, best.uniform, refit.fit(), len(self.columns), best.extras)
-            for structure, refit in found
-        )
-        freed = replace(self, candidates=_ranked((*self.candidates, *candidates)))
+        freed = self.ranked((*self.candidates, *(refit.candidate() for refit in found)))
         if freed.best.bic > best.bic - _DISMISSED:
             return freed.cross_checked()
-        lowest = min((refit for _, refit in found), key=lambda refit: refit.cost)
-        return freed.under(lowest.noise_here())
+        return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
     def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
         """Fit all again, with what is not linear beside the beam."""
         other = replace(self, columns=columns, noise=noise)
-        again = _ranked(
-            other.candidate(c.structure, c.uniform, c.fit.plant, extras=c.extras)
-            for c in self.candidates
-        )
-        return replace(other, candidates=again).cross_checked()
+        return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
+
+    def ranked(self, candidates: Iterable[Candidate]) -> Field:
+        """Hold these candidates, the lowest BIC first."""
+        return replace(self, candidates=_ranked(candidates))
+
+    def all_but_white(self, fit: RecordFit) -> bool:
+        """Whether chance may have shaped what a fit leaves, once in a hundred records at least."""
+        counts = self.noise.counts
+        found = whiteness(fit.residual[counts], self.comparison.frequency_hz[counts])
+        return found.probability > _DOUBTFUL and not found.loud
 
 
 def _ranked(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
@@ -386,15 +350,3 @@ def _deviance(noise: Noise, fit: RecordFit, bins: NDArray[np.bool_]) -> float:
     """``-2 ln`` likelihood of a fit under its noise, in some of the bins."""
     squares = float(np.sum(np.abs(fit.residual[bins]) ** 2))
     return squares + 2 * float(np.sum(np.log(noise.power[bins])))
-
-
-def _all_but_white(field: Field, fit: RecordFit) -> bool:
-    counts = field.noise.counts
-    found = whiteness(fit.residual[counts], field.comparison.frequency_hz[counts])
-    return found.probability > _DOUBTFUL and not found.loud
-
-
-def _noise(analysis: RecordAnalysis, comparison: Comparison) -> Noise:
-    """Noise as the estimator had it: the power of each bin."""
-    scale = comparison.samples * comparison.decimation.rate_hz / 2
-    return Noise(analysis.noise_nm2_per_hz * scale, analysis.compared, analysis.lines)

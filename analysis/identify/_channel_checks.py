@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._finding import Finding
+from analysis.record_checks import longest_run
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from numpy.typing import NDArray
 
     from analysis.identify._candidates import Field
     from analysis.identify._data import Measurement
@@ -54,7 +53,6 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
             "and no flag says so. What it would have been is not known."
         ),
         value=max(abs(limit) for limit, _ in flat),
-        interval=None,
         unit="N·m",
         remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
     )
@@ -76,26 +74,18 @@ def stops(measurement: Measurement) -> Iterator[Finding]:
     still = (wanted > np.median(wanted)) & (moved < _STILL * wanted)
     if not still.any():
         return
-    first, last = _longest(still)
+    count, first = longest_run(still)
     yield Finding(
         kind="stop",
         sentence=(
-            f"The motor stands still from {first * _STILL_S:.1f} to {last * _STILL_S:.1f} s of the "
+            f"The motor stands still from {first * _STILL_S:.1f} to "
+            f"{(first + count) * _STILL_S:.1f} s of the "
             "record, though it is asked to move."
         ),
-        value=(last - first) * _STILL_S,
-        interval=None,
+        value=count * _STILL_S,
         unit="s",
         remedy="Look for what held the shaft or switched the drive off, and sweep again.",
     )
-
-
-def _longest(true: NDArray[np.bool_]) -> tuple[int, int]:
-    """First block of the longest run, and the one after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], true.astype(int), [0]])))
-    starts, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - starts))
-    return int(starts[longest]), int(ends[longest])
 
 
 # Sign and unit
@@ -146,9 +136,6 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
                 "Torque or angle has the wrong sign: the torque opposes what the beam asks for at "
                 "nearly all frequencies. No number here is the antenna's."
             ),
-            value=None,
-            interval=None,
-            unit="1",
             remedy=(
                 "Reverse the sign of one channel: the torque is positive where the motor pushes "
                 "the beam towards positive angles."
@@ -176,8 +163,6 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
             "No number here is the antenna's."
         ),
         value=factor,
-        interval=None,
-        unit="1",
         remedy="Check the units of angle and torque, and import the record again.",
     )
 

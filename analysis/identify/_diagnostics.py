@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 from analysis.identify._channel_checks import clipping, drift_of_zero, stops
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repeats_after_s
-from analysis.identify._refit import vector
 from analysis.identify._residual_tests import SURE
 from analysis.identify._rig_findings import of_rig
 from analysis.identify._verdict import EVEN, STRONG, rivals
@@ -72,9 +71,6 @@ def findings(
 
 # Settings at an edge, or not as the file states them
 
-_MANY: Final = 40
-"""Evaluations of a descent that is to end."""
-
 _BEAM_OFF: Final = 0.003
 """Deviation of stiffness or density, relative to the file's, worth a word."""
 
@@ -97,7 +93,6 @@ def at_edges(field: Field) -> Iterator[Finding]:
                     "No number here is the antenna's."
                 ),
                 value=value,
-                interval=None,
                 unit=unit if factor == 1 else "s",
                 remedy=(
                     "Check the signs and the units of angle and torque, and the beam's length, "
@@ -172,7 +167,6 @@ def _of_beam(field: Field, differing: set[Setting]) -> Iterator[Finding]:
             ),
             value=share / 100,
             interval=(low / 100, high / 100),
-            unit="1",
             remedy="Weigh and measure the link again, or take the value found.",
         )
 
@@ -203,7 +197,6 @@ def _of_start(field: Field) -> Iterator[Finding]:
             "decay was fitted beside the response and spoils nothing."
         ),
         value=loudest,
-        interval=None,
         unit="N·m",
         remedy="Wait longer at rest before the sweep.",
     )
@@ -256,15 +249,10 @@ def _as_stated(field: Field, name: Setting) -> bool:
     """
     held = replace(field, free=tuple(other for other in field.free if other != name))
     for candidate in field.candidates:
-        structure, uniform, values = candidate.structure, candidate.uniform, candidate.values
-        unknowns = held.unknowns(structure, uniform, candidate.extras)
-        start = vector(unknowns, candidate.fit.plant)
+        values = candidate.values
         saved = field.best.bic + STRONG - (candidate.parameters - 1) * math.log(values)
         enough = values * math.exp(saved / values)
-        if (
-            held.descent(unknowns, start, 1).promised_cost < enough
-            and held.descent(unknowns, start, _MANY).cost < enough
-        ):
+        if held.refit(candidate, 1).promised_cost < enough and held.refit(candidate).cost < enough:
             return True
     return False
 
@@ -344,8 +332,6 @@ def unexplained(
         kind="unexplained",
         sentence=f"{what} Until it is known, take intervals and orders with care.",
         value=white.loudest_ratio,
-        interval=None,
-        unit="1",
         remedy=remedy,
     )
 
@@ -377,7 +363,6 @@ def _hum(field: Field) -> Iterator[Finding]:
                 )
             ),
             value=line.amplitude_nm,
-            interval=None,
             unit="N·m",
             remedy=(
                 "Repeat with half the amplitude: a line that shrinks is the motor's doing."
@@ -395,9 +380,7 @@ def _drift(size_nm: float) -> Finding:
             "course of the record. That is slower than anything the beam does."
         ),
         value=size_nm,
-        interval=None,
         unit="N·m",
-        remedy="",
     )
 
 
@@ -447,7 +430,6 @@ def _force(force: NonlinearForce) -> Finding:
         sentence=sentence,
         value=size,
         interval=(size - NORMAL_95 * std, size + NORMAL_95 * std),
-        unit="1",
         remedy="Repeat the sweep at half the amplitude: what is not linear all but vanishes.",
     )
 
@@ -464,7 +446,6 @@ def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
                     "which nothing linear makes."
                 ),
                 value=harmonic.deviate,
-                interval=None,
                 unit="standard deviations",
                 remedy="Repeat the sweep at half the amplitude; look for play in the clamp.",
             )

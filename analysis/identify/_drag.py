@@ -25,7 +25,7 @@ import numpy as np
 
 from analysis.identify._candidate import Candidate
 from analysis.identify._drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
-from analysis.identify._refit import Refit, adapted, unexplained_part, vector
+from analysis.identify._refit import Refit, unexplained_part
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
@@ -56,12 +56,15 @@ _MANY: Final = 40
 _HOPELESS: Final = 50.0
 """Deviance behind the structure with drag from which another is not followed to its minimum."""
 
-_SETTLED: Final = 0.5
-_ROUGHLY: Final = 20.0
-"""Squares that another step may save where the drag need not be computed anew."""
+_SETTLED: Final = 2.0
+_ROUGHLY: Final = 500.0
+"""Squares that another step may save where the drag need not be computed anew: the step is taken
+all the same, by all that is fitted at this drag (`_all`).
 
-_SHORT: Final = 0.3
-"""Step of the drag, in its standard deviations, that is none."""
+The two numbers of a law and external damping can make up for each other along a flat valley. There
+the drag computed anew promised a step of half a standard deviation, always the same way, for ten
+rounds and more: it led away from the truth, and each round cost a second.
+"""
 
 _LEAD: Final = "III"
 _FREEST: Final = "VI"
@@ -182,7 +185,7 @@ def _promising(field: Field) -> bool:
         beside = Refit.descend(
             field.comparison,
             unknowns,
-            vector(unknowns, plant),
+            unknowns.vector(plant),
             field.noise,
             np.concatenate([field.columns, _first_order(field.comparison, plant)]),
             max_evaluations=1,
@@ -224,7 +227,7 @@ def _start(field: Field, lead: Candidate) -> _Point | None:
     plant, structure = lead.fit.plant, lead.structure
     columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
     unknowns = field.unknowns(structure, lead.uniform)
-    here = vector(unknowns, plant)
+    here = unknowns.vector(plant)
     size, *_ = _last_amplitude(
         Refit.descend(field.comparison, unknowns, here, field.noise, columns, max_evaluations=1)
     )
@@ -258,8 +261,7 @@ def _settled(
         None if the air would have to push, the drag cannot be followed, or nothing settles.
     """
     unknowns = field.unknowns(structure, uniform)
-    x = adapted(unknowns, point.plant, point.structure)
-    still = False
+    x = unknowns.vector(point.plant)
     law, noise, two = point.law, point.noise, point.two
     for _ in range(_ROUNDS):
         plant = unknowns.plant(x)
@@ -272,17 +274,13 @@ def _settled(
         descent = partial(Refit.descend, comparison, unknowns, x)
         columns = comparison.drag.by_law[: 1 + two]
         here = descent(noise, columns, max_evaluations=1)
-        if here.cost - here.promised_cost < tolerance or (two and still):
+        if here.cost - here.promised_cost < tolerance:
             # With damping that is not the beam's, a second number would be its stopgap.
             roughly = tolerance > _SETTLED
             if two or roughly or _known_to(here) > _ONE_NUMBER:
                 return here
             two, columns = True, comparison.drag.by_law
         here = descent(noise, columns, max_evaluations=_FEW)
-        # Two numbers and external damping can make up for each other along a flat valley, where the
-        # steps are short long before the last of them.
-        step, std = here.amplitudes()
-        still = two and bool(np.all(np.abs(step) < _SHORT * std))
         x, law, noise = here.x, _law_at(here), here.noise_here()
         if law.at(comparison.drag.speed_m_s) <= 0:
             return None
@@ -312,12 +310,12 @@ def _all(field: Field, settled: Refit) -> Field:
         columns=settled.columns,
         noise=settled.noise_here(),
     )
-    of, plant = settled.objective.unknowns.structure, settled.plant
+    plant = settled.plant
     least = other.descent(settled.objective.unknowns, settled.x, 1).cost
     candidates = []
     for before in _without_extras(field):
         unknowns = other.unknowns(before.structure, before.uniform)
-        refit = other.descent(unknowns, adapted(unknowns, plant, of), _FEW)
+        refit = other.descent(unknowns, unknowns.vector(plant), _FEW)
         if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
             refit = other.descent(unknowns, refit.x, _MANY)
         candidates.append(
@@ -335,7 +333,7 @@ def _estimate(field: Field) -> DragEstimate:
         (c for c in field.candidates if c.kind == best.kind),
         key=lambda c: (len(c.structure.free), -c.bic),
     )
-    refit = field.refit(freest.structure, freest.uniform, freest.fit.plant)
+    refit = field.refit(freest)
     law, covariance = _law_at(refit), refit.amplitude_covariance()[1]
     covariance = covariance * freest.fit.cost / freest.fit.degrees_of_freedom
     expansion = refit.objective.comparison.drag

@@ -56,10 +56,10 @@ class Finding:
 
     kind: Kind
     sentence: str
-    value: float | None
-    interval: tuple[float, float] | None
-    unit: str
-    remedy: str
+    value: float | None = None
+    interval: tuple[float, float] | None = None
+    unit: str = "1"
+    remedy: str = ""
 
 
 SEEN: Final[frozenset[Kind]] = frozenset(

@@ -98,7 +98,7 @@ def fit_record(
     ]
     closest = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
     reference = searches[closest].lowest()
-    reference = reference.settled(reference.noise(), _BEFORE_LINES)
+    reference = reference.to_minimum(reference.noise(), _BEFORE_LINES)
     whole = reference.objective.comparison
     comparison = whole.following_reference(reference.plant)
     searches = [search.on(comparison) for search in searches]
@@ -113,17 +113,11 @@ def fit_record(
     noise = reference.noise(with_lines=True)
     noise = replace(noise, lines=(*noise.lines, *(hum.line for hum in comparison.hum)))
     descents = [
-        search.under(noise, reference if i == closest else None).settled(noise, _TOLERANCE)
+        search.under(noise, reference if i == closest else None).to_minimum(noise, _TOLERANCE)
         for i, search in enumerate(searches)
     ]
-    return RecordAnalysis(
-        fits=tuple(summary(descent.objective, descent.x, noise) for descent in descents),
-        frequency_hz=comparison.frequency_hz,
-        compared=noise.counts,
-        noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
-        lines=noise.lines,
-        comparison=comparison,
-    )
+    fits = (summary(descent.objective, descent.x, noise) for descent in descents)
+    return RecordAnalysis.of(fits, noise, comparison)
 
 
 def _followed_again(clean: Descent, whole: Comparison) -> Descent:
@@ -132,7 +126,7 @@ def _followed_again(clean: Descent, whole: Comparison) -> Descent:
     for _ in range(_REPEATS):
         comparison = whole.following_reference(clean.plant).without_hum(hum)
         clean = Descent(Objective(comparison, unknowns), clean.x)
-        clean = clean.settled(clean.noise(), _TOLERANCE)
+        clean = clean.to_minimum(clean.noise(), _TOLERANCE)
         hum = clean.hum() or hum
     return Descent(Objective(clean.objective.comparison.without_hum(hum), unknowns), clean.x)
 

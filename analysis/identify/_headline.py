@@ -163,6 +163,8 @@ class Numbers:
         numbers are of; "compatible"; "excluded".
     simpler : Simpler or None
         The simplest structure that would do, if it is not that one.
+    drag_speed_m_s : float or None
+        Speed at which the parameter ``drag`` is told; None without drag.
     """
 
     name: str
@@ -171,6 +173,7 @@ class Numbers:
     modes: tuple[Mode, ...]
     structures: tuple[tuple[str, StructureStatus], ...]
     simpler: Simpler | None
+    drag_speed_m_s: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,7 +283,12 @@ def headline(
         sizes = (
             each.flagged(BESIDE_DRAG) if each.damping == "external" else each for each in told.sizes
         )
-        told = replace(told, parameters={**told.parameters, "drag": at}, sizes=tuple(sizes))
+        told = replace(
+            told,
+            parameters={**told.parameters, "drag": at},
+            sizes=tuple(sizes),
+            drag_speed_m_s=drag.speed_m_s,
+        )
     simpler = _simpler(field, fractional) if unexplained is None else None
     for other in field.other_kinds(STRONG):
         told = _doubted_by(told, other)
@@ -337,6 +345,7 @@ def of_fit(
         modes=tuple(_mode(mode, visible, unexplained) for mode in fit.modes),
         structures=((name, "selected"),),
         simpler=None,
+        drag_speed_m_s=None,
         explained=unexplained is None,
     )
 
@@ -531,6 +540,7 @@ def headline_json(
         "file": file,
         "type": told.name,
         "parameters": {name: each.as_json() for name, each in told.parameters.items()},
+        "drag_speed_m_s": told.drag_speed_m_s,
         "sizes": [
             {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
             for each in told.sizes

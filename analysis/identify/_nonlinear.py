@@ -28,7 +28,7 @@ import numpy as np
 from analysis.identify._candidates import FREE_STIFFNESS
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel
-from analysis.identify._refit import Refit, unexplained_part
+from analysis.identify._refit import Refit
 from analysis.identify._residual_tests import SURE
 from analysis.identify._verdict import STRONG
 from rigd.beam import clamped_free_eigenvalues, participation
@@ -218,7 +218,7 @@ def nonlinear_forces(
     forces : tuple of NonlinearForce
     """
     best = field.best
-    here = field.refit(best.structure, best.uniform, best.fit.plant, extras=best.extras)
+    here = field.refit(best)
     if _gain(best, here.cost, _most_wanted(field, here, modes, [])[1]) < _HINT:
         return field, ()
     for lead in _leads(field):
@@ -248,7 +248,7 @@ def _added(
     terms: list[Term] = []
     sizes = std = np.zeros(0)
     best = field.best
-    here = field.refit(lead.structure, lead.uniform, lead.fit.plant, extras=lead.extras)
+    here = field.refit(lead)
     while len(terms) < _MOST_TERMS:
         term, cost = _most_wanted(field, here, modes, terms)
         behind = _gain(best, cost, best.fit.cost)
@@ -275,23 +275,16 @@ def _most_wanted(
     field: Field, refit: Refit, modes: tuple[int, ...], taken: list[Term]
 ) -> tuple[Term | None, float]:
     """Find the term that to first order saves most, and the cost with it."""
-    projected = refit.objective.project(refit.objective.linearise(refit.x), field.noise.weight)
     forces = ModalForces(field.comparison, refit.plant)
     # Air that brakes the whole beam has been found already, and no mode is braked by itself.
     kinds = KINDS if field.drag is None else tuple(k for k in KINDS if k != "quadratic drag")
     terms = [Term(kind, mode) for kind in kinds for mode in modes]
     terms = [term for term in terms if term not in taken]
     if not terms:
-        return None, projected.cost
-    at = refit.objective.linearise(refit.x)
-    known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
-    every = np.array([forces.column(term) for term in terms], dtype=np.complex128)
-    columns = unexplained_part(every * field.noise.weight, known)
-    squares = np.sum(np.abs(columns) ** 2, axis=1)
-    along = (columns.conj() @ projected.residual).real
-    saved = along**2 / np.maximum(squares, np.finfo(float).tiny)
+        return None, refit.cost
+    saved = refit.saved_by(np.array([forces.column(term) for term in terms]))
     most = int(np.argmax(saved))
-    return terms[most], max(projected.cost - float(saved[most]), 1e-3 * projected.cost)
+    return terms[most], max(refit.cost - float(saved[most]), 1e-3 * refit.cost)
 
 
 def _with_terms(

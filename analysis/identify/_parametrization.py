@@ -69,7 +69,7 @@ _EXTRA_RANGES: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
 )
 _TIP: Final = "tip_mass_kg"
 _BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
+_FILTER_DELAYS: Final[Mapping[str, float]] = MappingProxyType(
     {"filter_time_constant_s": 1.0, "second_order_filter_time_constant_s": 2**0.5}
 )
 """Delay of a filter at low frequency over its time constant."""
@@ -79,6 +79,8 @@ _GRADIENT_NAMES: Final[Mapping[str, str]] = {
     "bending_stiffness_n_m2": "ln_stiffness",
 }
 _QUARTER_TURN: Final = math.pi / 2
+_SMALL: Final = 1e-5
+"""Loss, relative to stiffness or inertia, at which a damping is brought in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,20 +171,53 @@ class Unknowns:
         sizes : ndarray, shape (len(structure.free),)
             ``ln z``, ``alpha``, ``ln g`` and ``lambda``, those that are free.
         """
-        nominal = self.nominal
         at: dict[str, float] = {
             **dict(self.structure.fixed.items()),
             **dict(zip(self.structure.free, sizes.tolist(), strict=True)),
             "density_over_stiffness": 0.0,
             "bending_stiffness_n_m2": 0.0,
-            "delay_s": nominal.delay_s / _DELAY_UNIT_S,
-            "tool_inertia_kg_m2": nominal.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
-            **dict.fromkeys(self.offsets, 0.0),
-            **{name: value / self.units[name] for name, value in nominal.extras.items()},
+            **self._linear(self.nominal),
         }
         for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
             if coefficient in self.names:
                 at[coefficient] += math.log(math.sin(_QUARTER_TURN * at[order]))
+        return np.array([at[name] for name in self.names])
+
+    def vector(self, plant: Plant) -> NDArray[np.float64]:
+        """Unknowns of a plant, shape (k,): the inverse of `plant`.
+
+        Parameters
+        ----------
+        plant : Plant
+            Found in whatever structure: damping keeps its loss at the mode where its order is
+            fixed otherwise; damping that is absent comes in small, of order 1.
+        """
+        damping, nominal = plant.damping, self.nominal.beam
+        first, second = self.omega_rad_s
+        ratio = plant.beam.density_over_stiffness
+        ln_ratio = math.log(ratio / nominal.density_over_stiffness)
+        ln_stiffness = math.log(plant.beam.bending_stiffness_n_m2 / nominal.bending_stiffness_n_m2)
+        at = {"zeta": math.log(_SMALL), "alpha": 1.0, "gamma": math.log(_SMALL), "lambda": 1.0}
+        at |= self._linear(plant)
+        if damping.zeta > 0:
+            size, turn = damping.zeta * second**damping.alpha, _QUARTER_TURN * damping.alpha
+            at["zeta"], at["alpha"] = math.log(size * math.sin(turn)), damping.alpha
+            stiffening = math.log(abs(1 + size * complex(math.cos(turn), math.sin(turn))))
+            ln_ratio -= stiffening
+            ln_stiffness += stiffening
+        if damping.gamma > 0:
+            size = damping.gamma / ratio * first ** (damping.lambda_ - 2)
+            turn = _QUARTER_TURN * damping.lambda_
+            at["gamma"], at["lambda"] = math.log(size * math.sin(turn)), damping.lambda_
+            ln_ratio += math.log(abs(1 - size * complex(math.cos(turn), math.sin(turn))))
+        if _TIP in self.extras:
+            (more, _), (stiffer, _) = _bare_beam(at[_TIP])
+            ln_ratio -= more
+            ln_stiffness -= stiffer
+        for name, share in _FILTER_DELAYS.items():
+            if name in self.extras:
+                at["delay_s"] += share * plant.extras[name] / _DELAY_UNIT_S
+        at |= {"density_over_stiffness": ln_ratio, "bending_stiffness_n_m2": ln_stiffness}
         return np.array([at[name] for name in self.names])
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
@@ -217,6 +252,11 @@ class Unknowns:
             "second_order_filter_time_constant_s": _TIME_CONSTANT_UNIT_S,
             "clock_rate_difference": _CLOCK_UNIT,
         }
+
+    def _linear(self, plant: Plant) -> dict[str, float]:
+        """Unknowns of a plant that are linear, by name."""
+        values = plant.parameters | plant.extras
+        return {name: values.get(name, 0.0) / unit for name, unit in self.units.items()}
 
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Differentiate the free parameters by `x`, shape (k, k): [parameter, unknown].
@@ -281,7 +321,7 @@ class Unknowns:
         for name in units.keys() & place.keys():
             values[name] = given[name] * units[name]
             derivative[place[name], place[name]] = units[name]
-        for name, share in FILTER_DELAYS.items():
+        for name, share in _FILTER_DELAYS.items():
             if name in place and "delay_s" in place:
                 values["delay_s"] -= share * values[name]
                 derivative[place["delay_s"], place[name]] = -share * units[name]
@@ -317,20 +357,6 @@ def _size(ln_loss: float, order: float) -> tuple[float, float]:
 _NEWTON_STEPS: Final = 30
 
 
-def bare_beam(share: float) -> tuple[float, float]:
-    """Logarithms of rho/EI and EI of a beam with a tip mass, over those of one without.
-
-    The bare beam has its first mode at the same frequency, and to first order the same torque.
-
-    Parameters
-    ----------
-    share : float
-        Mass of the tip, relative to the nominal beam's.
-    """
-    (ln_ratio, _), (ln_stiffness, _) = _bare_beam(share)
-    return ln_ratio, ln_stiffness
-
-
 def ln_stiffness_with_tip(mode: int, share: float) -> float:
     """Logarithm of the stiffness of a mode with a tip mass over that without, and all else equal.
 
@@ -345,7 +371,15 @@ def ln_stiffness_with_tip(mode: int, share: float) -> float:
 
 
 def _bare_beam(share: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Give the same as `bare_beam`, each with its slope by the share."""
+    """Logarithms of rho/EI and EI of a beam with a tip mass over those of one without, with slopes.
+
+    The bare beam has its first mode at the same frequency, and to first order the same torque.
+
+    Parameters
+    ----------
+    share : float
+        Mass of the tip, relative to the nominal beam's; the slopes are by it.
+    """
     return _with_tip(float(eigenvalues(1)[0]), share), (share, 1.0)
 
 

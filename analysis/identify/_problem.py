@@ -19,6 +19,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -28,7 +29,7 @@ from analysis.identify._drag_torque import DragExpansion, DragResponse
 from analysis.identify._free_decay import DecaySpectra, Pole, mode_poles
 from analysis.identify._predictor import Prediction
 from analysis.models import LARGEST_SHARE_OF_RATE
-from analysis.optimizer import NormalEquations, Recent
+from analysis.optimizer import NormalEquations, Recent, descend
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from analysis.identify._hum import Hum
     from analysis.identify._parametrization import Unknowns
     from analysis.identify._plant import Plant
+    from analysis.optimizer import Minimum, Region
 
 
 # Instrument: the part of the angle that is coherent with the reference
@@ -472,6 +474,11 @@ class Projected:
         )
 
 
+_FILLINGS: Final = 8
+_CONVERGED: Final = 1e-6
+"""Change of the unknowns below which what is put for unknown torques is final."""
+
+
 class Objective:
     """Sum of squares of one structure on one record, as a function of the unknowns.
 
@@ -479,13 +486,23 @@ class Objective:
     ----------
     comparison : Comparison
     unknowns : Unknowns
+    columns : ndarray of complex, shape (c, K), optional
+        Spectra of known shape and unknown size, in N·m per unit of amplitude: their amplitudes are
+        free as those of the free decay are.
     """
 
-    __slots__ = ("_recent", "comparison", "unknowns")
+    __slots__ = ("_recent", "columns", "comparison", "unknowns")
 
-    def __init__(self, comparison: Comparison, unknowns: Unknowns) -> None:
+    def __init__(
+        self,
+        comparison: Comparison,
+        unknowns: Unknowns,
+        columns: NDArray[np.complex128] | None = None,
+    ) -> None:
+        none = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         self.comparison = comparison
         self.unknowns = unknowns
+        self.columns = none if columns is None else columns
         self._recent: Recent[Linearisation] = Recent()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
@@ -511,7 +528,7 @@ class Objective:
             residual=residual,
             jacobian=jacobian,
             poles=poles,
-            columns=comparison.nuisance(poles),
+            columns=np.concatenate([comparison.nuisance(poles), self.columns]),
         )
 
     def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
@@ -527,8 +544,6 @@ class Objective:
             That of `Noise`, or 1 not to whiten.
         """
         residual, jacobian = at.residual * weight, at.jacobian * weight
-        if not len(at.columns):
-            return Projected(residual, jacobian, np.zeros(0), np.zeros((0, 0)))
         columns = _parts(at.columns * weight)
         scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
         scale[scale == 0] = 1.0  # a decay that is over at once
@@ -551,6 +566,60 @@ class Objective:
     ) -> NormalEquations:
         """Sum of squares at `x`, with what a Gauss-Newton step needs."""
         return self.project(self.linearise(x), weight).normal_equations()
+
+    def minimum(
+        self,
+        start: NDArray[np.float64],
+        weight: NDArray[np.float64],
+        region: Region,
+        *,
+        relative_tolerance: float,
+        max_evaluations: int = 200,
+        fillings: int = _FILLINGS,
+        learns: bool = True,
+    ) -> tuple[Objective, Minimum]:
+        """Descend; again, while what is put for unknown torques moves the minimum.
+
+        Parameters
+        ----------
+        start : ndarray, shape (k,)
+        weight : ndarray, shape (K,)
+            That of `Noise`.
+        region, relative_tolerance, max_evaluations, learns
+            As `descend` takes them.
+        fillings : int
+            How often unknown torques are put as predicted, at most.
+
+        Returns
+        -------
+        objective : Objective
+            With the unknown torques as they were put last; `self` if all are known.
+        minimum : Minimum
+            Of that.
+        """
+        x = start
+        for _ in range(fillings):
+            objective = self._filled(x)
+            found = descend(
+                partial(objective.normal_equations, weight=weight),
+                x,
+                region,
+                relative_tolerance=relative_tolerance,
+                max_evaluations=max_evaluations,
+                learns=learns,
+            )
+            converged = np.abs(found.x - x).max() < _CONVERGED
+            x = found.x
+            if converged or objective is self:
+                break
+        return objective, found
+
+    def _filled(self, x: NDArray[np.float64]) -> Objective:
+        """Put what is predicted at `x` where the torque is unknown; `self` if all is known."""
+        comparison = self.comparison.filled(self.unknowns.plant(x))
+        if comparison is self.comparison:
+            return self
+        return Objective(comparison, self.unknowns, self.columns)
 
 
 def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._refit import Refit, adapted
+from analysis.identify._refit import MISSED, Refit
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
 
 if TYPE_CHECKING:
@@ -174,8 +174,6 @@ def profile(field: Field, candidate: Candidate, order: Order) -> Profiled:
 
 _ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
 _ROUNDS: Final = 3
-_MISSED: Final = 1e-5
-"""Share of a sum of squares, which is some 1e4; BIC counts a parameter as 9."""
 
 
 def profiled(field: Field) -> tuple[Field, Profile, Profile]:
@@ -206,7 +204,7 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
         for found in walks.values():
             if _news(field, found):
                 for plant in found.plants:
-                    field = field.tried_from(plant, found.structure)
+                    field = field.tried_from(plant)
         if [candidate.fit.cost for candidate in field.candidates] == before:
             break
     of_alpha, of_lambda = (
@@ -226,7 +224,7 @@ def _news(field: Field, found: Profiled) -> bool:
         for candidate in field.candidates
         if candidate.uniform == found.uniform and free <= set(candidate.structure.free)
     ]
-    return bool(as_free) and found.cost < min(as_free) * (1 - _MISSED)
+    return bool(as_free) and found.cost < min(as_free) * (1 - MISSED)
 
 
 # Walk along an order
@@ -277,8 +275,7 @@ class Walk:
             self.structure, candidate.uniform, candidate.extras
         )
         self._place = unknowns.names.index(order)
-        seed = adapted(unknowns, candidate.fit.plant, candidate.structure)
-        first = field.descent(unknowns, seed, _MAX_EVALUATIONS)
+        first = field.descent(unknowns, unknowns.vector(candidate.fit.plant), _MAX_EVALUATIONS)
         self.costs: dict[float, float] = {}
         self._at: dict[float, Refit] = {}
         self._stand_at(first)
@@ -362,10 +359,9 @@ class Walk:
 
     def _spread(self) -> float:
         """Give the standard deviation of the order, or what stands for it."""
-        hessian, place = self._first.equations.hessian, self._place
-        scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
-        scaled = hessian / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
-        variance = np.linalg.inv(scaled)[place, place] / scale[place] ** 2
+        (scaled, scale), place = self._first.equations.scaled_hessian(), self._place
+        inverse = np.linalg.inv(scaled + 1e-12 * np.eye(scale.size))
+        variance = inverse[place, place] / scale[place] ** 2
         std = math.sqrt(variance * self._first.cost / self._values) if variance > 0 else _FIRST_STEP
         return min(max(std, 1e-4), 0.25)
 
@@ -395,11 +391,10 @@ class Walk:
 
     def _tangent(self, value: float, near: Refit) -> NDArray[np.float64]:
         """Where all else would be with the order at `value`, to first order, shape (k,)."""
-        x, hessian, place = near.x.copy(), near.equations.hessian, self._place
+        x, place = near.x.copy(), self._place
+        scaled, scale = near.equations.scaled_hessian()
         lower, upper = self._unknowns.bounds
-        scale = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
         others = (x > lower) & (x < upper) & (np.arange(x.size) != place)
-        scaled = hessian / np.outer(scale, scale)
         block = scaled[np.ix_(others, others)] + 1e-9 * np.eye(int(others.sum()))
         slope = -np.linalg.solve(block, scaled[others, place]) / scale[others] * scale[place]
         x[others] += slope * (value - x[place])

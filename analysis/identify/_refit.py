@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
 from analysis.identify._noise import Noise, smooth_power
-from analysis.identify._parametrization import FILTER_DELAYS, bare_beam
-from analysis.identify._problem import Linearisation, Objective
-from analysis.optimizer import Box, descend
+from analysis.identify._problem import Objective
+from analysis.optimizer import Box
 from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
@@ -29,88 +28,10 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
     from analysis.identify._result import ModeEstimate, RecordFit
-    from analysis.models import Structure
     from analysis.optimizer import NormalEquations
 
 
-# Start of one structure at the plant that another found
-
-_SMALL: Final = 1e-5
-"""Loss, relative to stiffness or inertia, at which a damping is brought in."""
-
-
-def vector(unknowns: Unknowns, plant: Plant) -> NDArray[np.float64]:
-    """Unknowns of a plant, shape (k,): the way back of `Unknowns.plant`.
-
-    Parameters
-    ----------
-    unknowns : Unknowns
-    plant : Plant
-        With damping wherever the structure has some.
-    """
-    damping, nominal = plant.damping, unknowns.nominal
-    first, second = unknowns.omega_rad_s
-    ratio = plant.beam.density_over_stiffness
-    at = {
-        "alpha": damping.alpha,
-        "lambda": damping.lambda_,
-        "density_over_stiffness": math.log(ratio / nominal.beam.density_over_stiffness),
-        "bending_stiffness_n_m2": math.log(
-            plant.beam.bending_stiffness_n_m2 / nominal.beam.bending_stiffness_n_m2
-        ),
-        "delay_s": plant.delay_s / unknowns.units["delay_s"],
-        "tool_inertia_kg_m2": plant.tool_inertia_kg_m2 / nominal.beam.inertia_kg_m2,
-        **{
-            name: value
-            for name, value in plant.parameters.items()
-            if name.startswith("stiffness_offset")
-        },
-        **{name: value / unknowns.units[name] for name, value in plant.extras.items()},
-    }
-    if unknowns.structure.internal:
-        size = damping.zeta * second**damping.alpha
-        turn = math.pi / 2 * damping.alpha
-        at["zeta"] = math.log(size * math.sin(turn))
-        stiffening = math.log(abs(1 + size * complex(math.cos(turn), math.sin(turn))))
-        at["density_over_stiffness"] -= stiffening
-        at["bending_stiffness_n_m2"] += stiffening
-    if unknowns.structure.external:
-        size = damping.gamma / ratio * first ** (damping.lambda_ - 2)
-        turn = math.pi / 2 * damping.lambda_
-        at["gamma"] = math.log(size * math.sin(turn))
-        at["density_over_stiffness"] += math.log(
-            abs(1 - size * complex(math.cos(turn), math.sin(turn)))
-        )
-    if "tip_mass_kg" in unknowns.extras:
-        ln_ratio, ln_stiffness = bare_beam(at["tip_mass_kg"])
-        at["density_over_stiffness"] -= ln_ratio
-        at["bending_stiffness_n_m2"] -= ln_stiffness
-    for name, share in FILTER_DELAYS.items():
-        if name in unknowns.extras:
-            at["delay_s"] += share * plant.extras[name] / unknowns.units["delay_s"]
-    return np.array([at.get(name, 0.0) for name in unknowns.names])
-
-
-def adapted(unknowns: Unknowns, plant: Plant, of: Structure) -> NDArray[np.float64]:
-    """Start for one structure at the plant that another found, shape (k,).
-
-    Damping keeps its size at the first two modes where its order changes; damping that the other
-    lacks comes in small, of order 1.
-
-    Parameters
-    ----------
-    unknowns : Unknowns
-        Unknowns of the one.
-    plant : Plant
-    of : Structure
-        The other.
-    """
-    own = replace(unknowns, structure=of)
-    start = dict(zip(own.names, vector(own, plant).tolist(), strict=True))
-    for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
-        start.setdefault(coefficient, math.log(_SMALL))
-        start.setdefault(order, 1.0)
-    return np.array([start[name] for name in unknowns.names])
+# Start on a beam that is not uniform
 
 
 def resonances_kept(
@@ -130,7 +51,7 @@ def resonances_kept(
     modes : sequence of ModeEstimate
         Those of the uniform beam.
     """
-    x = adapted(unknowns, damped_as.plant, damped_as.structure)
+    x = unknowns.vector(damped_as.plant)
     plant = unknowns.plant(x)
     damping, ratio = plant.damping, plant.beam.density_over_stiffness
     numbers = range(1, len(unknowns.offsets) + 2)
@@ -156,10 +77,17 @@ def resonances_kept(
 
 # Refit
 
+FEW: Final = 8
+"""Evaluations that settle a fit under slightly other noise, or show that a start leads nowhere."""
+
+MANY: Final = 40
+"""Evaluations of a descent that is to end."""
+
+MISSED: Final = 1e-5
+"""Share of a sum of squares, which is some 1e4, that counts; BIC counts a parameter as 9."""
+
 _TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares (some 1e4): 1e-4 of what BIC tells apart."""
-
-_FILLINGS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,14 +101,12 @@ class Refit:
     equations : NormalEquations
         At `x`.
     noise : Noise
-    columns : ndarray of complex, shape (c, K)
     """
 
     objective: Objective
     x: NDArray[np.float64]
     equations: NormalEquations
     noise: Noise
-    columns: NDArray[np.complex128]
 
     @classmethod
     def descend(
@@ -212,27 +138,25 @@ class Refit:
         hold : str, optional
             An unknown that stays where it starts.
         """
-        none = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
-        further = none if columns is None else columns
         lower, upper = unknowns.bounds
         x = np.clip(start, lower, upper)
         if hold is not None:
             place = unknowns.names.index(hold)
             lower[place] = upper[place] = x[place]
-        bounds = Box(lower, upper)
-        complete = bool(comparison.measurement.torque_known.all())
-        for _ in range(1 if complete else _FILLINGS):
-            objective = WithColumns(comparison.filled(unknowns.plant(x)), unknowns, further)
-            found = descend(
-                partial(objective.normal_equations, weight=noise.weight),
-                x,
-                bounds,
-                relative_tolerance=relative_tolerance,
-                max_evaluations=max_evaluations,
-                learns=False,
-            )
-            x = found.x
-        return cls(objective, x, found.equations, noise, further)
+        objective, found = Objective(comparison, unknowns, columns).minimum(
+            x,
+            noise.weight,
+            Box(lower, upper),
+            relative_tolerance=relative_tolerance,
+            max_evaluations=max_evaluations,
+            learns=False,
+        )
+        return cls(objective, found.x, found.equations, noise)
+
+    @property
+    def columns(self) -> NDArray[np.complex128]:
+        """What was projected out beside the free decay, shape (c, K)."""
+        return self.objective.columns
 
     @property
     def cost(self) -> float:
@@ -242,14 +166,12 @@ class Refit:
     @property
     def promised_cost(self) -> float:
         """What it would be at the minimum, as far as can be seen from here."""
-        lower, upper = self.objective.unknowns.bounds
-        gradient, hessian = self.equations.gradient, self.equations.hessian
-        held = ((self.x <= lower) & (gradient > 0)) | ((self.x >= upper) & (gradient < 0))
-        free = ~held & (np.diag(hessian) > 0)
-        scale = np.sqrt(np.diag(hessian)[free])
-        slope = gradient[free] / scale
-        scaled = hessian[np.ix_(free, free)] / np.outer(scale, scale)
-        step = np.linalg.solve(scaled + 1e-12 * np.eye(scale.size), slope)
+        equations = self.equations
+        held = equations.held(self.x, *self.objective.unknowns.bounds)
+        free = ~held & (np.diag(equations.hessian) > 0)
+        scaled, scale = equations.scaled_hessian()
+        slope = equations.gradient[free] / scale[free]
+        step = np.linalg.solve(scaled[np.ix_(free, free)] + 1e-12 * np.eye(slope.size), slope)
         return max(self.cost - float(slope @ step), 0.0)
 
     @property
@@ -282,6 +204,22 @@ class Refit:
         covariance = np.linalg.inv(gram)[first:, first:] / np.outer(own, own)
         return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
 
+    def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Squares that each of some further columns alone would save to first order, shape (c,).
+
+        Parameters
+        ----------
+        columns : ndarray of complex, shape (c, K)
+        """
+        weight, at = self.noise.weight, self.objective.linearise(self.x)
+        projected = self.objective.project(at, weight)
+        known = np.concatenate([projected.jacobian, at.columns * weight])
+        free = unexplained_part(columns * weight, known)
+        along = (free.conj() @ projected.residual).real
+        squares = np.maximum(np.sum(np.abs(free) ** 2, axis=1), np.finfo(float).tiny)
+        saved: NDArray[np.float64] = along**2 / squares
+        return saved
+
     def fit(self) -> RecordFit:
         """Everything that follows from this minimum."""
         fit = summary(self.objective, self.x, self.noise)
@@ -302,39 +240,16 @@ class Refit:
             fit, ringing=replace(fit.ringing, chi_square=chi_square, degrees_of_freedom=decays)
         )
 
+    def candidate(self) -> Candidate:
+        """Make a candidate of what was found."""
+        of = self.objective.unknowns
+        return Candidate(of.structure, not of.offsets, self.fit(), len(self.columns), of.extras)
+
     def noise_here(self) -> Noise:
         """Take for noise what remains here and no column explains; lines stay left out."""
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         share = self.objective.comparison.measurement.torque_share
         return replace(self.noise, power=smooth_power(residual) / share)
-
-
-# Columns of known shape and unknown size
-
-
-class WithColumns(Objective):
-    """Sum of squares with further columns, whose amplitudes are free as those of the decay are.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    unknowns : Unknowns
-    columns : ndarray of complex, shape (c, K)
-        Spectra, in N·m a unit of amplitude.
-    """
-
-    __slots__ = ("_further",)
-
-    def __init__(
-        self, comparison: Comparison, unknowns: Unknowns, columns: NDArray[np.complex128]
-    ) -> None:
-        super().__init__(comparison, unknowns)
-        self._further = columns
-
-    def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Residual, derivatives and all columns at `x`."""
-        at = super().linearise(x)
-        return replace(at, columns=np.concatenate([at.columns, self._further]))
 
 
 def unexplained_part(

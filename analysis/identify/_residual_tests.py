@@ -11,8 +11,6 @@ model of it is needed.
 References
 ----------
 M. S. Bartlett, An Introduction to Stochastic Processes (1955): the cumulative periodogram.
-E. B. Wilson and M. M. Hilferty, The distribution of chi-square, Proc. Natl. Acad. Sci. 17 (1931)
-684-688: `of_chi_square`.
 """
 
 from __future__ import annotations
@@ -228,14 +226,6 @@ def input_relation(
         lag_s=float(at_s[at]),
         related=bool(local or deviate > SURE or correlation[at] ** 2 / 2 > largest_of(tried)),
     )
-
-
-def in_time(residual: NDArray[np.complex128], bins: slice, samples: int) -> NDArray[np.float64]:
-    """Whitened residual as a signal, shape (samples,), of variance 1 were it white throughout."""
-    spectrum = np.zeros(samples // 2 + 1, dtype=np.complex128)
-    spectrum[bins] = residual
-    values: NDArray[np.float64] = np.fft.irfft(spectrum, samples) * np.sqrt(samples / 2)
-    return values
 
 
 # Harmonics of the sweep

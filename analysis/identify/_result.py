@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._noise import Noise
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
@@ -175,3 +176,21 @@ class RecordAnalysis:
     noise_nm2_per_hz: NDArray[np.float64]
     lines: tuple[Line, ...]
     comparison: Comparison
+
+    @classmethod
+    def of(cls, fits: Iterable[RecordFit], noise: Noise, comparison: Comparison) -> RecordAnalysis:
+        """Put together fits to one comparison under one noise."""
+        return cls(
+            fits=tuple(fits),
+            frequency_hz=comparison.frequency_hz,
+            compared=noise.counts,
+            noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
+            lines=noise.lines,
+            comparison=comparison,
+        )
+
+    @property
+    def noise(self) -> Noise:
+        """The noise as the fits had it: the power of each bin."""
+        scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
+        return Noise(self.noise_nm2_per_hz * scale, self.compared, self.lines)

@@ -39,9 +39,6 @@ def of_rig(field: Field) -> Iterator[Finding]:
             "The record is not that of a uniform beam on a rigid clamp with ideal channels; it is "
             f"explained equally well by {' or by '.join(map(_about, (freest, *others)))}."
         ),
-        value=None,
-        interval=None,
-        unit="1",
         remedy=(
             "Check clamp, tip and signal conditioning for these; a sweep that reaches one more "
             "mode tells them apart."
@@ -65,9 +62,6 @@ def _beside_a_uniform_beam(others: tuple[Candidate, ...]) -> Iterator[Finding]:
             "A uniform beam with its orders free explains the record, and so does, as well, one "
             f"with {' or with '.join(named)}. What they put elsewhere is flagged."
         ),
-        value=None,
-        interval=None,
-        unit="1",
         remedy="A sweep that reaches one more mode tells them apart.",
     )
 
@@ -115,9 +109,6 @@ def _not_uniform(candidate: Candidate) -> Finding:
             "The modes do not lie where those of a uniform beam do; in stiffness, relative to "
             f"mode 1: {', '.join(offsets)}."
         ),
-        value=None,
-        interval=None,
-        unit="1",
         remedy="Look for an added mass or a section that varies along the link.",
     )
 
@@ -190,7 +181,6 @@ def _clocks(value: float, interval: tuple[float, float]) -> Finding:
         ),
         value=value,
         interval=interval,
-        unit="1",
         remedy="Sample both channels by one clock, or correct the torque's time base.",
     )
 

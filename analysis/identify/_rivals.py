@@ -8,20 +8,18 @@ something.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._candidate import Candidate
 from analysis.identify._parametrization import ln_stiffness_with_tip
 from analysis.identify._plant import EXTRAS
-from analysis.identify._refit import adapted
-from analysis.identify._residual_tests import whiteness
+from analysis.identify._refit import FEW, MANY
 from analysis.models import STRUCTURES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import Field
     from analysis.identify._refit import Refit
 
@@ -29,8 +27,6 @@ _STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("VI", "VII", "III"))
 _PROMISING: Final = 10.0
 """Deviance that a step must promise: BIC asks 9.5 for a parameter in a record like the paper's."""
 
-_FEW: Final = 8
-_MANY: Final = 40
 _HOPELESS: Final = 50.0
 """Deviance behind the best after a few steps, from which a structure is not followed further."""
 
@@ -53,9 +49,6 @@ _HALVINGS: Final = 20
 _QUIETER: Final = 0.98
 """Share of the sum of squares left by an extra, below which the noise is estimated anew."""
 
-_DOUBTFUL: Final = 0.01
-"""Probability of a residual's shape by chance, below which a search starts from several sizes."""
-
 
 def with_extras(field: Field) -> Field:
     """Add the candidates that explain more than the same structure does without an extra."""
@@ -75,14 +68,11 @@ def with_extras(field: Field) -> Field:
             least = min([least, *(candidate.fit.cost for candidate in found)])
     if not found:
         return field
-    every = (*field.candidates, *found)
-    ranked = tuple(sorted(every, key=lambda candidate: candidate.bic))
-    freed = replace(field, candidates=ranked)
+    freed = field.ranked((*field.candidates, *found))
     best = freed.best
     if best.extras and best.fit.cost < _QUIETER * field.best.fit.cost:
         # Part of what was taken for noise was not.
-        refit = freed.refit(best.structure, True, best.fit.plant, 1, best.extras)
-        freed = freed.under(refit.noise_here())
+        freed = freed.under(freed.refit(best, 1).noise_here())
     return freed.cross_checked()
 
 
@@ -90,11 +80,9 @@ def _promising(field: Field, lead: Candidate) -> list[Refit]:
     """Begin a search with each of the extras; give those that promise something, the best first."""
     values, cost = lead.values, lead.fit.cost
     needed = cost * math.exp(-_PROMISING / values)
-    counts = field.noise.counts
-    left = whiteness(lead.fit.residual[counts], field.comparison.frequency_hz[counts])
     # A uniform beam far from the record is astray; one whose modes are free has mode 1 and all
     # dampings where they are.
-    doubtful = left.probability < _DOUBTFUL or left.loud
+    doubtful = not field.all_but_white(lead.fit)
     found = []
     for name in EXTRAS:
         begun = (
@@ -104,7 +92,7 @@ def _promising(field: Field, lead: Candidate) -> list[Refit]:
         )
         first = min(begun, key=lambda refit: refit.promised_cost)
         if doubtful:  # what a first step promises from afar means little
-            first = field.descent(first.objective.unknowns, first.x, _FEW)
+            first = field.descent(first.objective.unknowns, first.x, FEW)
         if first.promised_cost < needed:
             found.append(first)
     return sorted(found, key=lambda refit: refit.promised_cost)
@@ -132,7 +120,7 @@ def _tip_share(offset: float) -> float:
 def _begun(field: Field, lead: Candidate, name: str, size: float) -> Refit:
     """Look from a start."""
     unknowns = field.unknowns(STRUCTURES["VI"], uniform=True, extras=(name,))
-    x = adapted(unknowns, lead.fit.plant, lead.structure)
+    x = unknowns.vector(lead.fit.plant)
     x[-1] += size
     return field.descent(unknowns, x, 1)
 
@@ -140,27 +128,25 @@ def _begun(field: Field, lead: Candidate, name: str, size: float) -> Refit:
 def _fitted(field: Field, start: Refit, bare: dict[str, Candidate]) -> Iterator[Candidate]:
     """Candidates of one extra that are better than their structures are without it."""
     unknowns = start.objective.unknowns
-    extras, values = unknowns.extras, field.best.values
-    refit = field.descent(unknowns, start.x, _FEW)
+    values = field.best.values
+    refit = field.descent(unknowns, start.x, FEW)
     most = field.best.fit.cost * math.exp(_HOPELESS / values)
     if refit.promised_cost > max(most, bare["VI"].fit.cost * math.exp(-_HOPELESS / values)):
         return
-    refit = field.descent(unknowns, refit.x, _MANY)
-    plant = refit.plant
+    refit = field.descent(unknowns, refit.x, MANY)
     for structure in _STRUCTURES:
         if structure.name not in bare:
             continue
         if structure is not unknowns.structure:
-            own = field.unknowns(structure, uniform=True, extras=extras)
-            first = field.descent(own, adapted(own, plant, unknowns.structure), 1)
+            own = field.unknowns(structure, uniform=True, extras=unknowns.extras)
+            first = field.descent(own, own.vector(refit.plant), 1)
             if first.promised_cost > most:
                 continue
-            first = field.descent(own, first.x, _FEW)
+            first = field.descent(own, first.x, FEW)
             if first.promised_cost > most:
                 continue
-            found = field.descent(own, first.x, _MANY)
+            candidate = field.descent(own, first.x, MANY).candidate()
         else:
-            found = refit
-        candidate = Candidate(structure, True, found.fit(), len(field.columns), extras)
+            candidate = refit.candidate()
         if candidate.bic < bare[structure.name].bic:
             yield candidate

@@ -205,9 +205,6 @@ _MOST_MINIMA: Final = 4
 _LOOKS: Final = 3
 """As often hum is looked for: the first fit took part of it for the beam's doing."""
 
-_FILLINGS: Final = 8
-_SETTLED: Final = 1e-6
-
 
 @dataclass(frozen=True, slots=True)
 class Descent:
@@ -221,31 +218,13 @@ class Descent:
         """The plant there."""
         return self.objective.unknowns.plant(self.x)
 
-    def lower(self, noise: Noise, tolerance: float) -> Descent:
-        """Descend under a noise spectrum, unknown torques as predicted here."""
-        objective = self.objective
-        refilled = objective.comparison.filled(objective.unknowns.plant(self.x))
-        if refilled is not objective.comparison:
-            objective = Objective(refilled, objective.unknowns)
-        weight = noise.weight
-        minimum = descend(
-            lambda x: objective.normal_equations(x, weight),
-            self.x,
-            Steps.of(objective.unknowns),
-            relative_tolerance=tolerance,
+    def to_minimum(self, noise: Noise, tolerance: float) -> Descent:
+        """Descend to the minimum under a noise spectrum."""
+        region = Steps.of(self.objective.unknowns)
+        objective, minimum = self.objective.minimum(
+            self.x, noise.weight, region, relative_tolerance=tolerance
         )
         return Descent(objective, minimum.x)
-
-    def settled(self, noise: Noise, tolerance: float) -> Descent:
-        """Descend to the minimum; again, while what is put for unknown torques moves it."""
-        here = self.lower(noise, tolerance)
-        if self.objective.comparison.measurement.torque_known.all():
-            return here
-        for _ in range(_FILLINGS):
-            before, here = here, here.lower(noise, tolerance)
-            if np.abs(here.x - before.x).max() < _SETTLED:
-                break
-        return here
 
     def hum(self) -> tuple[Hum, ...]:
         """Look for what hums beside a mode, with the beam found so far."""
@@ -257,7 +236,7 @@ class Descent:
         return hum_beside_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def without_hum(self, tolerance: float) -> Descent:
-        """Take out what hums beside a mode, and settle again; `self` if nothing does."""
+        """Take out what hums beside a mode, and descend again; `self` if nothing does."""
         here = self
         for _ in range(_LOOKS):
             hum = here.hum()
@@ -267,7 +246,7 @@ class Descent:
                 here.objective.comparison.without_hum(hum), here.objective.unknowns
             )
             here = Descent(objective, here.x)
-            here = here.settled(here.noise(), tolerance)
+            here = here.to_minimum(here.noise(), tolerance)
         return here
 
     def noise(self, *, with_lines: bool = False) -> Noise:
@@ -358,5 +337,5 @@ class Search:
             ]
         if len(rivals) == 1:
             return rivals[0]
-        ends = [rival.lower(noise, _BETWEEN_RIVALS) for rival in rivals]
+        ends = [rival.to_minimum(noise, _BETWEEN_RIVALS) for rival in rivals]
         return min(ends, key=lambda end: end.objective.normal_equations(end.x, noise.weight).cost)

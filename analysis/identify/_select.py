@@ -23,7 +23,6 @@ from analysis.identify._residual_tests import (
     InputRelation,
     Whiteness,
     harmonics,
-    in_time,
     input_relation,
     whiteness,
 )
@@ -138,7 +137,7 @@ def select(
     comparison, fit = field.comparison, told.best.fit
     multiples = harmonics(
         comparison.angle_rad[comparison.kept],
-        in_time(fit.residual, comparison.bins, comparison.samples),
+        comparison.in_time(fit.residual) * math.sqrt(comparison.samples / 2),
         comparison.decimation.rate_hz,
         band_hz,
     )
@@ -179,7 +178,7 @@ def select(
     return Selection(
         candidates=field.candidates,
         headline=numbers,
-        analysis=_analysis(field),
+        analysis=RecordAnalysis.of((c.fit for c in field.candidates), field.noise, comparison),
         verdict=Verdict(
             name=measurement.name,
             structure=best.structure.name,
@@ -241,18 +240,6 @@ def _as_sure(
     if wrong is not None:
         along = tuple(doubted(each, wrong) for each in along)
     return (*beside, *along)
-
-
-def _analysis(field: Field) -> RecordAnalysis:
-    comparison, noise = field.comparison, field.noise
-    return RecordAnalysis(
-        fits=tuple(candidate.fit for candidate in field.candidates),
-        frequency_hz=comparison.frequency_hz,
-        compared=noise.counts,
-        noise_nm2_per_hz=2 * noise.power / (comparison.samples * comparison.decimation.rate_hz),
-        lines=noise.lines,
-        comparison=comparison,
-    )
 
 
 def _tests(field: Field) -> tuple[Whiteness, InputRelation]:

@@ -29,7 +29,7 @@ import numpy as np
 from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
 from analysis.identify._predictor import eigenvalues, torque_channel
-from analysis.identify._refit import Refit, unexplained_part
+from analysis.identify._refit import MANY, Refit
 from analysis.identify._residual_tests import SURE
 from analysis.identify._verdict import STRONG
 from analysis.models import STRUCTURES
@@ -59,7 +59,6 @@ _GAIN: Final = SURE**2 + 2 * math.log(20)
 _UNIT_PLAY_RAD: Final = 1e-4
 _ROUNDS: Final = 4
 _SETTLED: Final = 0.01
-_MANY: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,16 +148,12 @@ def _promising(
     field: Field, lead: Candidate, lag: NDArray[np.float64]
 ) -> Iterator[tuple[What, float]]:
     """Columns that to first order would make a candidate the best, with the BIC they promise."""
-    refit = field.refit(lead.structure, lead.uniform, lead.fit.plant, 1, lead.extras)
-    at = refit.objective.linearise(refit.x)
-    projected = refit.objective.project(at, field.noise.weight)
-    known = np.concatenate([projected.jacobian, at.columns * field.noise.weight])
-    for what, column in _columns(field.comparison, lead.fit.plant, lag).items():
-        (free,) = unexplained_part((column * field.noise.weight)[None], known)
-        saved = float(np.vdot(free, projected.residual).real) ** 2
-        saved /= max(float(np.vdot(free, free).real), np.finfo(float).tiny)
-        left = max(projected.cost - saved, 1e-3 * projected.cost)
-        gain = lead.values * math.log(projected.cost / left)
+    refit = field.refit(lead, 1)
+    columns = _columns(field.comparison, lead.fit.plant, lag)
+    saved = refit.saved_by(np.array(list(columns.values())))
+    for what, squares in zip(columns, saved.tolist(), strict=True):
+        left = max(refit.cost - squares, 1e-3 * refit.cost)
+        gain = lead.values * math.log(refit.cost / left)
         bic = lead.bic - gain + math.log(lead.values)
         if gain > _GAIN and bic < field.best.bic + STRONG:
             yield what, bic
@@ -168,15 +163,15 @@ def _fitted(
     field: Field, lead: Candidate, what: What, lag: NDArray[np.float64]
 ) -> tuple[Refit, float]:
     """Fit a candidate with one column beside it; give its BIC as well."""
-    unknowns = field.unknowns(lead.structure, lead.uniform, lead.extras)
-    refit = field.refit(lead.structure, lead.uniform, lead.fit.plant, 1, lead.extras)
+    refit = field.refit(lead, 1)
+    unknowns = refit.objective.unknowns
     size = 0.0
     for _ in range(_ROUNDS):
         column = _column(field.comparison, refit.plant, lag, what, size)
         columns = np.concatenate([field.columns, column[None]])
         before = refit.cost
         refit = Refit.descend(
-            field.comparison, unknowns, refit.x, field.noise, columns, max_evaluations=_MANY
+            field.comparison, unknowns, refit.x, field.noise, columns, max_evaluations=MANY
         )
         moved, size = size, float(refit.amplitudes()[0][-1])
         settled = abs(size - moved) < _SETTLED * abs(size)

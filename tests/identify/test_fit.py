@@ -264,8 +264,7 @@ def test_no_descent_from_elsewhere_ends_lower(sessions, name):
     comparison = Comparison.of(measurement, (0.0, 50.0))
     unknowns = Unknowns.of(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
     objective = Objective(comparison, unknowns)
-    scale = comparison.samples * comparison.decimation.rate_hz
-    weight = np.sqrt(4 / (analysis.noise_nm2_per_hz * scale))
+    weight = analysis.noise.weight
     rng = np.random.default_rng(6)
     draw = {"zeta": (-7, -1), "alpha": (0.1, 1.9), "gamma": (-6, -1), "lambda": (0.1, 1.9)}
     ends = []

@@ -54,6 +54,19 @@ def test_derivatives_with_offsets():
     assert not derivative[:-2, -2:].any()
 
 
+def test_damping_that_a_plant_lacks_comes_in_small_and_of_order_one():
+    plant = Plant(NOMINAL.beam, Damping(zeta=7e-5, alpha=0.9), 2e-4, 2e-5)
+    unknowns = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)
+    found = unknowns.plant(unknowns.vector(plant))
+    first, _ = undamped_frequencies_rad_s(NOMINAL.beam, 2)
+    ratio = plant.beam.density_over_stiffness
+    assert found.damping.lambda_ == 1.0
+    assert found.damping.gamma == pytest.approx(1e-5 * ratio * first, rel=1e-6)
+    for name, value in plant.parameters.items():
+        if name not in ("gamma", "lambda"):
+            assert found.parameters[name] == pytest.approx(value, rel=1e-9), name
+
+
 def test_what_is_not_free_stays_as_it_is():
     unknowns = Unknowns.of(STRUCTURES["III"], NOMINAL, ())
     plant = unknowns.plant(start(unknowns))

@@ -10,7 +10,6 @@ from analysis.identify._free_decay import mode_poles
 from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import LOGARITHMIC
 from analysis.identify._predictor import Prediction
-from analysis.identify._refit import vector
 from analysis.models import STRUCTURES
 from rigd.beam import PARAMETERS, Beam, Damping
 
@@ -100,7 +99,7 @@ def test_unknowns_with_an_extra(extra):
     unknowns = Unknowns.of(STRUCTURES["VI"], Plant(BEAM, Damping()), SETTINGS, 1, (extra,))
     assert unknowns.names[-1] == extra
     x = np.array([-5, 0.9, -4, 0.6, 0.02, -0.03, 0.2, 0.01, 0.05])
-    assert vector(unknowns, unknowns.plant(x)) == pytest.approx(x, abs=1e-12)
+    assert unknowns.vector(unknowns.plant(x)) == pytest.approx(x, abs=1e-12)
 
     def estimates(at):
         values = unknowns.parameters(at)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.identify._profile_likelihood import Walk, admitted, valleys
+from analysis.optimizer import NormalEquations
 
 COUNT = 1000
 BOTTOMS = {0.6: 0.0, 1.4: 1.0}
@@ -34,8 +35,8 @@ class DoubleWell(Walk):
         order = float(start[0])
         if not hold:
             order = min(BOTTOMS, key=lambda at: ((order - at) / WIDTH) ** 2 + BOTTOMS[at])
-        curvature = SimpleNamespace(hessian=np.array([[1 / WIDTH**2]]))
-        return SimpleNamespace(x=np.array([order]), cost=cost(order), equations=curvature)
+        at = NormalEquations(cost(order), np.zeros(1), np.array([[1 / WIDTH**2]]))
+        return SimpleNamespace(x=np.array([order]), cost=at.cost, equations=at)
 
     def _tangent(self, value, near):
         return np.array([value])

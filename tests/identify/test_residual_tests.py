@@ -6,7 +6,6 @@ import pytest
 from analysis.identify import cumulative_periodogram
 from analysis.identify._residual_tests import (
     harmonics,
-    in_time,
     input_relation,
     whiteness,
 )
@@ -55,6 +54,11 @@ def test_what_is_loud_is_found_where_it_is():
     assert high - low < 0.5
 
 
+def in_time(residual, samples):
+    """A signal of variance 1 were it white throughout."""
+    return np.fft.irfft(np.append(0, residual), samples) * np.sqrt(samples / 2)
+
+
 def sweep():
     """Angle, its frequency and time: 0.05-50 Hz in 80 s at 125 Hz."""
     t = np.arange(10_000) / 125
@@ -99,7 +103,7 @@ def test_an_echo_is_found_with_its_lag():
 @pytest.mark.parametrize("multiple", [2, 3])
 def test_a_harmonic_of_the_sweep_is_found_and_its_like_alone(multiple):
     angle, phase, t = sweep()
-    residual = in_time(noise(8), slice(1, BINS + 1), t.size)
+    residual = in_time(noise(8), t.size)
     assert residual.std() == pytest.approx(0.8**0.5, rel=0.03)  # of the band to 62.5 Hz
     drive_hz = 0.05 + 49.95 * t / 80
     extra = np.where((drive_hz > 6) & (drive_hz < 9), np.sin(multiple * phase + 0.4), 0.0)
@@ -112,7 +116,7 @@ def test_a_harmonic_of_the_sweep_is_found_and_its_like_alone(multiple):
 def test_noise_ringing_and_the_drive_itself_are_no_harmonic():
     angle, _, t = sweep()
     for seed in range(20):
-        residual = in_time(noise(seed), slice(1, BINS + 1), t.size)
+        residual = in_time(noise(seed), t.size)
         residual += np.where(t > 4, 5 * np.sin(16 * t) * np.exp(-(t - 4)), 0.0)
         residual += 2 * angle
         assert not any(one.present for one in harmonics(angle, residual, 125.0, (0.0, 50.0)))

@@ -1,0 +1,122 @@
+"""Drag of the air: whether it is named, how well C_D d is known, and what else is made up.
+
+``bench_drag.py [--count N] [--first SEED] [--none N] [--processes P]`` judges N records of each
+cell (0.5, 1 and 2 mm wires, chirps of 0.025, 0.0125 and 0.00625 rad, C_D constant or White's,
+beside external damping or alone), made by equations of motion of their own (`wrong_models.py`), and
+N records of the beam without air, by turns of integer and fractional orders. A line for each: C_D d
+over the truth at the speed where it is told, its standard deviation, its error in those, what else
+is named, and the worst error of what is told without a flag. Then the counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+
+from bench_wrong_models import Judged, errors_of
+from wrong_models import RIGS, Drag, Record, drags, record
+
+from analysis.identify import select
+
+AMPLITUDES_RAD = (0.025, 0.0125, 0.00625)
+DIAMETERS_M = (0.5e-3, 1e-3, 2e-3)
+FALSE = ("delay", "beam data", "not uniform", "tool inertia", "elastic clamp", "tip mass")
+"""Kinds of findings that drag passed for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What was made of one record."""
+
+    wire: Drag | None
+    drag: tuple[float, float, float] | None
+    """C_D d, its standard deviation, and the speed at which it is told."""
+    kinds: tuple[str, ...]
+    worst: tuple[float, str]
+    cpu_s: float
+
+    @property
+    def error(self) -> float:
+        """C_D d less the truth, in standard deviations."""
+        assert self.drag is not None and self.wire is not None
+        value, std, speed = self.drag
+        return (value - self.wire.true_m(speed)) / std
+
+    def text(self) -> str:
+        """Give a row of the table."""
+        where = "none" if self.wire is None else (
+            f"{1e3 * self.wire.diameter_m:3g} mm, {self.wire.amplitude_rad:7g} rad, "
+            f"{'White' if self.wire.cylinder else 'const'}, gamma {self.wire.rig.gamma:5g}"
+        )  # fmt: skip
+        found = "not named"
+        if self.drag is not None and self.wire is not None:
+            value, std, speed = self.drag
+            true = self.wire.true_m(speed)
+            found = (
+                f"{value / true:.4f} ± {std / true:.4f} at {speed:4.2f} m/s, {self.error:+.1f} std"
+            )
+        return f"{where:44} {found:44} {self.cpu_s:5.1f} s  {', '.join(self.kinds)}  {self.worst}"
+
+
+def judged(wire: Drag | None, made: Record) -> Line:
+    """Judge one record."""
+    start = time.process_time()
+    selection = select(made.measurement())
+    cpu_s = time.process_time() - start
+    one = Judged(selection, dict(errors_of(made, selection)), cpu_s)
+    drag = selection.headline.parameters.get("drag")
+    speed_m_s = selection.headline.drag_speed_m_s
+    return Line(
+        wire,
+        None if drag is None or speed_m_s is None else (drag.value, drag.std, speed_m_s),
+        tuple(dict.fromkeys(finding.kind for finding in selection.verdict.findings)),
+        one.worst,
+        cpu_s,
+    )
+
+
+def main() -> None:
+    """Judge the records asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=1, help="records of each of the 36 cells")
+    parser.add_argument("--none", type=int, default=12, help="records without air")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--processes", type=int, default=1)
+    given = parser.parse_args()
+    beam = RIGS["III"]
+    cells = [
+        Drag(replace(beam, gamma=gamma), diameter_m, amplitude_rad, cylinder)
+        for amplitude_rad, diameter_m, cylinder, gamma in itertools.product(
+            AMPLITUDES_RAD, DIAMETERS_M, (False, True), (beam.gamma, 0.0)
+        )
+    ]
+    wires = cells * given.count
+    seeds = [given.first + number for number in range(len(wires))]
+    jobs: list[tuple[Drag | None, Record]] = list(zip(wires, drags(wires, seeds), strict=True))
+    rigs = itertools.cycle(RIGS.values())
+    jobs += [(None, record(next(rigs), given.first + seed)) for seed in range(given.none)]
+    lines = []
+    with ProcessPoolExecutor(given.processes) as pool:
+        for line in pool.map(judged, *zip(*jobs, strict=True)):
+            lines.append(line)
+            print(line.text(), flush=True)
+    there = [line for line in lines if line.wire is not None]
+    named = [line for line in there if line.drag is not None]
+    held = [abs(line.error) < 1.959964 for line in named]
+    free = [line for line in lines if line.wire is None]
+    print(f"named {len(named)} of {len(there)}; C_D d within its interval {sum(held)}")
+    print(f"false delay, density, stiffness, modes: {sum(_false(line) for line in there)}")
+    print(f"without air named {sum(line.drag is not None for line in free)} of {len(free)}")
+    print(f"worst without a flag: {max(line.worst for line in there)}")
+    print(f"processor: median {sorted(line.cpu_s for line in named)[len(named) // 2]:.1f} s")
+
+
+def _false(line: Line) -> bool:
+    return any(kind in FALSE for kind in line.kinds)
+
+
+if __name__ == "__main__":
+    main()
