@@ -193,13 +193,9 @@ def select(
     MeasurementError
         The record cannot be used.
     """
-    from analysis.identify import Measurement
-    from analysis.identify import select as select_structure
-    from analysis.suited import record_band_hz
+    from analysis.results import whole_record
 
-    return select_structure(
-        Measurement.of_record(record), fixed=fixed, band_hz=record_band_hz(record, band_hz)
-    )
+    return whole_record(record, tuple(fixed), band_hz).selection
 
 
 def campaign(

@@ -212,7 +212,6 @@ def analyze(
     Estimates the frequency response from motor angle to coupling torque, fits the fractional
     damping models to it, and prints and draws the results.
     """
-    from analysis.campaigns import CampaignError, LoneSessionError
     from analysis.report import OutputError, OutputExistsError, check_new_file
 
     is_campaign = len(files) > 1 and not each
@@ -249,6 +248,7 @@ def analyze(
         if not is_campaign:
             code = session_command(files, routes, report, json, rerun)
         else:
+            from analysis.campaigns import CampaignError, LoneSessionError
             from analysis.cli.campaign import campaign_command
             from analysis.models import STRUCTURES
 
@@ -260,10 +260,13 @@ def analyze(
                 )  # fmt: skip
             except LoneSessionError as lone:
                 code = _lone_session(lone, routes, report, json)
+            except CampaignError as error:
+                _complain(str(error))
+                code = 1
     except OutputExistsError as error:
         _complain(str(error))
         code = 2
-    except (OutputError, CampaignError) as error:
+    except OutputError as error:
         _complain(str(error))
         code = 1
     except KeyboardInterrupt:

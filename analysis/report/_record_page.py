@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from analysis.models import ESTIMATOR_WORDS
 from analysis.report._page import page, versions
-from analysis.report._sentences import damping_sentences
+from analysis.report._text import damping_sentences
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -7,6 +7,7 @@ from typing import Any
 from rigd.control import ControlDesignError, check_stability, close_loop
 from rigd.identification._estimate import MotorEstimate, Quantity
 from rigd.profile import Profile
+from rigd.units import unit_of
 
 # Controllers
 
@@ -64,13 +65,17 @@ class Row:
     """A number of the profile beside what was measured."""
 
     key: str
-    unit: str
     measured: Quantity
     profile_value: float
     source: str
     """Source of the profile's value."""
     least: float = 0.0
     """Smallest value that the profile's other settings allow."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of all its numbers."""
+        return unit_of(self.key)
 
     @property
     def is_below_least(self) -> bool:
@@ -180,25 +185,22 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     """
     rig = profile.rig
     motor = rig.motor
-    found: list[tuple[str, str, Quantity, float]] = [
-        ("motor.inertia_kg_m2", "kg·m²", estimate.inertia_kg_m2, motor.inertia_kg_m2),
+    found: list[tuple[str, Quantity, float]] = [
+        ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
-            "N·m·s/rad",
             estimate.viscous_nm_s_per_rad,
             motor.viscous_nm_s_per_rad,
         ),
-        ("motor.coulomb_nm", "N·m", estimate.coulomb_nm, motor.coulomb_nm),
+        ("motor.coulomb_nm", estimate.coulomb_nm, motor.coulomb_nm),
         (
             "motor.rated_torque_nm",
-            "N·m",
             _times(motor.rated_torque_nm, estimate.torque_scale),
             motor.rated_torque_nm,
         ),
-        ("actuation.delay_s", "s", estimate.actuation_delay_s, rig.actuation.delay_s),
+        ("actuation.delay_s", estimate.actuation_delay_s, rig.actuation.delay_s),
         (
             "control.friction_compensation_nm",
-            "N·m",
             estimate.coulomb_nm,
             profile.control.friction_compensation_nm,
         ),
@@ -207,7 +209,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         # The drive's own rated torque is compared with the profile's by it: both change alike.
         unit_nm = rig.cia402.rated_torque_unit_nm
         key = "cia402.rated_torque_unit_nm"
-        found.append((key, "N·m", _times(unit_nm, estimate.torque_scale), unit_nm))
+        found.append((key, _times(unit_nm, estimate.torque_scale), unit_nm))
     waits = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     least = {"actuation.delay_s": 1 / rig.rate_hz} if waits else {}
     rows = tuple(

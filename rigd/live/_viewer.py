@@ -55,15 +55,15 @@ class _Playback:
         self.close()
 
 
-class Window(_Playback):
-    """The viewer's window on a file.
-
-    What the user has set in Rerun's own viewer is neither used nor changed.
+class _Window(_Playback):
+    """The viewer's window. What the user has set in Rerun's own viewer is not used, nor changed.
 
     Parameters
     ----------
-    path
-        Path of the recording.
+    shown
+        Command line that says what is shown first.
+    memory
+        Limit beyond which the oldest data are dropped.
     scratch
         Folder in which Rerun may leave files: it does when it is ended.
     options
@@ -75,12 +75,14 @@ class Window(_Playback):
         If Rerun's program cannot be run.
     """
 
-    def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, shown: tuple[str, ...], memory: str, scratch: Path, options: tuple[str, ...]
+    ) -> None:
         self._program = RerunProgram(
             (
-                str(path.absolute()),
+                *shown,
                 *("--port", "0"),
-                *("--memory-limit", _MOST_MEMORY),
+                *("--memory-limit", memory),
                 "--hide-welcome-screen",
                 *options,
             ),
@@ -90,7 +92,20 @@ class Window(_Playback):
     @property
     def fault(self) -> str:
         """Why it was closed, if not by the user: a sentence."""
-        return _fault_of(self._program)
+        if self._program.without_graphics:
+            return (
+                "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's "
+                "viewer needs. Install one; on Debian and Ubuntu the package mesa-vulkan-drivers "
+                "has those for most graphics cards, and one that needs none."
+            )
+        return f"The window was closed by a fault ({self._program.last_words})."
+
+
+class Window(_Window):
+    """The viewer's window on the file `path`; the rest as of `_Window`."""
+
+    def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
+        super().__init__((str(path.absolute()),), _MOST_MEMORY, scratch, options)
 
 
 class PageOfFile(_Playback):
@@ -167,39 +182,14 @@ _ANSWER_S: Final = 5.0
 _HOSTS: Final = ("127.0.0.1", "localhost")
 
 
-class Viewer:
-    """The viewer's window.
-
-    What the user has set in Rerun's own viewer is neither used nor changed.
-
-    Parameters
-    ----------
-    address
-        Address of the live view that is shown first.
-    scratch
-        Folder in which Rerun may leave files: it does when it is ended.
-    options
-        More of the program's command line.
-
-    Raises
-    ------
-    RerunError
-        If Rerun's program cannot be run.
-    """
+class Viewer(_Window):
+    """The viewer's window on live views, first that at `address`; the rest as of `_Window`."""
 
     def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
         self._connections = 0
         self._connecting: threading.Thread | None = None
-        self._program = RerunProgram(
-            (
-                *("--connect", self._next_url(address)),
-                *("--port", "0"),
-                *("--memory-limit", _WINDOW_MEMORY),
-                "--hide-welcome-screen",
-                *options,
-            ),
-            {"XDG_DATA_HOME": str(runtime_folder() / "viewer"), "TMPDIR": str(scratch)},
-        )
+        shown = ("--connect", self._next_url(address))
+        super().__init__(shown, _WINDOW_MEMORY, scratch, options)
 
     @property
     def pid(self) -> int:
@@ -220,11 +210,6 @@ class Viewer:
     def without_graphics(self) -> bool:
         """Whether it said that it cannot draw: that the computer has no graphics it can use."""
         return self._program.without_graphics
-
-    @property
-    def fault(self) -> str:
-        """Why it was closed, if not by the user: a sentence."""
-        return _fault_of(self._program)
 
     @property
     def control_url(self) -> str:
@@ -252,10 +237,6 @@ class Viewer:
         self._connecting.join(_ANSWER_S)
         return any(done)
 
-    def close(self) -> None:
-        """Close the window."""
-        self._program.kill()
-
     def _next_url(self, address: LiveAddress) -> str:
         return proxy_url(_HOSTS[self._connections % len(_HOSTS)], address.grpc_port)
 
@@ -276,14 +257,3 @@ def _have_it_connect(control_url: str, url: str, done: list[bool]) -> None:
     except (OSError, RuntimeError):  # it is busy, or about to end
         return
     done.append(True)
-
-
-def _fault_of(program: RerunProgram) -> str:
-    """Say in a sentence why a window was closed by a fault."""
-    if program.without_graphics:
-        return (
-            "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's viewer "
-            "needs. Install one; on Debian and Ubuntu the package mesa-vulkan-drivers has those "
-            "for most graphics cards, and one that needs none."
-        )
-    return f"The window was closed by a fault ({program.last_words})."

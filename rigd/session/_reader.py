@@ -3,12 +3,13 @@
 import mmap
 import shlex
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -375,19 +376,11 @@ def load_contents(
     SessionError
         If the file is missing, empty, too large or not an MCAP file.
     """
-    try:
-        _refuse_no_file(path)
-        with path.open("rb") as file:
-            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    with _opened(path) as file:
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
             memoryview(mapped), topics, take=take, salvage=salvage, on_progress=on_progress
         )
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    except McapTooLargeError as error:
-        raise SessionError(f"{path} {error}. Give a shorter session.") from None
-    except McapError as error:
-        raise _foreign(path, error) from None
 
 
 def check_beginning(path: Path) -> None:
@@ -398,12 +391,21 @@ def check_beginning(path: Path) -> None:
     SessionError
         If it is missing, empty or not an MCAP file.
     """
+    with _opened(path) as file:
+        read_mcap(memoryview(file.read(len(MAGIC))), ())
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a file, and say of it what goes wrong while it is read as MCAP."""
     try:
         _refuse_no_file(path)
         with path.open("rb") as file:
-            read_mcap(memoryview(file.read(len(MAGIC))), ())
+            yield file
     except OSError as error:
         raise _unreadable(path, error) from None
+    except McapTooLargeError as error:
+        raise SessionError(f"{path} {error}. Give a shorter session.") from None
     except McapError as error:
         raise _foreign(path, error) from None
 

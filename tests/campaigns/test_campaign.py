@@ -15,8 +15,8 @@ from analysis.campaigns._validation import forecasts, left_out_errors
 from analysis.identify import BAND_HZ, Plant
 from analysis.models import FrequencyResponseModel
 from analysis.report._campaign_document import campaign_document
+from analysis.report._campaign_text import campaign_tables, campaign_text
 from analysis.report._campaign_write import write_campaign
-from analysis.report._text import campaign_tables, campaign_text
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from analysis.identify import BAND_HZ
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_figures import validation_figure
 from analysis.report._campaign_page import campaign_page
-from analysis.report._text import campaign_text
+from analysis.report._campaign_text import campaign_text
 
 
 def ends_at_one(path, tried, band_hz):

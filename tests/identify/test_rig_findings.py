@@ -12,7 +12,7 @@ from analysis.identify._channel_checks import clipping, stops, wrong_scale
 from analysis.identify._headline import MISREAD
 from analysis.identify._leakage import repeats_after_s
 from analysis.identify._problem import Comparison
-from analysis.report._sentences import damping_sentences
+from analysis.report._text import damping_sentences
 from rigd.beam import Beam
 
 RATE_HZ = 500.0

@@ -10,11 +10,16 @@ PAGES = ("jinja2", "analysis.report._page", "analysis.report._record_page",
 ASK = "import sys; from analysis.report import {names}; print(*sys.modules)"
 
 
-def imported(names):
+def modules_after(code, *arguments):
+    """Modules that a program has imported when it ends."""
     result = subprocess.run(
-        [sys.executable, "-c", ASK.format(names=names)], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
     )
     return set(result.stdout.split())
+
+
+def imported(names):
+    return modules_after(ASK.format(names=names))
 
 
 @pytest.mark.parametrize(
@@ -31,3 +36,30 @@ def test_text_json_figures_and_rrd_need_no_pages(names):
     modules = imported(names)
     assert modules.intersection(("analysis.report._table", "analysis.report._style"))
     assert not modules.intersection(PAGES)
+
+
+MOST = 30
+ANALYZE = """
+import sys
+from pathlib import Path
+from analysis.cli.sessions import session_command
+from analysis.models import WelchSettings
+from analysis.results import Routes
+from contextlib import redirect_stdout
+routes = Routes(WelchSettings(), paper=True, whole_record=True, fixed=())
+with redirect_stdout(sys.stderr):
+    assert session_command([Path(sys.argv[1])], routes, Path(sys.argv[2]), None) == 0
+print(*sys.modules)
+"""
+
+
+def test_the_way_from_file_to_page_is_short(write_session, short_signals, tmp_path):
+    """Beside the estimators, and without a campaign."""
+    path = write_session(tmp_path / "session.mcap", short_signals)
+    modules = modules_after(ANALYZE, str(path), str(tmp_path / "report"))
+    assert (tmp_path / "report" / "report.html").exists()
+    ours = {name for name in modules if name.partition(".")[0] == "analysis"}
+    estimators = {name for name in ours if name.split(".")[1:2] in (["identify"], ["paper"])}
+    assert {"analysis.results", "analysis.report._record_page"} <= ours
+    assert len(ours - estimators) <= MOST
+    assert not [name for name in ours if "campaign" in name]

@@ -20,7 +20,7 @@ from analysis.report._folder import OutputExistsError
 from analysis.report._page import Picture
 from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_page import record_page
-from analysis.report._sentences import damping_sentences
+from analysis.report._text import damping_sentences
 from analysis.report._write import _write_page, report_tables
 
 VOID = {"meta", "br", "img"}

@@ -18,9 +18,8 @@ from analysis.report._document import document
 from analysis.report._page import Picture
 from analysis.report._record_figures import illustrations
 from analysis.report._record_page import record_page
-from analysis.report._sentences import damping_sentences
 from analysis.report._table import MARK, Cell, csv_text, unreported
-from analysis.report._text import record_text, tables_text
+from analysis.report._text import damping_sentences, record_text, tables_text
 from analysis.report._write import report_tables
 
 ALPHA = frozenset({"alpha"})
