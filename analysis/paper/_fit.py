@@ -217,9 +217,7 @@ def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfF
     bounds = Box(*unknowns.bounds)
     thin, full = _Problem(unknowns, few), _Problem(unknowns, whole)
     found = [
-        descend(
-            thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE, learns=False
-        )
+        descend(thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE)
         for x in starts(structure, thin.cost)
     ]
     # To the bottom of the few points first, and on with the Hessian learnt there: that leaves one
