@@ -6,8 +6,8 @@ of integer order (alpha = 1) with external damping of fractional order.
 
 A coefficient and its order are all but interchangeable near the frequencies where they act:
 fitting ``zeta`` and ``alpha`` themselves means descending a curved valley (their correlation is
--0.99). So the unknowns of a fit to a frequency response (`Unknowns`) are the logarithm of the
-damping's size at one frequency, and the order:
+-0.99). So the unknowns of a fit to a frequency response (`DampingUnknowns`) are the logarithm of
+the damping's size at one frequency, and the order:
 
 * ``ln(zeta omega_2^alpha)``: internal damping relative to the stiffness at the undamped second
   mode, and ``alpha``;
@@ -358,7 +358,7 @@ SIZE_RANGE: Final = (1e-9, 1e3)
 
 
 @dataclass(frozen=True, slots=True)
-class Unknowns:
+class DampingUnknowns:
     """Vector of unknowns of one structure on one beam, in the order of ``structure.free``."""
 
     structure: Structure
@@ -367,7 +367,7 @@ class Unknowns:
     ln_external_unit: float
 
     @classmethod
-    def of(cls, structure: Structure, beam: Beam) -> Unknowns:
+    def of(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
         """Take the beam's own modes as the frequencies at which damping is measured."""
         first, second = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
         return cls(

@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 
 from analysis.campaigns import SessionTask, analyse_session, campaign, process_pool
 from analysis.identify import BAND_HZ
-from analysis.models import STRUCTURES, FrequencyResponseModel, Unknowns, WelchSettings, weights
+from analysis.models import (
+    STRUCTURES,
+    DampingUnknowns,
+    FrequencyResponseModel,
+    WelchSettings,
+    weights,
+)
 from analysis.paper import fit_many
 from analysis.report import write_campaign
 
@@ -62,7 +68,7 @@ def welch_only(paths: list[Path]) -> int:
 def _cost(
     measured: NDArray[np.complex128],
     model: FrequencyResponseModel,
-    unknowns: Unknowns,
+    unknowns: DampingUnknowns,
     weight: NDArray[np.float64],
     x: NDArray[np.float64],
 ) -> float:
@@ -83,7 +89,7 @@ def searched(path: Path) -> dict[tuple[str, str], tuple[float, float]]:
     found = {}
     for fit in result.welch_fits:
         structure = STRUCTURES[fit.structure]
-        unknowns = Unknowns.of(structure, result.beam)
+        unknowns = DampingUnknowns.of(structure, result.beam)
         low, high = unknowns.bounds
         low = np.maximum(low, math.log(1e-5))
         weight = weights(2 * np.pi * result.frequency_hz, fit.weighting)

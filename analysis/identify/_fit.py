@@ -11,7 +11,7 @@ from analysis.identify._parametrization import Unknowns
 from analysis.identify._plant import SETTINGS
 from analysis.identify._problem import Comparison, Objective
 from analysis.identify._result import RecordAnalysis, RecordFit
-from analysis.identify._search import Descent, RoughResponse, Search
+from analysis.identify._search import CoarseResponse, Descent, Search
 from analysis.identify._uncertainty import (
     covariance_of_unknowns,
     interval_from_zero,
@@ -64,7 +64,7 @@ def fit_record(
     ----------
     measurement : Measurement
     structures : iterable of Structure
-        They share one noise spectrum, that of the one closest to the rough response, so that
+        They share one noise spectrum, that of the one closest to the coarse response, so that
         their costs compare.
     fixed : iterable of str
         Settings (`SETTINGS`) that stay at the values the file states.
@@ -88,9 +88,9 @@ def fit_record(
     free = tuple(name for name in SETTINGS if name not in fixed)
     comparison = Comparison.of(measurement, band_hz)
     nominal = measurement.nominal
-    rough = RoughResponse(comparison)
+    coarse = CoarseResponse(comparison)
     searches = [
-        Search.of(Objective(comparison, unknowns), rough)
+        Search.of(Objective(comparison, unknowns), coarse)
         for unknowns in (
             Unknowns.of(structure, nominal, free, 1 if uniform else comparison.visible_modes)
             for structure in structures
@@ -107,8 +107,10 @@ def fit_record(
     if clean is not reference:
         reference = _followed_again(clean, whole)
         comparison = reference.objective.comparison
-        rough = RoughResponse(comparison)
-        searches = [Search.of(Objective(comparison, search.unknowns), rough) for search in searches]
+        coarse = CoarseResponse(comparison)
+        searches = [
+            Search.of(Objective(comparison, search.unknowns), coarse) for search in searches
+        ]
     # Lines are looked for once, in what a fit to every bin leaves.
     noise = reference.noise(with_lines=True)
     noise = replace(noise, lines=(*noise.lines, *(hum.line for hum in comparison.hum)))

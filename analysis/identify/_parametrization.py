@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -433,11 +433,10 @@ class Steps:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     dampings: tuple[tuple[int, int, bool], ...]
-    straight: ClassVar[bool] = False
 
     @classmethod
     def of(cls, unknowns: Unknowns) -> Steps:
-        """Find the dampings in a vector of unknowns."""
+        """Find bounds and dampings of a vector of unknowns."""
         names = unknowns.names
         dampings = tuple(
             (names.index(coefficient), names.index(order), coefficient == "zeta")

@@ -475,6 +475,8 @@ class Projected:
 
 
 _FILLINGS: Final = 8
+"""As often unknown torques are put as predicted, at most."""
+
 _CONVERGED: Final = 1e-6
 """Change of the unknowns below which what is put for unknown torques is final."""
 
@@ -575,8 +577,6 @@ class Objective:
         *,
         relative_tolerance: float,
         max_evaluations: int = 200,
-        fillings: int = _FILLINGS,
-        learns: bool = True,
     ) -> tuple[Objective, Minimum]:
         """Descend; again, while what is put for unknown torques moves the minimum.
 
@@ -585,10 +585,8 @@ class Objective:
         start : ndarray, shape (k,)
         weight : ndarray, shape (K,)
             That of `Noise`.
-        region, relative_tolerance, max_evaluations, learns
+        region, relative_tolerance, max_evaluations
             As `descend` takes them.
-        fillings : int
-            How often unknown torques are put as predicted, at most.
 
         Returns
         -------
@@ -598,7 +596,7 @@ class Objective:
             Of that.
         """
         x = start
-        for _ in range(fillings):
+        for _ in range(_FILLINGS):
             objective = self._filled(x)
             found = descend(
                 partial(objective.normal_equations, weight=weight),
@@ -606,7 +604,6 @@ class Objective:
                 region,
                 relative_tolerance=relative_tolerance,
                 max_evaluations=max_evaluations,
-                learns=learns,
             )
             converged = np.abs(found.x - x).max() < _CONVERGED
             x = found.x

@@ -176,7 +176,7 @@ _ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
 _ROUNDS: Final = 3
 
 
-def profiled(field: Field) -> tuple[Field, Profile, Profile]:
+def profiled(field: Field, *, walk: bool = True) -> tuple[Field, Profile, Profile]:
     """Profile alpha and lambda in the freest structure on the best beam.
 
     What a walk finds lower than the candidates are, or in another valley, is where all of them
@@ -185,6 +185,8 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
     Parameters
     ----------
     field : Field
+    walk : bool
+        Whether the orders can be told at all.
 
     Returns
     -------
@@ -196,7 +198,9 @@ def profiled(field: Field) -> tuple[Field, Profile, Profile]:
         freest = field.freest
         # The order of a damping that does not show could be anything: no walk would tell more.
         walks = {
-            order: profile(field, freest, order) for order in _ORDERS if freest.structure.has(order)
+            order: profile(field, freest, order)
+            for order in _ORDERS
+            if walk and freest.structure.has(order)
         }
         before = [candidate.fit.cost for candidate in field.candidates]
         if round_ == _ROUNDS:

@@ -15,8 +15,8 @@ import numpy as np
 from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
 from analysis.identify._noise import Noise, smooth_power
+from analysis.identify._parametrization import Steps
 from analysis.identify._problem import Objective
-from analysis.optimizer import Box
 from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
@@ -138,18 +138,17 @@ class Refit:
         hold : str, optional
             An unknown that stays where it starts.
         """
-        lower, upper = unknowns.bounds
-        x = np.clip(start, lower, upper)
+        region = Steps.of(unknowns)
+        x = np.clip(start, region.lower, region.upper)
         if hold is not None:
             place = unknowns.names.index(hold)
-            lower[place] = upper[place] = x[place]
+            region.lower[place] = region.upper[place] = x[place]
         objective, found = Objective(comparison, unknowns, columns).minimum(
             x,
             noise.weight,
-            Box(lower, upper),
+            region,
             relative_tolerance=relative_tolerance,
             max_evaluations=max_evaluations,
-            learns=False,
         )
         return cls(objective, found.x, found.equations, noise)
 

@@ -81,7 +81,7 @@ _SIZES: Final = {name: tuple(np.log([1e-4, 1e-3, 1e-2, 1e-1])) for name in ("zet
 _ORDERS: Final = (0.5, 1.5)
 
 
-class RoughResponse:
+class CoarseResponse:
     """Few points of the whole record's frequency response, with their weights."""
 
     __slots__ = ("_frequency_hz", "_measured", "_response", "_weights")
@@ -103,7 +103,7 @@ class RoughResponse:
         self._frequency_hz = hz[band][excited][index]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
 
-    def whitened(self, noise: Noise, frequency_hz: NDArray[np.float64]) -> RoughResponse:
+    def whitened(self, noise: Noise, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
         """Take the same points with the weights that they have under a noise.
 
         Parameters
@@ -147,16 +147,16 @@ class RoughResponse:
         return float(self._weights @ (deviation.real**2 + deviation.imag**2))
 
 
-def rough_starts(rough: RoughResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
+def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
     """Points from which descents lead to all minima of interest, each of shape (k,).
 
     The damping that fits best with all orders 1, which most materials and air come close to; then
     the same losses with the orders apart.
     """
-    shift = resonance_shift(rough.cost, unknowns)
+    shift = resonance_shift(coarse.cost, unknowns)
     sizes = [_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
     found = [unknowns.start(np.array(point)) + shift for point in itertools.product(*sizes)]
-    first = min(found, key=lambda x: rough.cost(unknowns.plant(x)))
+    first = min(found, key=lambda x: coarse.cost(unknowns.plant(x)))
     points = [first]
     orders = [i for i, name in enumerate(unknowns.names) if name in ("alpha", "lambda")]
     for values in itertools.product(_ORDERS, repeat=len(orders)) if orders else ():
@@ -166,14 +166,14 @@ def rough_starts(rough: RoughResponse, unknowns: Unknowns) -> list[NDArray[np.fl
     return points
 
 
-def rough_minima(
-    rough: RoughResponse, unknowns: Unknowns, points: Iterable[NDArray[np.float64]]
+def coarse_minima(
+    coarse: CoarseResponse, unknowns: Unknowns, points: Iterable[NDArray[np.float64]]
 ) -> list[Minimum]:
-    """Different minima of the rough response's cost, the lowest first, from some points."""
+    """Different minima of the coarse response's cost, the lowest first, from some points."""
     steps = Steps.of(unknowns)
     found = [
         descend(
-            lambda x: rough.normal_equations(unknowns, x),
+            lambda x: coarse.normal_equations(unknowns, x),
             point,
             steps,
             relative_tolerance=_TOLERANCE,
@@ -184,7 +184,7 @@ def rough_minima(
     kept: list[Minimum] = []
     for minimum in sorted(found, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
-        if not any(rough.alike(plant, unknowns.plant(other.x)) for other in kept):
+        if not any(coarse.alike(plant, unknowns.plant(other.x)) for other in kept):
             kept.append(minimum)
     return kept
 
@@ -196,10 +196,10 @@ _BETWEEN_RIVALS: Final = 1e-2
 
 _RIVALS: Final = 2
 _NO_RIVAL: Final = 1.5
-"""A rough minimum whose cost is larger than the lowest one's by this factor is not gone after."""
+"""A coarse minimum whose cost is larger than the lowest one's by this factor is not gone after."""
 
 _CLEARLY: Final = 0.9
-"""Cost, relative to where a descent has ended, that makes another rough minimum worth a look."""
+"""Cost, relative to where a descent has ended, that makes another coarse minimum worth a look."""
 
 _MOST_MINIMA: Final = 4
 _LOOKS: Final = 3
@@ -276,7 +276,7 @@ class Search:
     Attributes
     ----------
     objective : Objective
-    rough : RoughResponse
+    coarse : CoarseResponse
     first : ndarray, shape (k,)
         Where the orders are 1.
     minima : list of Minimum
@@ -284,15 +284,15 @@ class Search:
     """
 
     objective: Objective
-    rough: RoughResponse
+    coarse: CoarseResponse
     first: NDArray[np.float64]
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, rough: RoughResponse) -> Search:
+    def of(cls, objective: Objective, coarse: CoarseResponse) -> Search:
         """Look over the whole range of the unknowns."""
-        starts = rough_starts(rough, objective.unknowns)
-        return cls(objective, rough, starts[0], rough_minima(rough, objective.unknowns, starts))
+        starts = initial_guesses(coarse, objective.unknowns)
+        return cls(objective, coarse, starts[0], coarse_minima(coarse, objective.unknowns, starts))
 
     @property
     def unknowns(self) -> Unknowns:
@@ -304,13 +304,13 @@ class Search:
         return replace(self, objective=Objective(comparison, self.unknowns))
 
     def lowest(self) -> Descent:
-        """Where the rough response is lowest."""
+        """Where the coarse response is lowest."""
         return Descent(self.objective, self.minima[0].x)
 
     def under(self, noise: Noise, near: Descent | None = None) -> Descent:
         """Go next to the lowest minimum of the whole record.
 
-        Under another noise another minimum may be the lowest: all are looked at again on the rough
+        Under another noise another minimum may be the lowest: all are looked at again on the coarse
         response, which costs little, and the best few descended to.
 
         Parameters
@@ -319,9 +319,9 @@ class Search:
         near : Descent, optional
             Where one of the minima is known already.
         """
-        rough = self.rough.whitened(noise, self.objective.comparison.frequency_hz)
+        coarse = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
         points = [minimum.x for minimum in self.minima[:_MOST_MINIMA]]
-        found = rough_minima(rough, self.unknowns, [*points, self.first])
+        found = coarse_minima(coarse, self.unknowns, [*points, self.first])
         rivals = [
             Descent(self.objective, minimum.x)
             for minimum in found[:_RIVALS]
@@ -332,8 +332,8 @@ class Search:
             rivals = [near] + [
                 rival
                 for rival in rivals
-                if not rough.alike(plant, self.unknowns.plant(rival.x))
-                and rough.cost(self.unknowns.plant(rival.x)) < _CLEARLY * rough.cost(plant)
+                if not coarse.alike(plant, self.unknowns.plant(rival.x))
+                and coarse.cost(self.unknowns.plant(rival.x)) < _CLEARLY * coarse.cost(plant)
             ]
         if len(rivals) == 1:
             return rivals[0]

@@ -18,7 +18,7 @@ from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._headline import MISREAD, ONE_MODE, UNEXPLAINED, Headline, headline
 from analysis.identify._nonlinear import nonlinear_forces
-from analysis.identify._profile_likelihood import Profile, profiled
+from analysis.identify._profile_likelihood import profiled
 from analysis.identify._residual_tests import (
     InputRelation,
     Whiteness,
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify._headline import Quantity, Simpler
     from analysis.identify._plant import Setting
+    from analysis.identify._residual_tests import Harmonic
     from analysis.identify._result import RecordFit
     from analysis.identify._time_varying import Change
     from analysis.identify._verdict import OrderVerdict
@@ -125,22 +126,9 @@ def select(
         (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
     )
     field, changes = along_time(field.with_orders_free())
-    if untold_reason(field, visible) is None:
-        field, of_alpha, of_lambda = profiled(field)
-    else:
-        of_alpha, of_lambda = (
-            Profile.unwalked(field.freest, "alpha"),
-            Profile.unwalked(field.freest, "lambda"),
-        )
+    field, *profiles = profiled(field, walk=untold_reason(field, visible) is None)
     told = field.led_by(field.freest)
-    white, related = _tests(told)
-    comparison, fit = field.comparison, told.best.fit
-    multiples = harmonics(
-        comparison.angle_rad[comparison.kept],
-        comparison.in_time(fit.residual) * math.sqrt(comparison.samples / 2),
-        comparison.decimation.rate_hz,
-        band_hz,
-    )
+    white, related, multiples = _tests(told, band_hz)
     explained = white.white and not related.related
     found = findings(told, forces, multiples, visible)
     kinds = {finding.kind for finding in found}
@@ -152,33 +140,31 @@ def select(
         else None
     )
     doubt = wrong or _doubt(changes, clipped="clipping" in kinds)
-    orders = (
-        order_verdict(field, of_alpha, visible, doubt=doubt),
-        order_verdict(field, of_lambda, visible, doubt=doubt),
-    )
-    close = rivals(field, EVEN)
-    if wrong == MISREAD:
-        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
-    else:
-        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
-        if not explained:
-            found = (*found, unexplained(white, related, fit.modes))
+    alpha, lambda_ = (order_verdict(field, each, visible, doubt=doubt) for each in profiles)
+    orders, close = (alpha, lambda_), rivals(field, EVEN)
     numbers = headline(field, orders, visible, unexplained=wrong)
     if doubt is not None:
         numbers = numbers.doubted(doubt)
     if "nonlinear stiffness" in kinds:
         numbers = numbers.with_law_assumed()
+    said, advice = [], []
+    if wrong == MISREAD:
+        found = tuple(each for each in found if each.kind in _OF_CHANNELS)
+    else:
+        found = _as_sure(found, tuple(changing(changes)), wrong, doubt, explained=explained)
+        if not explained:
+            found = (*found, unexplained(white, related, told.best.fit.modes))
+        alone = doubt is None and not field.other_kinds(STRONG)
+        said = of_headline(numbers, orders, alone=alone)
+        advice = experiments(field, orders, visible, found, close)
+    advice += [each.remedy for each in found if each.remedy]
     best = field.best
-    of_numbers = of_headline(numbers, orders, alone=doubt is None and not field.other_kinds(STRONG))
-    advice = (
-        dict.fromkeys(each.remedy for each in found if each.remedy)
-        if wrong == MISREAD
-        else experiments(field, orders, visible, found, close)
-    )
     return Selection(
         candidates=field.candidates,
         headline=numbers,
-        analysis=RecordAnalysis.of((c.fit for c in field.candidates), field.noise, comparison),
+        analysis=RecordAnalysis.of(
+            (c.fit for c in field.candidates), field.noise, field.comparison
+        ),
         verdict=Verdict(
             name=measurement.name,
             structure=best.structure.name,
@@ -186,19 +172,16 @@ def select(
             rivals=tuple(c.name for c in close),
             parameters={k: q.value for k, q in numbers.parameters.items() if q.flag is None},
             adequate=wrong is None,
-            alpha=orders[0],
-            lambda_=orders[1],
+            alpha=alpha,
+            lambda_=lambda_,
             visible_modes=visible,
             findings=found,
             table=_table(field),
             whiteness=white,
             input_relation=related,
             harmonics=multiples,
-            sentences=(
-                *(() if wrong == MISREAD else of_numbers),
-                *(each.sentence for each in found),
-            ),
-            experiments=tuple(advice),
+            sentences=(*said, *(each.sentence for each in found)),
+            experiments=tuple(dict.fromkeys(advice)),
             damping_with_amplitude=damping_with_amplitude(told),
         ),
     )
@@ -242,13 +225,17 @@ def _as_sure(
     return (*beside, *along)
 
 
-def _tests(field: Field) -> tuple[Whiteness, InputRelation]:
+def _tests(
+    field: Field, band_hz: tuple[float, float]
+) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
+    """Test what the first candidate leaves."""
     comparison, residual = field.comparison, field.best.fit.residual
-    counts = field.noise.counts
-    angle = comparison.spectrum(comparison.angle_rad[comparison.kept])
+    counts, angle_rad = field.noise.counts, comparison.angle_rad[comparison.kept]
+    of_variance_1 = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
     return (
         whiteness(residual[counts], comparison.frequency_hz[counts]),
-        input_relation(residual, angle, comparison.frequency_hz),
+        input_relation(residual, comparison.spectrum(angle_rad), comparison.frequency_hz),
+        harmonics(angle_rad, of_variance_1, comparison.decimation.rate_hz, band_hz),
     )
 
 
@@ -442,7 +429,7 @@ def experiments(
     found: tuple[Finding, ...],
     close: tuple[Candidate, ...],
 ) -> list[str]:
-    """Say what would tell more, each piece of advice once."""
+    """Say what would tell more, beside the findings' remedies."""
     advice = []
     unknown = [o for o in orders if o.status == "not identifiable"]
     if unknown:
@@ -459,8 +446,7 @@ def experiments(
         advice.append(
             "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
         )
-    advice += [finding.remedy for finding in found if finding.remedy]
-    return list(dict.fromkeys(advice))
+    return advice
 
 
 def _for_two_modes(field: Field, visible: tuple[int, ...]) -> str:

@@ -35,10 +35,10 @@ from numpy.typing import NDArray
 from analysis.models import (
     PARAMETERS,
     STRUCTURES,
+    DampingUnknowns,
     FrequencyResponseModel,
     Parameter,
     Structure,
-    Unknowns,
     Weighting,
     weighting_name,
     weights,
@@ -182,7 +182,7 @@ class _Grid:
 class _Problem:
     """Eq. (26) for one structure on one grid, as a function of the unknowns."""
 
-    def __init__(self, unknowns: Unknowns, grid: _Grid) -> None:
+    def __init__(self, unknowns: DampingUnknowns, grid: _Grid) -> None:
         self.unknowns = unknowns
         self.grid = grid
         self._recent: Recent[_Linearised] = Recent()
@@ -213,13 +213,11 @@ class _Problem:
 
 
 def _fit(structure: Structure, weighting: str, few: _Grid, whole: _Grid) -> FrfFit:
-    unknowns = Unknowns.of(structure, whole.model.beam)
+    unknowns = DampingUnknowns.of(structure, whole.model.beam)
     bounds = Box(*unknowns.bounds)
     thin, full = _Problem(unknowns, few), _Problem(unknowns, whole)
     found = [
-        descend(
-            thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE, learns=False
-        )
+        descend(thin.normal_equations, x, bounds, relative_tolerance=_THINNED_TOLERANCE)
         for x in starts(structure, thin.cost)
     ]
     # To the bottom of the few points first, and on with the Hessian learnt there: that leaves one

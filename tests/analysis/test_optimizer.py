@@ -112,14 +112,24 @@ misfit = decay_problem(decay([0.3, 2.0])[0] + decay([0.3, 3.0])[0])
 """One rotation cannot follow two: most of the residual stays."""
 
 
-def test_large_residuals_are_descended_in_fewer_steps_if_the_start_is_near():
+def test_large_residuals_are_descended_in_fewer_steps_than_gauss_newtons():
+    measured = decay([0.3, 2.0])[0] + decay([0.3, 3.0])[0]
+
+    def stacked(x):
+        r = decay(x)[0] - measured
+        return np.concatenate((r.real, r.imag))
+
+    def slopes_of(x):
+        j = decay(x)[1]
+        return np.concatenate((j.real, j.imag), axis=1).T
+
     rough = descend(misfit, np.array([0.4, 2.3]), FREE, relative_tolerance=1e-3)
-    plain = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, learns=False)
+    plain = least_squares(stacked, rough.x, slopes_of, xtol=1e-15, ftol=1e-14, gtol=1e-15)
     near = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=np.zeros((2, 2)))
     assert near.cost > 1.0
-    assert near.cost <= plain.cost * (1 + 1e-13)
+    assert near.cost <= 2 * plain.cost * (1 + 1e-13)
     np.testing.assert_allclose(near.x, plain.x, rtol=1e-6)
-    assert near.evaluations <= plain.evaluations / 2
+    assert near.evaluations <= plain.nfev / 2
     again = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=near.second_part)
     np.testing.assert_allclose(again.x, near.x, rtol=1e-6)
     assert again.evaluations < near.evaluations
@@ -178,16 +188,13 @@ def slopes(x):
 
 def test_a_large_residual_costs_few_evaluations_more():
     start = np.array([1.0, 1.5, 0.5])
-    ours, theirs = Counted(decays, slopes), Counted(decays, slopes)
+    ours = Counted(decays, slopes)
     found = descend(ours, start, free(3), relative_tolerance=1e-12)
-    box = Box(np.full(3, -10.0), np.full(3, 10.0))
-    plain = descend(theirs, start, box, relative_tolerance=1e-12, learns=False)
-    other = least_squares(decays, start, slopes, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    other = least_squares(decays, start, slopes, xtol=1e-15, ftol=1e-12, gtol=1e-15)
     assert 2 * other.cost > 5
     assert found.cost == pytest.approx(2 * other.cost, rel=1e-10)
-    assert found.cost <= plain.cost * (1 + 1e-11)
     assert found.evaluations == ours.asked
-    assert ours.asked <= 0.6 * theirs.asked
+    assert ours.asked <= 0.6 * other.nfev
 
 
 def test_an_exact_fit_is_found_as_well():
