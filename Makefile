@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Hundreds of processes start in the tests: each would compile every module once more.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all check bench fuzz chaos endurance clean
+.PHONY: demo test test-all test-fast check bench fuzz chaos endurance clean
 
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
@@ -15,6 +15,10 @@ demo: $(VENV)/ready
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
+
+# Without what starts processes or fits models: a minute, for every edit.
+test-fast: $(VENV)/ready
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not process and not fit"
 
 # With what is shown once more at full length, or over another transport.
 test-all: $(VENV)/ready

@@ -6,13 +6,13 @@ import fcntl
 import gc
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-pytest_plugins = ["paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions"]
+from rigd import testing
+
+pytest_plugins = [
+    "kinds_of_tests", "paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions",
+]  # fmt: skip
 
 # Threads gain nothing on small matrices, and fight each other where tests run in parallel.
 os.environ.update(
@@ -90,19 +94,6 @@ PATIENT = {
 BRIEF = {"session.tare_s": "0.5", "session.return_s": "0.3"}
 
 
-def with_values(text: str, values: dict[str, str]) -> str:
-    """A profile's text with other values, by `section.key`; what it has no section for is left."""
-    for name, value in values.items():
-        section, _, key = name.rpartition(".")
-        head, title, rest = text.partition(f"\n[{section}]\n" if section else "\n")
-        if title:
-            pattern = rf"^({key} = (?:\{{ value = )?)[^,\n]*"
-            rest, found = re.subn(pattern, rf"\g<1>{value}", rest, count=1, flags=re.MULTILINE)
-            assert found, name
-            text = head + title + rest
-    return text
-
-
 @pytest.fixture
 def write_profile(tmp_path):
     """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
@@ -111,13 +102,9 @@ def write_profile(tmp_path):
     """
 
     def write(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
-        text = (HW_PROFILES / f"{name}.toml").read_text("utf-8")
         values = BRIEF | (PATIENT if patient else {}) | (values or {})
-        text = with_values(text, values)
-        stem = values.get("name", name).strip('"')
-        path = tmp_path / f"{stem}.toml"
-        path.write_text(text, encoding="utf-8")
-        return path
+        other = {name: tomllib.loads(f"value = {text}")["value"] for name, text in values.items()}
+        return testing.write_profile(tmp_path, other, base=str(HW_PROFILES / f"{name}.toml"))
 
     return write
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from rigd.testing import DEVICE_CHECKS
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 
@@ -18,13 +20,6 @@ def module_at(path):
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-CONTRACT = [
-    check
-    for name, check in vars(module_at(ROOT / "tests/devices/test_conformance.py")).items()
-    if name.startswith("test_")
-]
 
 
 def run(example, folder, *arguments):
@@ -104,7 +99,7 @@ def test_a_device_of_one_s_own_turns(tmp_path):
     assert values(r"999 ms: ([\d.]+) rad", printed) == pytest.approx([0.1], abs=1e-3)
 
 
-@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", DEVICE_CHECKS, ids=lambda check: check.__name__.strip("_"))
 def test_a_device_of_one_s_own_passes_the_devices_contract(check):
     check(module_at(EXAMPLES / "own_device.py").open_rigid_hub())
 
@@ -112,4 +107,4 @@ def test_a_device_of_one_s_own_passes_the_devices_contract(check):
 def test_each_example_is_tested_here():
     tested = set(re.findall(r'run\("(\w+)"', Path(__file__).read_text("utf-8")))
     assert tested == {path.stem for path in EXAMPLES.glob("*.py")}
-    assert len(CONTRACT) >= 4
+    assert len(DEVICE_CHECKS) >= 4

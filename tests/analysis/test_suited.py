@@ -28,7 +28,7 @@ def record_of(write_session, short_signals, tmp_path):
     """Read a session of 4 s of sweep, with metadata as wanted and every so-manyth sample."""
 
     def make(every=1, **metadata):
-        signals = short_signals.decimated(slice(None, None, every))
+        signals = short_signals.part(slice(None, None, every))
         segments = {
             name: (first // every, end // every)
             for name, (first, end) in short_signals.segments.items()
@@ -105,7 +105,7 @@ def slow_signals(make_signals):
     """A sweep of 20 s past two modes, as a data logger of 100 Hz has it."""
     signals = make_signals(rest_s=1.0, sweep_s=20.0, ring_down_s=2.0, noise_nm=1e-3)
     segments = {name: (a // 10, b // 10) for name, (a, b) in signals.segments.items()}
-    return replace(signals.decimated(slice(None, None, 10)), segments=segments)
+    return replace(signals.part(slice(None, None, 10)), segments=segments)
 
 
 def test_a_record_of_100_hz_is_analysed(write_session, slow_signals, analyze_here, tmp_path):

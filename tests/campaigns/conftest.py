@@ -1,23 +1,25 @@
 """Short sessions of a beam with a little damping of both kinds, at 250 Hz to spare time."""
 
+import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from analysis.campaigns import campaign
 from analysis.campaigns._estimates import RecordEstimate, WelchFit
 from analysis.campaigns._experiment import Experiment
 from analysis.campaigns._session import SessionResult
 from analysis.identify import ModeEstimate, Plant
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper._route import Indices, Peak
-from rigd.beam import Beam, Damping, transfer
-from rigd.session import SessionWriter
-from rigd.session._format import SAMPLE_SIZE, pack_sample_into
+from rigd.beam import Beam, Damping
+from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
 RATE_HZ = 250.0
-LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
+LINK = PAPER_BEAM
 PLANT = Damping(zeta=3e-4, alpha=1.0, gamma=0.2, lambda_=1.0)
 NOISE_NM = 1e-3
 SETTINGS = WelchSettings(
@@ -27,36 +29,14 @@ SETTINGS = WelchSettings(
 
 def short_session(path, seed, beam=LINK, damping=PLANT, **stated):
     """One second of rest, 0.5-50 Hz in 30 s, 5 s after it."""
-    t = np.arange(round(36 * RATE_HZ)) / RATE_HZ - 1.0
-    phase = 2 * np.pi * (0.5 * t + (50 - 0.5) * t**2 / 60)
-    reference = np.where((t >= 0) & (t < 30), 0.025 * np.sin(phase), 0.0)
-    n = t.size
-    decay = np.exp(-5.0 * np.arange(n) / n)
-    s = 5.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
-    spectrum = np.fft.rfft(reference * decay, 4 * n) / (1 + s / 80) ** 2
-    angle, torque = (
-        np.fft.irfft(x, 4 * n)[:n] / decay
-        for x in (spectrum, spectrum * transfer(s, beam, damping))
+    signals = chirp_signals(
+        sweep_s=30.0, ring_down_s=5.0, rate_hz=RATE_HZ, start_hz=0.5, beam=beam, damping=damping,
+        noise_nm=NOISE_NM, quantum_rad=0.0, seed=seed,
+    )  # fmt: skip
+    segments = {name: signals.segments[name] for name in ("rest", "sweep")}
+    return write_session(
+        path, replace(signals, metadata={}), beam=beam, metadata=stated, segments=segments
     )
-    torque = torque + np.random.default_rng(seed).normal(scale=NOISE_NM, size=n)
-    block = bytearray(n * SAMPLE_SIZE)
-    for tick in range(n):
-        pack_sample_into(
-            block, tick * SAMPLE_SIZE, tick * 4_000_000, tick, reference[tick], angle[tick], 0.0,
-            torque[tick], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0,
-        )  # fmt: skip
-    writer = SessionWriter(path)
-    metadata = {
-        "rate_hz": repr(RATE_HZ),
-        "beam_length_m": repr(beam.length_m),
-        "beam_density_kg_per_m": repr(beam.density_kg_per_m),
-        "beam_bending_stiffness_n_m2": repr(beam.bending_stiffness_n_m2),
-        **stated,
-    }
-    ends = round(RATE_HZ), round(31 * RATE_HZ)
-    writer.begin(1_700_000_000_000_000_000, metadata, {"rest": (0, ends[0]), "sweep": ends}, {})
-    writer.write_samples(block)
-    return writer.close({"outcome": "complete"})
 
 
 @pytest.fixture(scope="session")
@@ -86,6 +66,48 @@ def settings():
 @pytest.fixture(scope="session")
 def truth():
     return LINK, PLANT
+
+
+@pytest.fixture(scope="session")
+def done(short_sessions, other_beam, settings, tmp_path_factory):
+    """The campaign of four that agree and two files that do not belong to it; its progress."""
+    torn = tmp_path_factory.mktemp("torn") / "torn.mcap"
+    torn.write_bytes(short_sessions[0].read_bytes()[:5000])
+    paths = [short_sessions[0], torn, *short_sessions[1:], other_beam]
+    progress = []
+    found = campaign(
+        paths, settings, structures=("I", "III"), jobs=2,
+        on_progress=lambda *step: progress.append(step),
+    )  # fmt: skip
+    return found, progress
+
+
+class Here:
+    """Workers of this process."""
+
+    def run(self, function, tasks, on_done):
+        found = []
+        for number, task in enumerate(tasks):
+            found.append(function(*task))
+            on_done(number)
+        return found
+
+
+@pytest.fixture(scope="session")
+def in_this_process():
+    """A context in which campaigns start no workers: where that is not what is tested."""
+
+    @contextmanager
+    def pool(_count):
+        yield Here()
+
+    @contextmanager
+    def entered():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys.modules["analysis.campaigns._campaign"], "process_pool", pool)
+            yield
+
+    return entered
 
 
 def welch_fit(structure, weighting, at_bounds=(), **free):

@@ -19,20 +19,6 @@ from analysis.report._campaign_text import campaign_tables, campaign_text
 from analysis.report._campaign_write import write_campaign
 
 
-@pytest.fixture(scope="module")
-def done(short_sessions, other_beam, settings, tmp_path_factory):
-    """The campaign, and its progress."""
-    torn = tmp_path_factory.mktemp("torn") / "torn.mcap"
-    torn.write_bytes(short_sessions[0].read_bytes()[:5000])
-    paths = [short_sessions[0], torn, *short_sessions[1:], other_beam]
-    progress = []
-    found = campaign(
-        paths, settings, structures=("I", "III"), jobs=2,
-        on_progress=lambda *step: progress.append(step),
-    )  # fmt: skip
-    return found, progress
-
-
 def test_sessions_keep_their_order_and_failures_are_told(done, short_sessions, other_beam):
     found, progress = done
     assert [each.path for each in found.sessions] == short_sessions

@@ -122,7 +122,9 @@ def test_files_are_grouped_by_the_specimen_that_they_state(make_experiment):
 
 
 @pytest.fixture(scope="module")
-def mixture(short_sessions, other_beam, make_file, truth, settings, tmp_path_factory):
+def mixture(
+    short_sessions, other_beam, make_file, truth, settings, tmp_path_factory, in_this_process
+):
     """Two of one beam, two of a stiffer one that states to be the same, one that states another."""
     folder = tmp_path_factory.mktemp("stiffer")
     link, damping = truth
@@ -136,7 +138,8 @@ def mixture(short_sessions, other_beam, make_file, truth, settings, tmp_path_fac
         for seed in (20, 21)
     ]  # fmt: skip
     paths = [*short_sessions[:2], *others, other_beam]
-    return campaign(paths, replace(settings, types=("I",)), structures=("III", "IV"), jobs=2)
+    with in_this_process():
+        return campaign(paths, replace(settings, types=("I",)), structures=("III", "IV"))
 
 
 def test_the_verdict_says_first_that_sessions_are_of_several_specimens(mixture):

@@ -3,8 +3,6 @@
 import json
 import math
 import shutil
-import sys
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -17,21 +15,10 @@ QUICK = (
 )  # fmt: skip
 
 
-class Here:
-    """Workers of this process: what is tested is not that there are several."""
-
-    def run(self, function, tasks, on_done):
-        return [function(*task) for task in tasks]
-
-
 @pytest.fixture
-def run_here(monkeypatch, analyze_here):
-    @contextmanager
-    def here(_count):
-        yield Here()
-
-    monkeypatch.setattr(sys.modules["analysis.campaigns._campaign"], "process_pool", here)
-    return lambda *arguments: analyze_here(*arguments, *QUICK)
+def run_here(in_this_process, analyze_here):
+    with in_this_process():
+        yield lambda *arguments: analyze_here(*arguments, *QUICK)
 
 
 def errors(result):

@@ -18,7 +18,7 @@ from analysis.report._campaign_write import write_campaign
 
 
 @pytest.fixture(scope="module")
-def found(make_file, tmp_path_factory):
+def found(make_file, tmp_path_factory, in_this_process):
     """Two sessions whose files say that their excitation is a multisine."""
     folder = tmp_path_factory.mktemp("multisine")
     paths = [
@@ -28,7 +28,8 @@ def found(make_file, tmp_path_factory):
         )
         for seed in range(2)
     ]  # fmt: skip
-    return campaign(paths, WelchSettings(types=("I",)), structures=("III",), jobs=2)
+    with in_this_process():
+        return campaign(paths, WelchSettings(types=("I",)), structures=("III",))
 
 
 def test_the_whole_records_are_pooled_and_nothing_else(found, truth):

@@ -150,11 +150,17 @@ def recorded(folder, size=50_000, timeout_s=60.0):
     return part
 
 
-@pytest.mark.parametrize("send", [to_all, to_one])
+@pytest.mark.parametrize(
+    ("send", "interrupts"),
+    [
+        (to_all, ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")),
+        (to_one, ("SIGINT", "SIGTERM")),
+        pytest.param(to_one, ("SIGHUP", "SIGQUIT", "SIGTSTP"), marks=pytest.mark.slow),
+    ],
+)
 def test_every_stop_leaves_the_torque_off_and_a_complete_file(
-    start_rigd, write_profile, tmp_path, send
+    start_rigd, write_profile, tmp_path, send, interrupts
 ):
-    interrupts = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
     running = {}
     for name in interrupts:  # all at once: what takes time is waiting
         (tmp_path / name).mkdir()

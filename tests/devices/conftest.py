@@ -12,8 +12,12 @@ HARDWARE = "RIGD_HARDWARE"
 
 
 @pytest.fixture(params=["direct", "can", "serial", "previous_tick", "hardware"])
-def devices(request, start_simulator):
+def devices(request, start_simulator, monkeypatch):
     """Drive and sensor: simulated directly, through the wire in lock-step, or the real ones."""
+    # How long a simulated drive takes to answer while it is set up is the machine's affair.
+    if request.param != "hardware":
+        for name in ("_SDO_TIMEOUT_S", "_HURRIED_TIMEOUT_S"):
+            monkeypatch.setattr(f"rigd.devices.cia402._sdo.{name}", 10.0)
     if request.param == "hardware":
         name = os.environ.get(HARDWARE)
         if not name:

@@ -104,7 +104,7 @@ def test_one_percent_of_missing_ticks_does_little(write_session, paper_signals, 
     for first in rng.choice(np.arange(2000, 120_000, 10), 380, replace=False):
         present[first : first + rng.integers(1, 6)] = False
     path = write_session(
-        tmp_path / "a.mcap", paper_signals.decimated(present), ticks=np.flatnonzero(present)
+        tmp_path / "a.mcap", paper_signals.part(present), ticks=np.flatnonzero(present)
     )
     record = load_record(path)
     assert 0.008 < record.gaps.sweep_missing_ticks / record.sweep_samples <= 0.01

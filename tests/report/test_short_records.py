@@ -25,9 +25,7 @@ def cut(write_session, make_signals, tmp_path_factory):
     def make(samples):
         path = folder / f"{samples}.mcap"
         if not path.exists():
-            write_session(
-                path, replace(whole.decimated(slice(0, samples)), segments=whole.segments)
-            )
+            write_session(path, replace(whole.part(slice(0, samples)), segments=whole.segments))
         return path
 
     return make
@@ -68,7 +66,7 @@ def test_a_transform_that_cannot_show_a_mode_is_told(cut):
 def test_a_record_too_short_for_any_mode_is_not_the_metadatas_fault_alone(
     write_session, short_signals, tmp_path
 ):
-    few = replace(short_signals.decimated(slice(0, 30)), segments={})
+    few = replace(short_signals.part(slice(0, 30)), segments={})
     with pytest.raises(
         RecordError, match=r"which 0\.03 s at 1000 Hz cannot show; record longer, or"
     ):

@@ -1,0 +1,11 @@
+"""Builders for tests of devices, excitations and analyses of one's own.
+
+Offers a profile with other values than a shipped one (`write_profile`), records of a beam whose
+parameters are known (`chirp_signals`, `beam_torque`, `write_session`, with the paper's `PAPER_BEAM`
+and `PAPER_DAMPING`), and what every drive with its sensor has to do (`DEVICE_CHECKS`). No test
+framework is needed, and none is imported.
+"""
+
+import lazy_loader as lazy
+
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)
