@@ -186,7 +186,7 @@ class Publisher:
     def end(self) -> tuple[int, str, str]:
         """Close its input; return its exit code and what else it wrote."""
         self.process.stdin.close()
-        self.process.wait(60.0)
+        self.process.wait(300.0)
         return (
             self.process.returncode,
             self.process.stdout.read().decode(),
@@ -202,7 +202,7 @@ class Publisher:
     def _hear(self, what: str) -> dict:
         """Return its next message that has this to say, or an error."""
         while True:
-            ready, _, _ = select.select([self.process.stdout], [], [], 60.0)
+            ready, _, _ = select.select([self.process.stdout], [], [], 300.0)
             assert ready, "the publisher does not answer"
             message = json.loads(self.process.stdout.readline())
             if what in message or "error" in message:
@@ -292,7 +292,7 @@ class Saver:
         """
         from rerun.chunk import RrdReader
 
-        assert self._process.wait(60.0) == 0
+        assert self._process.wait(300.0) == 0
         reader = RrdReader(self._path)
         return {
             recording.recording_id: Columns(
