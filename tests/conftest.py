@@ -102,9 +102,12 @@ def write_profile(tmp_path):
     """
 
     def write(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
-        values = BRIEF | (PATIENT if patient else {}) | (values or {})
-        other = {name: tomllib.loads(f"value = {text}")["value"] for name, text in values.items()}
-        return testing.write_profile(tmp_path, other, base=str(HW_PROFILES / f"{name}.toml"))
+        base = HW_PROFILES / f"{name}.toml"
+        sections = tomllib.loads(base.read_text("utf-8"))
+        borne = {key: PATIENT[key] for key in PATIENT if key.split(".")[0] in sections}
+        texts = BRIEF | (borne if patient else {}) | (values or {})
+        other = {key: tomllib.loads(f"value = {text}")["value"] for key, text in texts.items()}
+        return testing.write_profile(tmp_path, other, base=str(base))
 
     return write
 
