@@ -102,9 +102,12 @@ def write_profile(tmp_path):
     """
 
     def write(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
-        values = BRIEF | (PATIENT if patient else {}) | (values or {})
-        other = {name: tomllib.loads(f"value = {text}")["value"] for name, text in values.items()}
-        return testing.write_profile(tmp_path, other, base=str(HW_PROFILES / f"{name}.toml"))
+        base = HW_PROFILES / f"{name}.toml"
+        sections = tomllib.loads(base.read_text("utf-8"))
+        borne = {key: PATIENT[key] for key in PATIENT if key.split(".")[0] in sections}
+        texts = BRIEF | (borne if patient else {}) | (values or {})
+        other = {key: tomllib.loads(f"value = {text}")["value"] for key, text in texts.items()}
+        return testing.write_profile(tmp_path, other, base=str(base))
 
     return write
 
@@ -122,7 +125,7 @@ def runtime_folder(monkeypatch):
 def rigd(tmp_path):
     """Run `rigd` in an empty folder; returns the completed process."""
 
-    def run(*arguments, timeout=100):
+    def run(*arguments, timeout=300):
         return subprocess.run(
             [RIGD, *map(str, arguments)],
             cwd=tmp_path,
@@ -220,7 +223,7 @@ def start_simulator(runtime_folder, tmp_path):
             )
         started.append(process)
         name = load_profile(profile).name
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + 300.0
         while find_simulator(name) is None:
             assert process.poll() is None, Path(said.name).read_text()
             assert time.monotonic() < deadline, "the simulator does not answer"
@@ -280,6 +283,6 @@ def short_chirps(made_once):
         command = [RIGD, "run", "chirp", "--profile", HW_PROFILES / "sim.toml", "--fast"]
         command += ["--duration", "20", "--rest", "0.5", "--ring-down", "1", "--seed", "3"]
         command += ["--repeat", "2", "--output", folder]
-        subprocess.run(command, check=True, capture_output=True, timeout=100)
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
 
     return sorted(made_once("short_chirps", make).glob("*.mcap"))

@@ -23,8 +23,7 @@ def write_profile(
         Where the file goes, under the profile's name.
     values : mapping of str to value, optional
         Other values by ``section.key``, in the unit of the key; ``name`` is the profile's own. A
-        key that the base does not have is added to its section, and of a section that it does not
-        have nothing is written.
+        key that the base does not have is added to its section.
     base : str
         Name or path of the profile to start from.
 
@@ -32,6 +31,11 @@ def write_profile(
     -------
     Path
         For :func:`rigd.profile.load_profile` and for ``--profile``.
+
+    Raises
+    ------
+    ValueError
+        If the base does not have a section.
 
     Examples
     --------
@@ -60,6 +64,8 @@ def write_profile(
         else:
             lines.append(line)
     lines += _added(section, left)
+    if left:
+        raise ValueError(f"{base} has no section for {', '.join(left)}")
     path = folder / f"{name}.toml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path

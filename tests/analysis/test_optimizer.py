@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+import scipy  # whose parts come on first use
 
 from analysis.identify._parametrization import Steps
 from analysis.optimizer import Box, NormalEquations, descend
@@ -49,7 +49,7 @@ def test_agrees_with_scipy_with_residuals_left(seed):
         r = decay(x)[0] - measured
         return np.concatenate((r.real, r.imag))
 
-    peer = least_squares(stacked, [0.5, 1.8], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    peer = scipy.optimize.least_squares(stacked, [0.5, 1.8], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     np.testing.assert_allclose(found.x, peer.x, rtol=1e-5)
     assert found.cost == pytest.approx(2 * peer.cost, rel=1e-10)
 
@@ -216,7 +216,7 @@ def test_on_a_bound_the_others_make_the_best_of_it():
     problem = Counted(lambda x: matrix @ x - target, lambda x: matrix)
     bounded = Steps(np.array([-10.0, -0.5]), np.array([1.2, 10.0]), ())
     found = descend(problem, np.array([0.0, 0.0]), bounded, relative_tolerance=1e-13)
-    other = least_squares(
+    other = scipy.optimize.least_squares(
         lambda x: matrix @ x - target, [0.0, 0.0], bounds=(bounded.lower, bounded.upper), xtol=1e-14
     )
     assert found.x == pytest.approx(other.x, abs=1e-6)

@@ -166,7 +166,7 @@ cli.main()
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONWARNINGS"}
     done = subprocess.run(
         [sys.executable, *switches, "-c", program], cwd=tmp_path, env=environment,
-        capture_output=True, text=True, timeout=60, check=True,
+        capture_output=True, text=True, timeout=300, check=True,
     )  # fmt: skip
     assert "no such font" not in done.stderr
     assert ("overflow" in done.stderr) == asked

@@ -27,13 +27,13 @@ def profile(request, can_profile, serial_profile):
     process = subprocess.Popen(
         [sys.executable, "-c", RUN, profile.name], stderr=subprocess.PIPE, text=True
     )
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while find_simulator(profile.name) is None and process.poll() is None:
         assert time.monotonic() < end
         time.sleep(0.02)
     yield profile
     process.terminate()
-    sys.stderr.write(process.communicate(timeout=60)[1])
+    sys.stderr.write(process.communicate(timeout=300)[1])
 
 
 def test_a_fault_is_found_and_only_the_operator_resets_it(profile):

@@ -65,7 +65,7 @@ def stop(tmp_path):
             check=False,
             stdout=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=300,
             **options,
         )
 

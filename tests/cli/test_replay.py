@@ -455,7 +455,7 @@ def test_without_a_screen_it_says_what_else_there_is(rigd_here, short, monkeypat
 def test_a_window_that_cannot_be_opened_is_told(rerun_program, short, tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "WAYLAND_DISPLAY"}
     environment |= {"DISPLAY": ":48123", "TMPDIR": str(tmp_path)}
-    done = run("replay", short, env=environment, timeout=60)
+    done = run("replay", short, env=environment, timeout=300)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert "--web shows the same in a browser" in done.stderr.splitlines()[-1]
@@ -506,7 +506,7 @@ def test_a_browser_is_served_on_loopback_until_it_is_ended(served, tmp_path):
     said = process.stderr.readline()
     assert "is shown there until Ctrl-C. From another computer: ssh -L " in said
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=60.0)
+    process.communicate(timeout=300.0)
     assert process.returncode == 130
     assert list(tmp_path.iterdir()) == []
     assert eventually(lambda: has_ended(server))
@@ -516,7 +516,7 @@ def test_a_server_that_dies_is_told(served, tmp_path):
     process, _ = served
     (server,) = children(process.pid)
     os.kill(server, signal.SIGKILL)
-    _, said = process.communicate(timeout=60.0)
+    _, said = process.communicate(timeout=300.0)
     assert process.returncode == 1
     assert said.splitlines()[-1].startswith("Error: The Rerun server ended: ")
     assert list(tmp_path.iterdir()) == []
@@ -643,7 +643,7 @@ def test_a_window_is_closed_with_the_command(rerun_program, short, tmp_path):
             pytest.skip(f"{NO_GRAPHICS}: {process.stderr.read()}")
         assert {end.addresses[0] for end in listeners(viewer)} == {LOOPBACK}
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60.0)
+        process.communicate(timeout=300.0)
         assert process.returncode == 130
         assert list(tmp_path.iterdir()) == []
         assert eventually(lambda: has_ended(viewer))

@@ -176,7 +176,7 @@ def test_every_stop_leaves_the_torque_off_and_a_complete_file(
         time.sleep(0.05)
     for name, process in running.items():
         folder = tmp_path / name
-        output, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=300)
         assert process.returncode == 130, errors
         assert "Traceback" not in errors
         (session,) = json.loads(output)["sessions"]
@@ -205,7 +205,7 @@ def test_a_stop_before_the_record_leaves_no_file(start_rigd, write_profile, tmp_
         time.sleep(0.3 * number)
         to_all(process, signal.SIGINT)
     for folder, process in running:
-        output, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=300)
         assert process.returncode == 130, errors
         assert "Traceback" not in errors
         assert not list(folder.glob("sessions/*"))
@@ -219,7 +219,7 @@ def test_a_series_that_is_stopped_keeps_what_it_has(start_rigd, tmp_path):
     process = start_rigd("run", "chirp", "--json", "--fast", "--repeat", "50", *SHORT)
     assert eventually(lambda: len(list(tmp_path.glob("sessions/*.mcap"))) >= 2)
     to_all(process, signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     sessions = json.loads(output)["sessions"]
@@ -235,7 +235,7 @@ def test_a_control_process_that_hangs_is_killed_at_a_stop(start_rigd, patient, t
     recorded(tmp_path)
     os.kill(child_running(process.pid, "rigd.engine.control_process"), signal.SIGSTOP)
     to_one(process, signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 1, errors  # a fault is one, whatever was asked for
     (session,) = json.loads(output)["sessions"]
     assert session["outcome"] == "fault"
@@ -248,7 +248,7 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, t
     process = start_rigd("run", "hold", "--duration", "3", "--rest", "0", "--profile", patient)
     part = recorded(tmp_path, 1000)  # before, its name is only being tried
     part.with_suffix("").write_text("somebody else's")
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == 1
     assert "Traceback" not in errors
     assert "not overwritten" in errors
@@ -265,7 +265,7 @@ def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path,
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)
     recorded(tmp_path)
     os.kill(child_running(process.pid, victim), signal.SIGKILL)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 1, (output, errors)
     assert "Traceback" not in errors
     if victim == "rigd.engine.control_process":
@@ -291,7 +291,7 @@ def test_a_series_of_which_one_fails_tells_of_those_before(start_rigd, patient, 
             recorded(tmp_path, 1000, timeout_s=10.0)
             os.kill(recorder, signal.SIGKILL)
         time.sleep(0.2)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 1
     (part,) = tmp_path.glob("sessions/*.part")
     *before, failed = json.loads(output)["sessions"]
@@ -312,7 +312,7 @@ def test_a_series_whose_folder_goes_tells_of_those_before(start_rigd, tmp_path):
     assert eventually(lambda: list(tmp_path.glob("sessions/*-02.mcap")))
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "file").rename(tmp_path / "sessions")  # at one go: a missing folder is made anew
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 1, errors
     assert len(json.loads(output)["sessions"]) >= 2
     assert "Traceback" not in errors
@@ -323,7 +323,7 @@ def test_sessions_of_the_same_second_get_names_of_their_own(start_rigd, tmp_path
     processes = [start_rigd("run", *options) for _ in range(3)]
     paths = set()
     for process in processes:
-        output, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=300)
         assert process.returncode == 0, errors
         paths.add(json.loads(output)["sessions"][0]["path"])
     assert len(paths) == 3
@@ -363,7 +363,7 @@ def test_a_terminal_that_was_stopped_does_not_stop_the_supervisor(patient, tmp_p
         assert eventually(lambda: list(tmp_path.glob("sessions/*.mcap")))
     finally:
         termios.tcflow(slave, termios.TCOON)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=300)
     os.close(master)
     os.close(slave)
     (session,) = json.loads(output)["sessions"]

@@ -176,7 +176,7 @@ def look(session):
         )
         try:
             views, reports = {}, []
-            deadline = time.monotonic() + 60.0
+            deadline = time.monotonic() + 300.0
             while not is_right(views) and time.monotonic() < deadline:
                 time.sleep(0.2)  # for each answer it draws everything
                 if not program.running:

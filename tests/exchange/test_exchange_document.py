@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.io
+import scipy  # whose parts come on first use
 
 from analysis.exchange._channels import UNITS
 from analysis.exchange._source import MAX_MEMORY, MAX_SAMPLES

@@ -28,7 +28,7 @@ print(int(status["VmHWM"].split()[0]) // 1024)
 def refused(path, name):
     """Read in a process of its own; return the message and the most memory it took, in MB."""
     command = [sys.executable, "-c", READ, path, name]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     assert result.stderr == ""
     *message, megabytes = result.stdout.splitlines()
     assert message[0].startswith(str(path)), message

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import scipy.io
+import scipy  # whose parts come on first use
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-import scipy.io
+import scipy  # whose parts come on first use
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays

@@ -124,7 +124,7 @@ def test_what_is_no_plain_file_is_refused(tmp_path):
 def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(document()), "--fast", "--json"]
     command += ["--duration", "14", "--ring-down", "1", "--output", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     (session,) = json.loads(done.stdout)["sessions"]
     assert (session["outcome"], session["recorded"]) == ("complete", 16_000)
@@ -136,7 +136,7 @@ def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
 
 def test_the_command_refuses_in_one_sentence(tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(tmp_path / "no.json"), "--fast"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2
     assert "no.json: cannot be read" in done.stderr
     assert "Traceback" not in done.stderr

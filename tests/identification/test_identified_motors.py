@@ -170,7 +170,6 @@ def random_case(number):
     return motor, replace(profile, rig=replace(profile.rig, motor=wrong))
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_random_motors_are_found_within_three_deviations(count):
     all_errors = []

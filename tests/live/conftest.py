@@ -186,7 +186,7 @@ class Publisher:
     def end(self) -> tuple[int, str, str]:
         """Close its input; return its exit code and what else it wrote."""
         self.process.stdin.close()
-        self.process.wait(60.0)
+        self.process.wait(300.0)
         return (
             self.process.returncode,
             self.process.stdout.read().decode(),
@@ -202,7 +202,7 @@ class Publisher:
     def _hear(self, kind: type) -> object:
         """Return its next message of a kind, or why it fails."""
         while True:
-            message = self._messages.next(60.0)
+            message = self._messages.next(300.0)
             assert message is not None, "the publisher does not answer"
             if isinstance(message, kind | Failed):
                 return message
@@ -291,7 +291,7 @@ class Saver:
         """
         from rerun.chunk import RrdReader
 
-        assert self._process.wait(60.0) == 0
+        assert self._process.wait(300.0) == 0
         reader = RrdReader(self._path)
         return {
             recording.recording_id: Columns(

@@ -121,7 +121,7 @@ def test_stays_open_for_as_long_as_asked(start_publisher):
     with pytest.raises(subprocess.TimeoutExpired):
         publisher.process.wait(0.2)
     assert page(publisher)
-    assert publisher.process.wait(60.0) == 0
+    assert publisher.process.wait(300.0) == 0
     assert time.monotonic() - began_s >= 2.5
 
 

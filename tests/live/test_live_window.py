@@ -93,7 +93,7 @@ def session(write_profile, start_rigd, tmp_path):
     assert "Live view: http://127.0.0.1:" in said, said
     yield process, re.search(r"Live view: (\S+)", said)[1]
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60.0)
+    process.communicate(timeout=300.0)
 
 
 @pytest.fixture

@@ -67,7 +67,6 @@ def test_it_holds_all_modules_and_profiles_and_nothing_else(wheel):
 
 
 @pytest.mark.slow  # .ci/run does it too, with dependencies as declared
-@pytest.mark.timeout(300)
 def test_from_an_empty_folder_it_runs_a_session_and_analyses_it(installed, tmp_path):
     config, work = tmp_path / "config", tmp_path / "work"
     work.mkdir()

@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
+import scipy  # whose parts come on first use
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import least_squares
 
 from analysis.models import STRUCTURES, FrequencyResponseModel, WeightingError, weights
 from analysis.paper._fit import FitError, fit_frf, fit_many
@@ -152,7 +152,9 @@ def test_no_random_start_ends_lower(fits, cost, noisy_frf, link, name, weighting
 
     rng = np.random.default_rng([len(name), len(weighting), 5_771])
     ends = [
-        least_squares(residual, rng.uniform(low, high), jacobian, bounds=(low, high), max_nfev=40)
+        scipy.optimize.least_squares(
+            residual, rng.uniform(low, high), jacobian, bounds=(low, high), max_nfev=40
+        )
         for _ in range(20)
     ]
     best = sorted(ends, key=lambda end: end.cost)[:3]

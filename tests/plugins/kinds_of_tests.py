@@ -12,9 +12,9 @@ import pytest
 
 STARTS = {
     "subprocess", "fork", "Rig", "Crew", "Child", "run_in_foreground", "run_session", "run_alone",
-    "process_pool", "LocalCluster", "Scene", "play", "busy",
+    "process_pool", "LocalCluster", "Scene", "play", "busy", "attend",
 }  # fmt: skip
-"""Names by which processes are started."""
+"""Names by which processes are started, or all that one does is run in the test's."""
 FITS = {
     "select", "fit_record", "fit_frf", "analyse", "analyse_session", "campaign", "Field", "Refit",
     "Comparison", "identify", "estimate_motor", "analyze_here", "judged",

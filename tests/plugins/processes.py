@@ -15,7 +15,7 @@ LISTENING = "0A"
 
 
 def eventually(
-    condition: Callable[[], Met], within_s: float = 60.0, every_s: float = 0.02
+    condition: Callable[[], Met], within_s: float = 300.0, every_s: float = 0.02
 ) -> Met | None:
     """Whether a condition comes true: its last answer. The limit only ends a test that fails.
 

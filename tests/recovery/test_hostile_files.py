@@ -17,7 +17,6 @@ def hostile(load_script):
     return load_script("fuzz_hostile")
 
 
-@pytest.mark.timeout(400)
 def test_a_file_of_each_hostile_kind_and_as_many_damaged_ones(hostile):
     """In a process of its own, which forks for each command: this one is large, and has threads."""
     script = Path(hostile.__file__)

@@ -38,7 +38,7 @@ def refused(path, share=1):
     program = ANALYZE.replace("{share}", str(share))
     result = subprocess.run(
         [sys.executable, "-c", program, path.name, "--method", "welch"],
-        cwd=path.parent, capture_output=True, text=True, timeout=100, check=False,
+        cwd=path.parent, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert result.returncode == 1, result.stderr
     (line,) = result.stderr.splitlines()

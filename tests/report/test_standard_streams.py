@@ -30,13 +30,13 @@ def short_file(write_session, make_signals, tmp_path_factory):
 def analyze(*arguments, **options):
     return subprocess.run(
         [sys.executable, "-m", "analysis", *map(str, arguments)],
-        stderr=subprocess.PIPE, encoding="cp1252", timeout=60, check=False, **options,
+        stderr=subprocess.PIPE, encoding="cp1252", timeout=300, check=False, **options,
     )  # fmt: skip
 
 
 def python(code, **options):
     return subprocess.run(
-        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+        [sys.executable, "-c", code], stderr=subprocess.PIPE, text=True, timeout=300, check=False,
         **options,
     )  # fmt: skip
 
@@ -86,7 +86,7 @@ def test_help_and_errors_on_a_full_disk_end_without_a_traceback(stream):
         arguments = ["--help"] if stream == "stdout" else ["nosuch.mcap"]
         result = subprocess.run(
             [sys.executable, "-m", "analysis", *arguments],
-            **both, text=True, timeout=60, check=False,
+            **both, text=True, timeout=300, check=False,
         )  # fmt: skip
     assert result.returncode == 1
     if stream == "stdout":
@@ -115,4 +115,4 @@ def test_everything_is_written_before_the_end():
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell closes streams")
 def test_a_stream_that_is_closed_is_nothing_to_complain_of():
     command = f'"{sys.executable}" -m analysis --help >&- 2>&-'
-    assert subprocess.run(command, shell=True, timeout=60, check=False).returncode == 0
+    assert subprocess.run(command, shell=True, timeout=300, check=False).returncode == 0

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # whose parts come on first use
 
 from rigd.spectral import SpectralError, instrumental_response, welch_response
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # whose parts come on first use
 from hypothesis import given
 from hypothesis import strategies as st
 

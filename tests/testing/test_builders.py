@@ -55,6 +55,12 @@ def test_a_profile_differs_where_it_is_asked_to(tmp_path):
     assert made.control == base.control
 
 
+def test_a_section_that_there_is_not_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"sim has no section for cia402\.node_id, limit\.angle"):
+        testing.write_profile(tmp_path, {"cia402.node_id": 5, "limit.angle_rad": 1.0})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_shipped_rig_is_the_papers():
     rig = load_profile("sim").rig
     assert (rig.beam, rig.damping) == (testing.PAPER_BEAM, testing.PAPER_DAMPING)

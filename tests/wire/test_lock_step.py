@@ -14,25 +14,39 @@ from rigd.runtime._signals import StopRequest
 from rigd.session import read_session
 from rigd.sim.wire._simulator import inject
 
+# Of the devices alone all of these are compared in tests/sim/wire/process: of whole sessions those
+# in which the loop itself does something else, or another line is read.
+AGAIN = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("antenna_can", {}),
-        ("antenna_can", {"cia402.torque_delivery": '"on_arrival"'}),
-        (
+        pytest.param("antenna_can", {}, id="can"),
+        pytest.param(
+            "antenna_can",
+            {"cia402.torque_delivery": '"on_arrival"'},
+            id="on_arrival",
+            marks=AGAIN,
+        ),
+        pytest.param(
             "antenna_can",
             {
                 "acquisition.mode": '"previous_tick"',
                 "encoder.delay_s": "1.0e-3",
                 "sensor.delay_s": "1.0e-3",
             },
+            id="previous_tick",
         ),
-        ("antenna_can", {"cia402.direction": "-1"}),
-        ("antenna_serial", {}),
-        ("antenna_serial", {"ati_serial.filter": '"triangle"', "sensor.delay_s": "9.6e-4"}),
+        pytest.param("antenna_can", {"cia402.direction": "-1"}, id="turned_round", marks=AGAIN),
+        pytest.param("antenna_serial", {}, id="serial"),
+        pytest.param(
+            "antenna_serial",
+            {"ati_serial.filter": '"triangle"', "sensor.delay_s": "9.6e-4"},
+            id="triangle",
+            marks=AGAIN,
+        ),
     ],
-    ids=["can", "on_arrival", "previous_tick", "turned_round", "serial", "triangle"],
 )
 def test_samples_equal_those_of_the_direct_simulation(
     name, values, quiet_profile, start_simulator, run_order, load, tmp_path

@@ -108,7 +108,7 @@ def test_ctrl_c_stops_the_motor_over_the_wire(
     running = start_chirp(profile)
     assert eventually(lambda: _recording(tmp_path))
     os.killpg(running.pid, signal.SIGINT)
-    out, err = running.communicate(timeout=60)
+    out, err = running.communicate(timeout=300)
     assert running.returncode == 130, err
     (counts,) = json.loads(out)["sessions"]
     assert counts["outcome"] == "stopped"
@@ -161,7 +161,7 @@ def test_without_the_loop_the_drive_goes_off_by_itself(
     os.kill(child_running(running.pid, "rigd.engine.control_process"), how)
     assert eventually(lambda: any(e["code"] == 0x8130 for e in drive_log(log).of("emcy")))
     running.send_signal(signal.SIGINT)  # the supervisor kills a process that does not answer
-    running.communicate(timeout=60)
+    running.communicate(timeout=300)
     simulator.send_signal(signal.SIGTERM)
     assert simulator.wait(30.0) == 0
 

@@ -90,9 +90,7 @@ def adapter(scripted, tmp_path):
 
 
 @pytest.fixture
-def behind_adapter(adapter, rig, settings, monkeypatch):
-    # Setting it up takes what it takes where the adapter's threads get no processor.
-    monkeypatch.setattr("rigd.devices.cia402._sdo._SDO_TIMEOUT_S", 10.0)
+def behind_adapter(adapter, rig, settings):
     slow = replace(
         settings,
         heartbeat_timeout_s=0.5,

@@ -32,7 +32,7 @@ def command(*arguments):
 
 def rigd(*arguments):
     return subprocess.run(
-        command(*arguments), capture_output=True, text=True, timeout=100, check=False
+        command(*arguments), capture_output=True, text=True, timeout=300, check=False
     )
 
 
