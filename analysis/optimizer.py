@@ -96,7 +96,15 @@ class Region(Protocol):
         """Least and largest step from `x` in each unknown, shape (k,)."""
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Point within the bounds that a step leads to, shape (k,)."""
+        """Point within the bounds that a step leads to, shape (k,).
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point within the bounds.
+        step : ndarray, shape (k,)
+            Step that is asked for.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +116,9 @@ class Box:
     """
 
     lower: NDArray[np.float64]
+    """Least values, shape (k,)."""
     upper: NDArray[np.float64]
+    """Largest values, shape (k,)."""
     straight: ClassVar[bool] = True
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -116,7 +126,15 @@ class Box:
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Go straight, to the bounds at most."""
+        """Go straight, to the bounds at most.
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point within the bounds.
+        step : ndarray, shape (k,)
+            Step that is asked for.
+        """
         return np.clip(x + step, self.lower, self.upper)
 
 
@@ -163,6 +181,15 @@ def descend(
         As a descent on nearly the same problem has learned it; used from the first step on.
     learns : bool
         Whether to learn the second part of the Hessian; otherwise steps are Gauss-Newton's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.optimizer import Box, NormalEquations, descend
+    >>> square = lambda x: NormalEquations(float((x[0] - 3) ** 2), x - 3, np.eye(1))
+    >>> box = Box(np.array([0.0]), np.array([10.0]))
+    >>> print(descend(square, np.array([1.0]), box, relative_tolerance=1e-12).x.round(6))
+    [3.]
     """
     x = np.clip(start, region.lower, region.upper)
     here = problem(x)
@@ -298,7 +325,15 @@ class Recent(Generic[_Value]):
     def at(
         self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
     ) -> _Value:
-        """Value at `x`, computed if it is not one of the last."""
+        """Value at `x`, computed if it is not one of the last.
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point.
+        compute : callable
+            Gives the value at a point.
+        """
         key = x.tobytes()
         if key not in self._values:
             if len(self._values) == _KEPT:

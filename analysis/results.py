@@ -105,7 +105,21 @@ class Subject:
         fixed: tuple[Setting, ...] = (),
         welch: WelchAnalysis | None = None,
     ) -> Subject:
-        """Take what was selected for a record."""
+        """Take what was selected for a record.
+
+        Parameters
+        ----------
+        record : Record
+            One session on its time grid.
+        selection : Selection
+            Fits, headline and verdict.
+        band_hz : tuple of float
+            Band of the fits.
+        fixed : tuple of str
+            Settings that stayed at the file's values.
+        welch : WelchAnalysis, optional
+            Welch fits of the same record.
+        """
         return cls(
             record=record,
             analysis=selection.analysis,

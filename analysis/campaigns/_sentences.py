@@ -52,18 +52,39 @@ def label(quantity: str) -> tuple[str, float, str]:
 
 
 def with_unit(parameter: str) -> str:
-    """Symbol with its unit, if it has one."""
+    """Symbol with its unit, if it has one.
+
+    Examples
+    --------
+    >>> from analysis.campaigns import with_unit
+    >>> with_unit("zeta"), with_unit("frequency_hz_2")
+    ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
+    """
     symbol, _, unit = label(parameter)
     return f"{symbol} ({unit})" if unit else symbol
 
 
 def probability(chance: float) -> str:
-    """Write a probability that may be too small for a number, but is not 0."""
+    """Write a probability that may be too small for a number, but is not 0.
+
+    Examples
+    --------
+    >>> from analysis.campaigns import probability
+    >>> probability(0.0312), probability(0.0)
+    ('0.031', '< 1e-99')
+    """
     return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
 
 
 def percent(share: float) -> str:
-    """Write a share that may be next to 1, but is not 1."""
+    """Write a share that may be next to 1, but is not 1.
+
+    Examples
+    --------
+    >>> from analysis.campaigns import percent
+    >>> percent(0.4321), percent(0.99999)
+    ('43.2 %', '> 99.9 %')
+    """
     return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
 
 
@@ -88,7 +109,15 @@ def specimens(found: Homogeneity) -> list[str]:
 
 
 def title(text: str, found: Homogeneity) -> str:
-    """Say in a title that what is under it is pooled over a mixture."""
+    """Say in a title that what is under it is pooled over a mixture.
+
+    Parameters
+    ----------
+    text : str
+        The title.
+    found : Homogeneity
+        Whether the sessions are of one specimen.
+    """
     return f"{text}, {_OF_MIXTURE}" if found.mixed else text
 
 
@@ -364,7 +393,15 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
 
 
 def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
-    """Account for the sessions that were to be predicted and were not."""
+    """Account for the sessions that were to be predicted and were not.
+
+    Parameters
+    ----------
+    lost : sequence of LostTrial
+        Sessions that were not predicted.
+    asked : int
+        How many were to be.
+    """
     if not lost:
         return []
     each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])

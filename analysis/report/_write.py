@@ -141,7 +141,15 @@ def write_report(
 
 
 def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
-    """Name the figures of the paper's route that a report has."""
+    """Name the figures of the paper's route that a report has.
+
+    Parameters
+    ----------
+    paper : bool
+        Whether the Welch fits were run.
+    whole_record : bool
+        Whether the whole-record fits were run.
+    """
     if not paper:
         return ()
     return _FIGURES_BESIDE_RECORD if whole_record else _FIGURES

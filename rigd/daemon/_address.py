@@ -28,7 +28,15 @@ class UnknownGroupError(AddressError):
 
 
 def socket_path(rig: str, folder: Path | None = None) -> Path:
-    """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise."""
+    """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise.
+
+    Parameters
+    ----------
+    rig
+        Name of its profile.
+    folder
+        Folder of sockets; by default the user's runtime folder.
+    """
     plain = "".join(c if c.isalnum() else "-" for c in rig).strip("-")
     return (folder or runtime_folder()) / f"{plain}{_SUFFIX}"
 

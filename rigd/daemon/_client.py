@@ -65,7 +65,15 @@ class DaemonGoneError(Exception):
 
 
 class RefusedByDaemonError(Exception):
-    """The daemon refuses a request, or it failed; the message is the daemon's."""
+    """The daemon refuses a request, or it failed; the message is the daemon's.
+
+    Parameters
+    ----------
+    message
+        Text for the operator.
+    wrong_use
+        Whether the request was wrong, and not the rig.
+    """
 
     def __init__(self, message: str, *, wrong_use: bool) -> None:
         super().__init__(message)
@@ -149,6 +157,13 @@ class Client:
         A daemon that has turned this client away, because there were too many, is asked again: it
         has not obeyed then.
 
+        Parameters
+        ----------
+        command
+            A request of docs/control_socket.md.
+        **fields
+            Its further fields.
+
         Raises
         ------
         RefusedByDaemonError
@@ -187,6 +202,13 @@ class Client:
 
     def send(self, command: str, **fields: object) -> None:
         """Send a request whose reply nobody waits for.
+
+        Parameters
+        ----------
+        command
+            A request of docs/control_socket.md.
+        **fields
+            Its further fields.
 
         Raises
         ------
@@ -312,6 +334,13 @@ def stop_session(path: Path) -> Document:
 
 def await_end(path: Path, patience_s: float) -> Document | None:
     """Wait until a daemon says that no session runs.
+
+    Parameters
+    ----------
+    path
+        Socket of the daemon.
+    patience_s
+        Longest wait.
 
     Returns
     -------

@@ -102,7 +102,15 @@ class Child:
         self._write(json.dumps(message).encode() + b"\n")
 
     def send_object(self, name: str, value: object) -> None:
-        """Send a message ``{name: value}`` whose value is no JSON."""
+        """Send a message ``{name: value}`` whose value is no JSON.
+
+        Parameters
+        ----------
+        name
+            Key of the message.
+        value
+            What can be pickled.
+        """
         self._write(packed_object(name, value))
 
     @property
@@ -383,7 +391,15 @@ class Pulse:
         self.still_s = 0.0
 
     def look(self, beat: int, now_s: float) -> float:
-        """Take a look at its beat and return for how long it has not changed, in s."""
+        """Take a look at its beat and return for how long it has not changed, in s.
+
+        Parameters
+        ----------
+        beat
+            Count that the process adds to while it is at work.
+        now_s
+            Time of a monotonic clock.
+        """
         passed_s = min(now_s - self._looked_s, self._MOST_PER_LOOK_S)
         self.still_s = self.still_s + passed_s if beat == self._beat else 0.0
         self._beat, self._looked_s = beat, now_s

@@ -15,9 +15,11 @@ class ControlJob:
     """The rig to attend to."""
 
     profile: Profile
+    """Profile of the rig."""
     moving: Reality | None
     """What the operator was told would move, and nothing else may; None: nothing was told."""
     channels: ChannelSpecs
+    """Shared memory of the session."""
     fast: bool
     """Run under the virtual clock."""
 
@@ -39,6 +41,8 @@ class RecorderJob:
     """The file to write."""
 
     path: Path
+    """Final name of the session file."""
     channels: ChannelSpecs
+    """Shared memory of the session."""
     realtime: RealtimeSettings | None = None
     """What it may ask of the scheduler; None: nothing, for it is not in real time."""

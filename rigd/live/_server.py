@@ -226,7 +226,17 @@ class LiveAddress:
 
     @classmethod
     def of_this_process(cls, rig: str, grpc_port: int, page_port: int, server: int) -> Self:
-        """Return the address of a live view that this process publishes."""
+        """Return the address of a live view that this process publishes.
+
+        Parameters
+        ----------
+        rig
+            Name of its profile.
+        grpc_port, page_port
+            Ports of Rerun's server and of its page.
+        server
+            Process id of the server.
+        """
         pid = os.getpid()
         return cls(rig, pid, _born(pid) or 0, grpc_port, page_port, server)
 

@@ -92,6 +92,13 @@ def check_new(path: Path) -> None:
 def write_new(path: Path, text: str) -> None:
     """Write a file that does not exist yet.
 
+    Parameters
+    ----------
+    path
+        The new file.
+    text
+        Its text.
+
     Raises
     ------
     ProfileError

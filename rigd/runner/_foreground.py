@@ -34,7 +34,17 @@ Tell = Callable[[str], None]
 
 
 class ForegroundError(Exception):
-    """No session, or no further one; the message is for the operator."""
+    """No session, or no further one; the message is for the operator.
+
+    Parameters
+    ----------
+    message
+        Text for the operator.
+    wrong_use
+        Whether the command was wrong, and not the rig.
+    results
+        Sessions that ended before.
+    """
 
     def __init__(
         self, message: str, *, wrong_use: bool, results: Sequence[SessionResult] = ()

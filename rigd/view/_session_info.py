@@ -75,7 +75,15 @@ class Note:
 
 
 def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
-    """Return the last line of a session's log: how it ended, at the time of its last sample."""
+    """Return the last line of a session's log: how it ended, at the time of its last sample.
+
+    Parameters
+    ----------
+    t_ns
+        Time of the last sample.
+    outcome, reason
+        How the session ended, and why.
+    """
     return Note(
         t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
     )
