@@ -29,7 +29,7 @@ LENGTH_M, DENSITY, STIFFNESS = 0.98, 4.7e-3, 0.090275
 NOISE_NM = 5e-3
 _AMPLITUDE_RAD = 0.025
 _ROOTS = np.array([1.8751040687119611, 4.694091132974175, 7.854757438237613, 10.995540734875467])
-"""Of 1 + cos z cosh z."""
+"""Roots of 1 + cos z cosh z."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Rig:
 
     @property
     def damping_ratios(self) -> Real:
-        """Of the first three modes."""
+        """Damping ratios of the first three modes."""
         poles = self.poles()
         return -poles.real / np.abs(poles)
 
@@ -194,7 +194,7 @@ def record(rig: Rig, seed: int, **more: float) -> Record:
 
 
 Force = Callable[[int, float, float, float, float], float]
-"""Of the tick, the deflection relative to the hub, its speed, the absolute speed, and k."""
+"""Function of the tick, the deflection relative to the hub, its speed, the absolute speed, and k."""
 
 
 @cache

@@ -331,7 +331,7 @@ class Decimation:
 def fast_length(at_least: int) -> int:
     """Least number not below `at_least` (1 or more) whose prime factors are at most 11.
 
-    Of real values a transform is a fifth faster with factors up to 5 (``real=True``), which no fit
+    A transform of real values is a fifth faster with factors up to 5 (``real=True``), which no fit
     shows in its time; but the grid of the Laplace variable follows the length (`Prediction`), and
     with it the last digits of every estimate.
 

@@ -102,7 +102,7 @@ def index_figure(campaign: Campaign) -> Figure:
 
 _COLUMNS: Final = 4
 _POOLED: Final = "#C3DCED"
-"""Of an interval: the pooled line's blue, but light and opaque."""
+"""Colour of an interval: the pooled line's blue, but light and opaque."""
 
 
 def pooled_figure(campaign: Campaign) -> Figure:

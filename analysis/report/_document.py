@@ -43,13 +43,13 @@ NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 
 
 def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexValues, IndexValues]:
-    """Compute the indices of a whole-record fit in the band of the paper's route.
+    """Compute the indices of a whole-record fit in the band of the Welch fits.
 
     Parameters
     ----------
     fit : RecordFit
     welch : WelchAnalysis
-        Of the same record.
+        Welch fits of the same record.
 
     Returns
     -------
@@ -405,7 +405,7 @@ def _name(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of what computed the results."""
+    """Versions of what computed the results."""
     return {
         "rigd": rigd.__version__,
         "python": platform.python_version(),

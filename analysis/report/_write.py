@@ -76,7 +76,7 @@ def write_html_report(
 
 
 def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
-    """Make the table of modes, those of the whole-record fits, and those of the paper's route."""
+    """Make the table of modes, those of the whole-record fits, and those of the Welch fits."""
     condition = tables.condition_table(subject)
     of_record = (
         tables.sizes_table(subject),
@@ -97,7 +97,7 @@ def report_tables(subject: Subject) -> tuple[Table, tuple[Table, ...], tuple[Tab
 
 _FIGURES: Final = ("signals", "frf", "torque")
 _FIGURES_BESIDE_RECORD: Final = ("frf",)
-"""Of the paper's route, where the whole-record fit has signals and torque of its own."""
+"""Figures of the Welch fits where the whole-record fit has its own of signals and torque."""
 
 
 def write_report(
@@ -111,7 +111,7 @@ def write_report(
     Parameters
     ----------
     analysis : WelchAnalysis or None
-        The paper's route; None if it was not gone, and only `subject` is reported.
+        Welch fits; None if they were not run, and only `subject` is reported.
     folder : Path
         An existing folder without these files.
     on_step : callable, optional
@@ -141,7 +141,7 @@ def write_report(
 
 
 def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
-    """Name the figures of the paper's route that a report has.
+    """Name the figures of the Welch fits that a report has.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _draw(
 
 
 def _text(analysis: WelchAnalysis | None, subject: Subject | None) -> str:
-    """Return the tables of the paper's route, or without it those of the whole record."""
+    """Return the tables of the Welch fits, or without them those of the whole record."""
     if analysis is not None:
         return tables_text(analysis, () if subject is None else subject.withheld)
     return "" if subject is None else as_text(record_text(subject))

@@ -122,7 +122,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
         What is copied, with all its comments. Where it names the drive's EDS file, that is named
         by its whole path in the copy, whose folder is another one.
     path
-        Of the copy.
+        Name in the copy.
     name
         What the profile calls itself in the copy; None: as before.
 

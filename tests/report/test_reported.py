@@ -177,7 +177,7 @@ def test_one_mode_has_a_point_and_no_curve(careful):
 
 
 def test_the_excited_band_ends_where_the_sweep_does(careful):
-    """Of a chirp of 0.05 to 50 Hz nearly all; of noise alone nothing."""
+    """A chirp of 0.05 to 50 Hz excites nearly all, noise alone nothing."""
     first_hz, last_hz = excited_band_hz(careful.record, careful.analysis)
     assert first_hz < 2.0
     assert last_hz > 45.0
