@@ -194,7 +194,7 @@ def record(rig: Rig, seed: int, **more: float) -> Record:
 
 
 Force = Callable[[int, float, float, float, float], float]
-"""Function of the tick, the deflection relative to the hub, its speed, the absolute speed, and k."""
+"""Force by tick, deflection relative to the hub, its speed, absolute speed, and k."""
 
 
 @cache

@@ -38,7 +38,7 @@ def tuned(profile: Profile, estimate: MotorEstimate) -> Profile:
     profile
         Profile of the rig.
     estimate
-        Of its motor.
+        Estimate of its motor.
     """
     scale = estimate.torque_scale.value
     motor = replace(

@@ -125,6 +125,16 @@ def test_the_check_finds_what_is_missing(text, complaints):
     assert list(complaints_on_function(lambda a, b: a + b, text)) == complaints
 
 
+def test_descriptions_name_the_thing():
+    """Not "Of the copy.", but "Name of the copy."."""
+    found = {
+        name_of(path): lines
+        for path in SOURCES
+        if (lines := re.findall(r'^ *(?:""")?Of .*', path.read_text("utf-8"), re.MULTILINE))
+    }
+    assert not found
+
+
 EXAMPLES = [path for path in SOURCES if ">>> " in path.read_text("utf-8")]
 
 
