@@ -247,7 +247,7 @@ def campaign(
     fixed : sequence of str
         Settings that stay at the file's values in those fits.
     jobs : int, optional
-        Worker processes, by default one a core.
+        Worker processes, by default one per core.
     dask : str, optional
         Address of a Dask scheduler to use instead.
 

@@ -284,12 +284,12 @@ def selected(
     if close:
         names = " or ".join(f"type {each.name}" for each in close)
         said += (
-            f" All sessions together cannot tell it from {names} (BIC differs by "
-            f"{close[0].bic - best.bic:.1f}; 10 would be clear)."
+            f" All sessions together cannot tell it from {names} (ΔBIC "
+            f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
-        said += f" The next, type {ranked[1].name}, is worse by {margin:.3g}."
+        said += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
     return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
 
 
@@ -297,13 +297,13 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
     """Say whether what the structure leaves is noise."""
     if best.misfit > _WRONG:
         return (
-            f"What it leaves is {best.misfit:.3g} times the noise: no structure tried describes "
+            f"Its residual is {best.misfit:.3g} times the noise: no structure tried describes "
             "the beam, and standard deviations mean little."
         )
     if adequate == sessions:
-        return "What it leaves is noise in every session: nothing in the records asks for more."
+        return "The residual is noise in every session; no unmodelled effect found."
     return (
-        f"What is left is noise in {adequate} of {sessions} sessions; in the others something is "
+        f"The residual is noise in {adequate} of {sessions} sessions; in the others something is "
         "unexplained."
     )
 
@@ -337,7 +337,7 @@ def order(found: PooledOrder) -> str:
         would = is_.replace(" is ", " would be ", 1)
         return f"{would}, but {found.reason}; it is not reported.{alone}"
     said = {
-        "compatible": "1 would do",
+        "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
@@ -362,8 +362,8 @@ def scatter(best: PooledEstimate) -> str:
     moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
     if not moved:
         return (
-            "Sessions differ by no more than their own uncertainties (p: probability of so much "
-            "scatter by these alone); they repeat."
+            "No between-session variance: sessions differ by no more than their own uncertainties "
+            "(p: Cochran's Q)."
         )
     return (
         f"Sessions differ by more than their own uncertainties in {', '.join(moved)} (p: "
@@ -381,14 +381,14 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
         return []
     error, alone = float(np.mean([each.error for each in of_best])), float(np.mean(own))
     verdict = (
-        "as well as by a fit to itself"
+        "the others predict a session as well as its own fit"
         if error <= _AS_GOOD * alone
-        else "worse than by a fit to itself: the parameters wander"
+        else "the others predict a session worse than its own fit, for the parameters wander"
     )
     fewer = f"; mean of {len(own)} of {sessions} sessions" if len(own) < sessions else ""
     return [
-        f"From the others, the torque of a session is predicted to {100 * error:.2f} % (its own "
-        f"fit: {100 * alone:.2f} %, noise included{fewer}), {verdict}."
+        f"Leave-one-out error of the torque {100 * error:.2f} % rms (in-sample "
+        f"{100 * alone:.2f} %, noise included{fewer}): {verdict}."
     ]
 
 
@@ -415,7 +415,7 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
 
 
 def _on_beam(estimate: PooledEstimate) -> str:
-    modes = "" if estimate.uniform else ", on a beam whose modes each have a stiffness of their own"
+    modes = "" if estimate.uniform else ", on a non-uniform beam (stiffness correction per mode)"
     more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
     return f"{modes}, with {more}" if more else modes
 
@@ -425,7 +425,7 @@ def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
     (first, count), *others = counts.items()
     verb = do if count > 1 else f"{do}s"
     more = "".join(f", {n} {what}" for what, n in others)
-    return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
+    return f"By themselves, {count} of {sessions} sessions {verb} {first}{more}."
 
 
 def _damping(structure: str) -> str:

@@ -106,7 +106,7 @@ def _how(campaign: Campaign, made_at: datetime) -> list[Facts]:
             ],
         ),
         (
-            "The paper's route",
+            "Welch method (as in the paper)",
             [
                 ("estimator", settings.estimator),
                 ("band", f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz"),

@@ -299,7 +299,7 @@ def session_list_table(campaign: Campaign) -> Table:
 
 
 def sessions_welch_table(campaign: Campaign) -> Table:
-    """Every session's fits by the paper's route, and the nominal models' distance from it."""
+    """Every session's Welch fits, and the nominal models' distance from it."""
     rows = [
         {
             "file": str(session.path),
@@ -440,7 +440,7 @@ def homogeneity_table(campaign: Campaign) -> Table:
         (
             Column("quantity", "quantity", WORDS), Column("sessions", "sessions"),
             Column("mean", "mean"), Column("between sessions", "between_std"),
-            Column("in own std", "between_in_own_std", ".3g"),
+            Column("τ/s", "between_in_own_std", ".3g"),
             Column("Cochran's Q", "cochran_q", ".3g"),
             Column("I²", "i_squared"), Column("p", "chance"),
         ),
@@ -603,7 +603,7 @@ def modes_table(campaign: Campaign) -> Table:
     mixed = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
     return Table(
         "pooled_modes",
-        title("Modes of the beam on a motor that stands still, mean of the sessions", found),
+        title("Modes with locked hub (clamped–free), mean of the sessions", found),
         (
             Column("mode", "number"),
             Column("frequency (Hz)", "frequency_hz"),
@@ -691,8 +691,8 @@ def sessions_table(campaign: Campaign) -> Table:
         "Sessions, and what each says by itself",
         (
             Column("file", "file", WORDS), Column("selects", "selected", WORDS),
-            Column("what is left", "left", WORDS),
-            Column("found beside the beam", "findings", WORDS),
+            Column("residual", "left", WORDS),
+            Column("other effects", "findings", WORDS),
             Column("group" if groups else "", "group", WORDS),
         ),
         (

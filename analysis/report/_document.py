@@ -94,7 +94,7 @@ def record_entries(subject: Subject) -> dict[str, Any]:
     -------
     dict
         ``headline``: what the record says, with flags; ``fits`` and ``modes``: lists of objects as
-        the document has them of the paper's route,
+        the document has them of the Welch fits,
         with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
         selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
         not finite, as `finite` takes them. What is not reported is flagged, not
@@ -234,13 +234,13 @@ def document(
     errors : mapping of str to str, optional
         Message for each file that could not be analysed.
     subjects : sequence of Subject, optional
-        Whole-record results, whose entries follow those of the paper's route.
+        Whole-record results, whose entries follow those of the Welch fits.
 
     Returns
     -------
     dict
         ``versions``, ``headlines`` (what each whole record says, with flags), ``files`` (what was
-        read, and how the paper's route estimated it), ``fits``, ``modes``, ``peaks``, ``records``,
+        read, and how the Welch method estimated it), ``fits``, ``modes``, ``peaks``, ``records``,
         ``errors``: lists of objects that name their file.
         Finite numbers only.
     """

@@ -105,7 +105,11 @@ def _how(subject: Subject, made_at: datetime) -> list[Facts]:
             [(key, value) for key, value in record.metadata.items() if key not in _SHOWN_ALREADY],
         ),
         ("Whole-record fits", _record_fit_facts(subject)),
-        *([] if subject.welch is None else [("The paper's route", _welch_facts(subject.welch))]),
+        *(
+            []
+            if subject.welch is None
+            else [("Welch method (as in the paper)", _welch_facts(subject.welch))]
+        ),
         versions(made_at),
     ]
 

@@ -1,4 +1,4 @@
-"""Tables of a record: whole-record fits, structures, damping by amplitude; the paper's route."""
+"""Tables of a record: whole-record fits, structures, damping by amplitude; Welch fits."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
     "lambda": ("λ", "its order", "1", 1.0),
     "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
     "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
-    "delay_s": ("τ", "torque older than angle", "µs", 1e6),
+    "delay_s": ("τ", "torque-channel delay", "µs", 1e6),
     "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
     "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
     "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
@@ -54,8 +54,8 @@ PARAMETERS: Final[dict[str, tuple[str, str, str, float]]] = {
 
 _STRONG_CORRELATION: Final = 0.9
 _MARKED: Final = (
-    f"{MARK} must not be taken for a property of the antenna; the remark says why. The number "
-    "belongs to the model's curve."
+    f"{MARK} not a property of the antenna, for the reason in the remark: do not interpret. The "
+    "number belongs to the model's curve."
 )
 
 
@@ -72,7 +72,7 @@ def modes_table(subject: Subject) -> Table:
             rows.append((marked(count(mode.number)), *map(greyed, cells)))
     return Table.of(
         "modes",
-        f"Modes of the beam on a motor that stands still: type {told.name}",
+        f"Modes with locked hub (clamped–free): type {told.name}",
         (
             Column("Mode", "mode"),
             Column("Frequency (Hz)", "frequency_hz"),
@@ -157,7 +157,7 @@ def condition_table(subject: Subject) -> Table | None:
         )
     return Table.of(
         "on_condition",
-        f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which would do",
+        f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which suffices",
         (
             Column("Parameter", "parameter", WORDS),
             Column("Unit shown", "unit_shown", WORDS),
@@ -359,7 +359,7 @@ _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 
 
 def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
-    """Parameters and indices of every fit of the paper's route.
+    """Parameters and indices of every Welch fit.
 
     Parameters
     ----------

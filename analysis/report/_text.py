@@ -50,7 +50,7 @@ def analysis_tables(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> 
     """
     modes = tables.welch_modes_table(analysis)
     return Group(
-        Text(f"{analysis.record.path.name}: the paper's route", style="italic"),
+        Text(f"{analysis.record.path.name}: Welch method (as in the paper)", style="italic"),
         "",
         *spaced(
             (
@@ -64,7 +64,7 @@ def analysis_tables(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> 
 
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> RenderableType:
-    """Return what the paper's route gives over several files."""
+    """Return what the Welch fits give over several files."""
     return terminal_table(tables.summary_table(analyses))
 
 

@@ -38,9 +38,7 @@ def serve(
     output: Output = SESSIONS,
     group: Annotated[
         str | None,
-        typer.Option(
-            "--group", help="Let the members of this group command it too, over /run/rigd."
-        ),
+        typer.Option("--group", help="Let members of this group control it too, over /run/rigd."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
@@ -48,7 +46,7 @@ def serve(
     fast: Fast = False,
     hardware: Hardware = False,
 ) -> None:
-    """Own a rig and run sessions for rigd start, until Ctrl-C or SIGTERM ends it safely.
+    """Run the rig daemon, which runs sessions for rigd start; Ctrl-C or SIGTERM ends it safely.
 
     Example: rigd serve --profile antenna_can --output /data/sessions
     """
@@ -72,7 +70,7 @@ def serve(
 
 DaemonOf = Annotated[
     str | None,
-    typer.Option("--profile", help="Whose daemon (default: the only one that is running)."),
+    typer.Option("--profile", help="Profile of the rig (default: the only running daemon)."),
 ]
 
 
@@ -122,10 +120,10 @@ def rig_name(profile: str | None) -> str | None:
 
 def status(
     profile: DaemonOf = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it, until Ctrl-C.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Update it until Ctrl-C.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show how the daemon, its rig and a running session are.
+    """Show the status of daemon, rig and session.
 
     Example: rigd status --watch
     """
@@ -199,7 +197,7 @@ def _file_of_last(status: dict[str, Any]) -> str:
 
 
 def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Average the sensor at rest, and make that its zero. No torque.
+    """Tare the sensor: take its mean at rest as zero. No torque.
 
     Example: rigd tare
     """
@@ -211,12 +209,12 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     for axis, mean in told["mean"].items():
         unit = "N·m" if axis.endswith("_nm") else "N"
         name = axis.removesuffix("_nm").removesuffix("_n")
-        typer.echo(f"{name}: {mean:.4g} {unit}, scatter {told['std'][axis]:.2g} {unit}")
-    typer.echo(f"coupling torque: scatter {told['torque_std_nm']:.2g} N·m")
+        typer.echo(f"{name}: mean {mean:.4g} {unit}, s.d. {told['std'][axis]:.2g} {unit}")
+    typer.echo(f"coupling torque: s.d. {told['torque_std_nm']:.2g} N·m")
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Make the angle where the motor stands the zero, to which the limits are relative. No torque.
+    """Set the zero of the angle, from which limits count, where the motor stands. No torque.
 
     Example: rigd zero
     """
@@ -225,9 +223,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(json.dumps(_measured(told)))
     else:
-        typer.echo(
-            f"The zero is where the motor stands now; before, that was {told['moved_rad']:.5f} rad."
-        )
+        typer.echo(f"Zero set (shift {told['moved_rad']:.5f} rad).")
 
 
 def reset_by_daemon(profile: str | None) -> bool:

@@ -102,7 +102,8 @@ class Violation:
         left = "is below its limit of" if self.below else "exceeds its limit of"
         how = left
         if self.warning is not None:
-            how = f"is past its warning level of {self.warning:.4g} {self.unit}; its limit is"
+            side = "below" if self.below else "above"
+            how = f"is {side} its warning level of {self.warning:.4g} {self.unit}; its limit is"
         where = f" ({self.key})" if self.key else ""
         remedy = f" {self.remedy}" if self.remedy else ""
         return (
@@ -219,7 +220,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "torque command",
-        "torque that the controller asks for",
+        "torque command of the controller",
         "N·m",
         "limits.torque_command_nm",
         "motor.peak_torque_nm",
@@ -230,7 +231,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "i²t",
-        "motor's mean torque (i²t)",
+        "motor's rms torque (i²t)",
         "N·m",
         "motor.continuous_torque_nm",
         0.8,
@@ -293,7 +294,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stale angle share",
-        "part of ticks without a new angle",
+        "share of ticks without a new angle",
         "%",
         "limits.stale_percent",
         0.5,
@@ -304,7 +305,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stale wrench share",
-        "part of ticks without a new wrench",
+        "share of ticks without a new wrench",
         "%",
         "limits.stale_percent",
         0.5,
@@ -324,7 +325,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "missed share",
-        "part of ticks missed",
+        "share of missed ticks",
         "%",
         "limits.missed_percent",
         0.8,

@@ -172,7 +172,7 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
         ("missed ticks", _number(health.missed_ticks), not health.missed_ticks),
         ("late ticks", _number(health.late_ticks), not health.late_ticks),
         ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
-        ("waiting for the recorder", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
+        ("recorder backlog", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
         ("not shown here", _number(health.view_dropped, "{:.0f} samples"), True),
         ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
         ("bus errors", _number(health.bus_errors), not health.bus_errors),

@@ -235,7 +235,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     assert session.board[Word.STALE_ANGLES] == len(stale)
     # Six per cent of ten seconds, of which there may be ten: said once, and past the half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
-    assert warning.startswith("The part of ticks without a new angle of 5 %")
+    assert warning.startswith("The share of ticks without a new angle of 5 %")
     assert "its limit is 10 % (limits.stale_percent)" in warning
 
 
@@ -247,7 +247,7 @@ def test_two_of_three_angles_may_not_be_old(make_session):
     session.assert_safe()
     finished = session.finished
     assert finished["finished"] == "fault"
-    assert "part of ticks without a new angle of 1.01 %" in finished["reason"]
+    assert "share of ticks without a new angle of 1.01 %" in finished["reason"]
     assert "acquisition.deadline_us" in finished["reason"]
     counts, samples = finished["counts"], session.samples
     assert counts["stale_angles"] in (101, 102), "one may come with the last sample"
