@@ -124,6 +124,11 @@ def fit_frf(
     WeightingError
         If there is no such weighting.
 
+    References
+    ----------
+    Fractional-Order Models of Damping Phenomena in a Flexible Sensing Antenna Used for Haptic Robot
+    Navigation, Eq. 26.
+
     Examples
     --------
     >>> import numpy as np

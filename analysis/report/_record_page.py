@@ -170,7 +170,7 @@ def _record_fit_facts(subject: Subject) -> list[tuple[str, str]]:
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {subject.analysis.frequency_hz.size} bins"),
         ("types", ", ".join(subject.fits)),
         ("fixed at the file's values", ", ".join(subject.fixed) or "none"),
-        ("hum taken out", "; ".join(lines) or "none found"),
+        ("narrow-band disturbance", "; ".join(lines) or "none found"),
         (
             "intervals and bands",
             "95 %, from the covariance of the parameters at the minimum; curves by linearisation",

@@ -234,6 +234,11 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
     g : complex ndarray, shape of `s`
         G(s) in N·m/rad.
 
+    References
+    ----------
+    Fractional-Order Models of Damping Phenomena in a Flexible Sensing Antenna Used for Haptic Robot
+    Navigation, Eq. 25.
+
     Examples
     --------
     >>> import numpy as np

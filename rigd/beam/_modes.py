@@ -45,6 +45,10 @@ class Mode:
 def clamped_free_eigenvalues(n: int) -> Real:
     """First `n` positive roots z_i of ``1 + cos z cosh z = 0``, shape (n,), to full precision.
 
+    References
+    ----------
+    L. Meirovitch, Fundamentals of Vibrations, McGraw-Hill.
+
     Examples
     --------
     >>> from rigd.beam import clamped_free_eigenvalues
@@ -98,6 +102,10 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
         From 1 on.
     x_over_length
         Places along the beam, 0 (axis) to 1 (tip), of any shape.
+
+    References
+    ----------
+    L. Meirovitch, Fundamentals of Vibrations, McGraw-Hill.
 
     Examples
     --------

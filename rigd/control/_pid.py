@@ -84,6 +84,11 @@ def design_pid(
         If p is too small beside the motor's own ``g = B/J``: the filter's time constant is
         positive only for ``p > g/4`` and the proportional gain only for ``p > 4 g/15``.
 
+    References
+    ----------
+    K. J. Åström and R. M. Murray, Feedback Systems, Princeton: pole placement and set-point
+    weights.
+
     Examples
     --------
     >>> from rigd.control import design_pid

@@ -396,6 +396,11 @@ def welch_response(
     SpectralError
         If the record is shorter than one segment, or a record or setting makes no sense.
 
+    References
+    ----------
+    P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE
+    Trans. Audio Electroacoust. 15 (1967) 70-73.
+
     Examples
     --------
     >>> import numpy as np
@@ -457,6 +462,10 @@ def fft_response(
     SpectralError
         If a record holds values that are not finite, the input is zero, or `nfft` is too short.
 
+    References
+    ----------
+    L. Ljung, System Identification, 2nd edition, section 6.3: empirical transfer function estimate.
+
     Examples
     --------
     >>> import numpy as np
@@ -514,6 +523,10 @@ def instrumental_response(
     ------
     SpectralError
         As `rigd.spectral.welch_response`, and if the reference is 0 throughout.
+
+    References
+    ----------
+    P. E. Wellstead, "Non-parametric methods of system identification", Automatica 17 (1981) 55-69.
 
     Examples
     --------
