@@ -41,6 +41,13 @@ def load(path: Path | str) -> Record:
         The file cannot be read.
     RecordError
         It can, but not be analysed.
+
+    Examples
+    --------
+    >>> from analysis import api
+    >>> record = api.load("session.mcap")
+    >>> print(record.time_s.size, record.rate_hz, record.outcome)
+    21500 1000.0 complete
     """
     from analysis.record import load_record
 
@@ -66,6 +73,15 @@ def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyRespo
     ------
     EstimateError
         The settings do not suit the record, or its angle does not move.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis import api
+    >>> response = api.frf(api.load("session.mcap")).band(1, 5)
+    >>> peak = np.argmax(np.abs(response.response))
+    >>> print(f"{response.frequency_hz[peak]:.2f} Hz")
+    2.56 Hz
     """
     from analysis.models import WelchSettings
     from analysis.paper import estimate
@@ -133,6 +149,13 @@ def fit(
     ValueError
         No such type, method or setting; among its kinds those of the methods:
         `MeasurementError` and `EstimateError`, if the record cannot be used.
+
+    Examples
+    --------
+    >>> from analysis import api
+    >>> found = api.fit(api.load("session.mcap"), ["III"], fixed=["delay_s"])
+    >>> print(f"{found.fits[0].modes[0].frequency_hz:.2f} Hz")
+    2.55 Hz
     """
     if isinstance(types, str) or isinstance(fixed, str) or isinstance(weightings, str):
         raise ValueError('Give names in a list, if only one: ["VI"] and not "VI".')
@@ -220,7 +243,7 @@ def campaign(
     fixed : sequence of str
         Settings that stay at the file's values in those fits.
     jobs : int, optional
-        Worker processes, by default one a core.
+        Worker processes, by default one per core.
     dask : str, optional
         Address of a Dask scheduler to use instead.
 

@@ -88,6 +88,14 @@ class Structure:
         Parameters to be fitted, in the order of `PARAMETERS`.
     fixed : mapping of str to float
         The others with their values. An order of 0 belongs to a coefficient of 0: absent damping.
+
+    Examples
+    --------
+    >>> from analysis.models import STRUCTURES
+    >>> STRUCTURES["VII"].free
+    ('zeta', 'gamma', 'lambda')
+    >>> STRUCTURES["VII"].damping({"zeta": 7e-5, "gamma": 0.05, "lambda": 0.6})
+    Damping(zeta=7e-05, alpha=1.0, gamma=0.05, lambda_=0.6)
     """
 
     name: str
@@ -165,6 +173,16 @@ class FrequencyResponseModel:
     beam : Beam
     tool_inertia_kg_m2 : float
         Inertia between the sensor and the beam about the motor's axis.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.models import FrequencyResponseModel
+    >>> from rigd.beam import Beam, Damping
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> model = FrequencyResponseModel(np.array([1.0, 10.0]), beam, tool_inertia_kg_m2=1e-5)
+    >>> print(np.abs(model.evaluate(Damping(zeta=1e-4))).round(4))
+    [0.0688 0.0911]
     """
 
     __slots__ = ("_grid", "_tool", "beam")
@@ -184,7 +202,15 @@ class FrequencyResponseModel:
     def evaluate_with_gradient(
         self, damping: Damping, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Response, shape (n,), and its derivatives by the parameters `wrt`, shape (k, n)."""
+        """Response, shape (n,), and its derivatives by the parameters `wrt`, shape (k, n).
+
+        Parameters
+        ----------
+        damping : Damping
+            Where the response is evaluated.
+        wrt : sequence of str
+            Names of `rigd.beam.PARAMETERS`.
+        """
         response, gradient = self._grid.evaluate_with_gradient(self.beam, damping, wrt)
         return response + self._tool, gradient
 
@@ -224,6 +250,13 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
     ------
     WeightingError
         If there is no such weighting, or its values are negative, not finite or all zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.models import weights
+    >>> print(weights(2 * np.pi * np.array([1.0, 2.0, 4.0]), "omega").round(3))
+    [0.571 0.286 0.143]
     """
     name = weighting_name(weighting)
     if callable(weighting):
@@ -251,6 +284,12 @@ def weighting_name(weighting: Weighting) -> str:
     ------
     WeightingError
         If there is no weighting of that name.
+
+    Examples
+    --------
+    >>> from analysis.models import weighting_name
+    >>> weighting_name("omega^-0.5")
+    'omega^-0.5'
     """
     if callable(weighting):
         return str(getattr(weighting, "__name__", type(weighting).__name__))
@@ -334,7 +373,14 @@ class WelchSettings:
         return self.estimator == "h1" and not chosen
 
     def segmentation(self, rate_hz: float) -> Segmentation:
-        """Fill in what was left open: the paper's durations, in samples at this rate."""
+        """Fill in what was left open: the paper's durations, in samples at this rate.
+
+        Examples
+        --------
+        >>> from analysis.models import WelchSettings
+        >>> WelchSettings().segmentation(rate_hz=500)
+        Segmentation(segment_length=8633, overlap=1295, nfft=80000)
+        """
         scale = rate_hz / PAPER_RATE_HZ
         length, overlap, nfft = self.segment_length, self.overlap, self.nfft
         if overlap is None:
@@ -362,9 +408,13 @@ class DampingUnknowns:
     """Vector of unknowns of one structure on one beam, in the order of ``structure.free``."""
 
     structure: Structure
+    """Says which parameters are free."""
     ln_internal_rad_s: float
+    """ln of the undamped second mode, where internal damping is sized."""
     ln_external_rad_s: float
+    """ln of the undamped first mode, where external damping is sized."""
     ln_external_unit: float
+    """ln of the inertia there, ``rho/EI omega²``."""
 
     @classmethod
     def of(cls, structure: Structure, beam: Beam) -> DampingUnknowns:

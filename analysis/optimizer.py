@@ -103,7 +103,15 @@ class Region(Protocol):
         """Least and largest step from `x` in each unknown, shape (k,)."""
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Point within the bounds that a step leads to, shape (k,)."""
+        """Point within the bounds that a step leads to, shape (k,).
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point within the bounds.
+        step : ndarray, shape (k,)
+            Step that is asked for.
+        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +123,7 @@ class Box:
     """
 
     lower: NDArray[np.float64]
+    """Least values, shape (k,)."""
     upper: NDArray[np.float64]
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -122,7 +131,15 @@ class Box:
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Go straight, to the bounds at most."""
+        """Go straight, to the bounds at most.
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point within the bounds.
+        step : ndarray, shape (k,)
+            Step that is asked for.
+        """
         return np.clip(x + step, self.lower, self.upper)
 
 
@@ -295,7 +312,15 @@ class Recent(Generic[_Value]):
     def at(
         self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
     ) -> _Value:
-        """Value at `x`, computed if it is not one of the last."""
+        """Value at `x`, computed if it is not one of the last.
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point.
+        compute : callable
+            Gives the value at a point.
+        """
         key = x.tobytes()
         if key not in self._values:
             if len(self._values) == _KEPT:

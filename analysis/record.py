@@ -176,6 +176,14 @@ def load_record(path: Path) -> Record:
         The file is missing, unreadable, foreign, or lacks a required key.
     RecordError
         It was read, but its samples cannot be analysed.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from analysis.record import load_record
+    >>> record = load_record(Path("session.mcap"))
+    >>> print(record.sweep_samples, record.gaps.missing_ticks)
+    20000 0
     """
     session = read_session(path, fields=_FIELDS, max_samples=MAX_SAMPLES)
     samples = session.samples

@@ -118,6 +118,13 @@ def stated_tool_inertia_kg_m2(session: Session) -> float:
 def stated_delay_s(session: Session, key: str) -> float:
     """Age of a channel's values at their time stamps in s, 0 if the file has none.
 
+    Parameters
+    ----------
+    session : Session
+        Session as read.
+    key : str
+        Key of the metadata.
+
     Raises
     ------
     RecordError
@@ -182,7 +189,20 @@ MAX_CLOCK_ERROR = 1e-3
 
 
 def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
-    """Refuse a span of ticks that is all but empty, or too long."""
+    """Refuse a span of ticks that is all but empty, or too long.
+
+    Parameters
+    ----------
+    path : Path
+        File that messages name.
+    ticks : ndarray of int, shape (n,)
+        Numbers of the recorded ticks.
+
+    Raises
+    ------
+    RecordError
+        It is.
+    """
     span = int(ticks[-1] - ticks[0]) + 1
     if span > MAX_SPAN * len(ticks):
         raise RecordError(
@@ -200,7 +220,24 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
 def check_clock(
     path: Path, ticks: NDArray[np.int64], t_ns: NDArray[np.int64], rate_hz: float
 ) -> None:
-    """Refuse time stamps that run backwards or contradict the rate."""
+    """Refuse time stamps that run backwards or contradict the rate.
+
+    Parameters
+    ----------
+    path : Path
+        File that messages name.
+    ticks : ndarray of int, shape (n,)
+        Numbers of the recorded ticks.
+    t_ns : ndarray of int, shape (n,)
+        Their time stamps.
+    rate_hz : float
+        Rate that the file states.
+
+    Raises
+    ------
+    RecordError
+        They do.
+    """
     if len(ticks) < 2:
         return
     # Compared, not subtracted: a difference of what a file states may overflow.
@@ -224,7 +261,24 @@ def check_clock(
 def check_finite(
     path: Path, field: str, values: NDArray[np.float64], ticks: NDArray[np.int64]
 ) -> None:
-    """Refuse values that are not finite, or that no rig has."""
+    """Refuse values that are not finite, or that no rig has.
+
+    Parameters
+    ----------
+    path : Path
+        File that messages name.
+    field : str
+        Name of the channel.
+    values : ndarray, shape (n,)
+        In rad or N·m.
+    ticks : ndarray of int, shape (n,)
+        Numbers of the recorded ticks.
+
+    Raises
+    ------
+    RecordError
+        There are some.
+    """
     large = np.flatnonzero(np.abs(values) > MAX_VALUE)
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
@@ -241,7 +295,20 @@ def check_finite(
 
 
 def check_sensor(path: Path, torque_nm: NDArray[np.float64]) -> None:
-    """Refuse a torque that is one and the same throughout: noise alone would move it."""
+    """Refuse a torque that is one and the same throughout: noise alone would move it.
+
+    Parameters
+    ----------
+    path : Path
+        File that messages name.
+    torque_nm : ndarray, shape (n,)
+        Coupling torque.
+
+    Raises
+    ------
+    RecordError
+        It is.
+    """
     if torque_nm.size > 1 and np.ptp(torque_nm) == 0.0:
         raise RecordError(
             f"{path}: coupling_torque_nm is {torque_nm[0]:g} N·m in every sample, so the sensor "
@@ -297,7 +364,15 @@ def too_much_unknown(what: str, unknown: int, of: int) -> str | None:
 
 
 def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
-    """Length and start of the longest run of True, (0, 0) without any."""
+    """Length and start of the longest run of True, (0, 0) without any.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.record_checks import longest_run
+    >>> longest_run(np.array([True, False, True, True]))
+    (2, 2)
+    """
     edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
     if starts.size == 0:

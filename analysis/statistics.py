@@ -23,7 +23,21 @@ _SMALLEST: Final = 1e-290
 
 
 def chi_square_p_value(value: ArrayLike, degrees_of_freedom: float) -> NDArray[np.float64]:
-    """Probability that a chi-square is at least `value`, of the shape of `value`."""
+    """Probability that a chi-square is at least `value`, of the shape of `value`.
+
+    Parameters
+    ----------
+    value : array_like
+        Chi-square, not negative.
+    degrees_of_freedom : float
+        Above 0.
+
+    Examples
+    --------
+    >>> from analysis.statistics import chi_square_p_value
+    >>> print(chi_square_p_value([3.841, 10.83], 1).round(4))
+    [0.05  0.001]
+    """
     from scipy.special import chdtrc
 
     p_value: NDArray[np.float64] = chdtrc(degrees_of_freedom, value)
@@ -34,6 +48,19 @@ def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
     """Turn a chi-square into the standard normal deviate that is exceeded as rarely.
 
     It is finite however far `value` is out, also where the probability underflows.
+
+    Parameters
+    ----------
+    value : float
+        Chi-square, not negative.
+    degrees_of_freedom : float
+        Above 0.
+
+    Examples
+    --------
+    >>> from analysis.statistics import chi_square_deviate
+    >>> round(chi_square_deviate(3.841, 1), 3)
+    1.645
     """
     from scipy.special import chdtr, chdtrc, gammaln, ndtri_exp
 
@@ -53,14 +80,35 @@ def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
 
 
 def kolmogorov_p_value(statistic: float) -> float:
-    """Probability that the Kolmogorov statistic, times the root of the count, is at least that."""
+    """Probability that the Kolmogorov statistic, times the root of the count, is at least that.
+
+    Examples
+    --------
+    >>> from analysis.statistics import kolmogorov_p_value
+    >>> round(kolmogorov_p_value(1.3581), 4)
+    0.05
+    """
     from scipy.special import kolmogorov
 
     return float(kolmogorov(statistic))
 
 
 def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
-    """Two-sided point of Student's t: within ± it a share `level` lies."""
+    """Two-sided point of Student's t: within ± it a share `level` lies.
+
+    Parameters
+    ----------
+    level : float
+        Share, 0 to 1.
+    degrees_of_freedom : float
+        Above 0.
+
+    Examples
+    --------
+    >>> from analysis.statistics import student_t_quantile
+    >>> round(student_t_quantile(0.95, 9), 3)
+    2.262
+    """
     from scipy.special import stdtrit
 
     return float(stdtrit(degrees_of_freedom, (1 + level) / 2))

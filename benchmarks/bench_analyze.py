@@ -52,7 +52,7 @@ for (name, end), (_, start) in zip(marks[1:], marks):
 
 @dataclass(frozen=True)
 class Cost:
-    """Of a process, its children included."""
+    """Time and memory of a process, its children included."""
 
     processor_s: float
     wall_s: float

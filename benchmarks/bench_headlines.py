@@ -137,7 +137,7 @@ class Cell:
         Parameters
         ----------
         seed : int
-            Of the noise.
+            Seed of the noise.
         folder : Path
             Where the session stands meanwhile.
         """

@@ -44,7 +44,7 @@ class Meter:
 
     @property
     def percent(self) -> float:
-        """Of one core."""
+        """Share of one core."""
         assert self.first is not None
         assert self.last is not None
         (begin_s, before_s), (end_s, after_s) = self.first, self.last

@@ -122,7 +122,7 @@ class Peer:
         return float(np.vdot(residual, residual).real - inside @ (projection / scale))
 
     def costs(self, population: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of a population, shape (k, members) or (k,)."""
+        """Costs of a population, shape (k, members) or (k,)."""
         members = population.reshape(len(self.unknowns.names), -1).T
         return np.array([self.cost(x) for x in members])
 

@@ -70,7 +70,7 @@ class Told:
 
     @property
     def width(self) -> float:
-        """Of the interval; not a number without one."""
+        """Width of the interval; not a number without one."""
         return math.nan if self.interval is None else self.interval[1] - self.interval[0]
 
     @property
@@ -117,7 +117,7 @@ def loss_frequencies_hz(curves: dict[str, Any]) -> NDArray[np.float64]:
     Parameters
     ----------
     curves : dict
-        Of an object of `records` in the document.
+        Curves of an object of `records` in the document.
     """
     chosen = _loss_places(curves)
     return np.array(curves["frequency_hz"], dtype=np.float64)[chosen]
@@ -192,9 +192,9 @@ class Scored:
     cell : str
     seed : int
     cpu_s : float
-        Of the judgement.
+        Processor time of the judgement.
     type : str
-        Of the structure that the headline is of.
+        Structure that the headline is of.
     told : tuple of Told
         Every number; of the loss factor several points.
     own : dict
@@ -360,8 +360,8 @@ def _mark(held: float, count: int) -> str:
 def score(name: str, sessions: Iterable[Scored]) -> Score:
     """Count how one quantity did.
 
-    Of the loss factor's points, which are one error seen many times, a session counts once, by
-    the share of them whose interval holds the truth.
+    The loss factor's points are one error seen many times, so a session counts once, by the share
+    of them whose interval holds the truth.
 
     Parameters
     ----------

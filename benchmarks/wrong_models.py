@@ -31,7 +31,7 @@ _AMPLITUDE_RAD = 0.025
 _AIR_KG_M3, _AIR_M2_S = 1.2, 1.5e-5
 """Density and kinematic viscosity."""
 _ROOTS = np.array([1.8751040687119611, 4.694091132974175, 7.854757438237613, 10.995540734875467])
-"""Of 1 + cos z cosh z."""
+"""Roots of 1 + cos z cosh z."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Rig:
 
     @property
     def damping_ratios(self) -> Real:
-        """Of the first three modes."""
+        """Damping ratios of the first three modes."""
         poles = self.poles()
         return -poles.real / np.abs(poles)
 
@@ -196,7 +196,7 @@ def record(rig: Rig, seed: int, **more: float) -> Record:
 
 
 Force = Callable[[int, float, float, float, float], float]
-"""Of the tick, the deflection relative to the hub, its speed, the absolute speed, and k."""
+"""Force by tick, deflection relative to the hub, its speed, absolute speed, and k."""
 
 
 @cache

@@ -4,7 +4,7 @@ Usage: python frequency_response.py SESSION.mcap
 
 Welch's estimate has the paper's settings, made for sweeps of two minutes: on a short one the end of
 the band is leakage, so peaks are looked for up to 40 Hz. The empirical transfer function estimate
-is the ratio of the whole record's transforms, which no window smears: compare the heights.
+of the whole record is smeared by no window: compare the heights.
 """
 
 import sys

@@ -126,7 +126,7 @@ def campaign(
     band_hz : tuple of float, optional
         Band of all fits and of the validation; by default what suits each record.
     jobs : int, optional
-        Worker processes, by default one a core.
+        Worker processes, by default one per core.
     dask : str, optional
         Address of a Dask scheduler whose workers are used instead; they find the files under the
         same absolute paths.

@@ -124,7 +124,15 @@ class RecordEstimate:
 
     @classmethod
     def of(cls, candidate: Candidate, indices: Indices) -> RecordEstimate:
-        """Keep of a fit what a campaign needs: all but the residual."""
+        """Keep of a fit what a campaign needs: all but the residual.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            Fit of one session.
+        indices : Indices
+            Its indices against the measured response.
+        """
         fit = candidate.fit
         return cls(
             structure=fit.structure.name,

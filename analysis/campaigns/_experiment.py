@@ -24,6 +24,13 @@ class CampaignError(ValueError):
 class LoneSessionError(CampaignError):
     """A campaign of whose files one alone can be used.
 
+    Parameters
+    ----------
+    path : Path
+        Session that can be used.
+    failures : tuple of SessionFailure
+        The others, and why.
+
     Attributes
     ----------
     path : Path
@@ -225,7 +232,15 @@ def _same(one: str | float, two: str | float) -> bool:
 
 
 def told(key: str, value: str | float) -> str:
-    """Write a fact with its unit."""
+    """Write a fact with its unit.
+
+    Parameters
+    ----------
+    key : str
+        Name of the fact, with its unit as a suffix.
+    value : str or float
+        The fact.
+    """
     if isinstance(value, str):
         return (f"“{value}”" if value else "not stated") if key == LABEL else value
     return f"{value:g} {unit_of(key)}".rstrip()

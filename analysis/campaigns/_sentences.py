@@ -53,18 +53,39 @@ def label(quantity: str) -> tuple[str, float, str]:
 
 
 def with_unit(parameter: str) -> str:
-    """Symbol with its unit, if it has one."""
+    """Symbol with its unit, if it has one.
+
+    Examples
+    --------
+    >>> from analysis.campaigns import with_unit
+    >>> with_unit("zeta"), with_unit("frequency_hz_2")
+    ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
+    """
     symbol, _, unit = label(parameter)
     return f"{symbol} ({unit})" if unit else symbol
 
 
 def probability(chance: float) -> str:
-    """Write a probability that may be too small for a number, but is not 0."""
+    """Write a probability that may be too small for a number, but is not 0.
+
+    Examples
+    --------
+    >>> from analysis.campaigns import probability
+    >>> probability(0.0312), probability(0.0)
+    ('0.031', '< 1e-99')
+    """
     return f"{chance:.2g}" if chance > _LEAST else f"< {_LEAST:g}"
 
 
 def percent(share: float) -> str:
-    """Write a share that may be next to 1, but is not 1."""
+    """Write a share that may be next to 1, but is not 1.
+
+    Examples
+    --------
+    >>> from analysis.campaigns import percent
+    >>> percent(0.4321), percent(0.99999)
+    ('43.2 %', '> 99.9 %')
+    """
     return "> 99.9 %" if share > 0.999 else f"{100 * share:.3g} %"
 
 
@@ -89,7 +110,15 @@ def specimens(found: Homogeneity) -> list[str]:
 
 
 def title(text: str, found: Homogeneity) -> str:
-    """Say in a title that what is under it is pooled over a mixture."""
+    """Say in a title that what is under it is pooled over a mixture.
+
+    Parameters
+    ----------
+    text : str
+        The title.
+    found : Homogeneity
+        Whether the sessions are of one specimen.
+    """
     return f"{text}, {_OF_MIXTURE}" if found.mixed else text
 
 
@@ -256,12 +285,12 @@ def selected(
     if close:
         names = " or ".join(f"type {each.name}" for each in close)
         said += (
-            f" All sessions together cannot tell it from {names} (BIC differs by "
-            f"{close[0].bic - best.bic:.1f}; 10 would be clear)."
+            f" All sessions together cannot tell it from {names} (ΔBIC "
+            f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
-        said += f" The next, type {ranked[1].name}, is worse by {margin:.3g}."
+        said += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
     return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
 
 
@@ -269,13 +298,13 @@ def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
     """Say whether what the structure leaves is noise."""
     if best.misfit > _WRONG:
         return (
-            f"What it leaves is {best.misfit:.3g} times the noise: no structure tried describes "
+            f"Its residual is {best.misfit:.3g} times the noise: no structure tried describes "
             "the beam, and standard deviations mean little."
         )
     if adequate == sessions:
-        return "What it leaves is noise in every session: nothing in the records asks for more."
+        return "The residual is noise in every session; no unmodelled effect found."
     return (
-        f"What is left is noise in {adequate} of {sessions} sessions; in the others something is "
+        f"The residual is noise in {adequate} of {sessions} sessions; in the others something is "
         "unexplained."
     )
 
@@ -309,7 +338,7 @@ def order(found: PooledOrder) -> str:
         would = is_.replace(" is ", " would be ", 1)
         return f"{would}, but {found.reason}; it is not reported.{alone}"
     said = {
-        "compatible": "1 would do",
+        "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
@@ -334,8 +363,8 @@ def scatter(best: PooledEstimate) -> str:
     moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
     if not moved:
         return (
-            "Sessions differ by no more than their own uncertainties (p: probability of so much "
-            "scatter by these alone); they repeat."
+            "No between-session variance: sessions differ by no more than their own uncertainties "
+            "(p: Cochran's Q)."
         )
     return (
         f"Sessions differ by more than their own uncertainties in {', '.join(moved)} (p: "
@@ -353,19 +382,27 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
         return []
     error, alone = float(np.mean([each.error for each in of_best])), float(np.mean(own))
     verdict = (
-        "as well as by a fit to itself"
+        "the others predict a session as well as its own fit"
         if error <= _AS_GOOD * alone
-        else "worse than by a fit to itself: the parameters wander"
+        else "the others predict a session worse than its own fit, for the parameters wander"
     )
     fewer = f"; mean of {len(own)} of {sessions} sessions" if len(own) < sessions else ""
     return [
-        f"From the others, the torque of a session is predicted to {100 * error:.2f} % (its own "
-        f"fit: {100 * alone:.2f} %, noise included{fewer}), {verdict}."
+        f"Leave-one-out error of the torque {100 * error:.2f} % rms (in-sample "
+        f"{100 * alone:.2f} %, noise included{fewer}): {verdict}."
     ]
 
 
 def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
-    """Account for the sessions that were to be predicted and were not."""
+    """Account for the sessions that were to be predicted and were not.
+
+    Parameters
+    ----------
+    lost : sequence of LostTrial
+        Sessions that were not predicted.
+    asked : int
+        How many were to be.
+    """
     if not lost:
         return []
     each = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MANY])
@@ -379,7 +416,7 @@ def lost_trials(lost: Sequence[LostTrial], asked: int) -> list[str]:
 
 
 def _on_beam(estimate: PooledEstimate) -> str:
-    modes = "" if estimate.uniform else ", on a beam whose modes each have a stiffness of their own"
+    modes = "" if estimate.uniform else ", on a non-uniform beam (stiffness correction per mode)"
     more = estimate.beam.removeprefix(", modes free").removeprefix(", ")
     return f"{modes}, with {more}" if more else modes
 
@@ -389,7 +426,7 @@ def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
     (first, count), *others = counts.items()
     verb = do if count > 1 else f"{do}s"
     more = "".join(f", {n} {what}" for what, n in others)
-    return f"Alone, {count} of {sessions} sessions {verb} {first}{more}."
+    return f"By themselves, {count} of {sessions} sessions {verb} {first}{more}."
 
 
 def _damping(structure: str) -> str:

@@ -42,8 +42,11 @@ class SessionFailure:
     """A session of which nothing is used, why, and what experiment it is as far as is known."""
 
     path: Path
+    """The file."""
     message: str
+    """Why, a sentence for the operator."""
     experiment: Experiment | None = None
+    """Specimen and rig, None if nothing is known of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +142,13 @@ def analyse_session(path: Path, task: SessionTask) -> SessionResult | SessionFai
     """Read a session, analyse it by both routes, or by the whole record where that suits alone.
 
     A session that cannot be analysed is told, not raised: it is one of many.
+
+    Parameters
+    ----------
+    path : Path
+        Session file.
+    task : SessionTask
+        What is fitted, and how.
     """
     from analysis.record import load_record
     from analysis.suited import remarks, welch_analysis

@@ -60,7 +60,9 @@ class LostTrial:
     """A session that was to be predicted from the others, and why it was not."""
 
     path: Path
+    """The session."""
     reason: str
+    """Why, as the rest of a sentence."""
 
 
 @dataclass(frozen=True, slots=True)

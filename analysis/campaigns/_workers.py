@@ -254,7 +254,7 @@ def dask_cluster(address: str) -> Iterator[Workers]:
     Parameters
     ----------
     address : str
-        Of its scheduler, such as ``tcp://10.0.0.5:8786``.
+        Address of its scheduler, such as ``tcp://10.0.0.5:8786``.
 
     Raises
     ------

@@ -73,7 +73,8 @@ def _tell(asked: bool) -> None:
 
 
 Version = Annotated[
-    bool, typer.Option("--version", callback=_tell, is_eager=True, help="Say which it is.")
+    bool,
+    typer.Option("--version", callback=_tell, is_eager=True, help="Show the version and exit."),
 ]
 
 
@@ -146,14 +147,14 @@ def analyze(
         str,
         typer.Option(
             metavar="welch|record|all",
-            help="welch: the paper's; record: the whole record's, of all types; all: both.",
+            help="welch: Welch method (as in the paper); record: whole-record fits; all: both.",
         ),
     ] = "all",
     fix: Annotated[
         str,
         typer.Option(
             metavar="LIST",
-            help="What the whole-record fits take from the file instead of estimating it, of "
+            help="What the whole-record fits take from the file instead of estimating it: "
             "density_over_stiffness, bending_stiffness_n_m2, delay_s, tool_inertia_kg_m2.",
         ),
     ] = "",
@@ -176,7 +177,7 @@ def analyze(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of the report, new or empty; with --each, one folder a file in it.",
+            help="Folder of the report, new or empty; with --each, one folder per file in it.",
         ),
     ] = None,
     json: Annotated[
@@ -187,23 +188,24 @@ def analyze(
         Path | None,
         typer.Option(
             metavar="OUT.rrd",
-            help="New file with the session and its fits for Rerun's viewer; of one session file.",
+            help="New file for Rerun's viewer with the session and its fits; one session only.",
         ),
     ] = None,
     each: Annotated[
         bool,
-        typer.Option("--each", help="Of several files, a report of each and not of the campaign."),
+        typer.Option("--each", help="Report each of several files by itself, not as a campaign."),
     ] = False,
     paper: Annotated[
-        bool, typer.Option("--paper", help="Campaign: the paper's Tables 3 and 4 beside its own.")
+        bool,
+        typer.Option("--paper", help="Campaign: show the paper's Tables 3 and 4 for comparison."),
     ] = False,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Campaign: worker processes.  [default: one a core]"),
+        typer.Option(min=1, help="Campaign: worker processes.  [default: one per core]"),
     ] = None,
     dask: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Campaign: Dask scheduler whose workers are used."),
+        typer.Option(metavar="ADDRESS", help="Campaign: address of a Dask scheduler to run on."),
     ] = None,
     version: Version = False,  # noqa: ARG001 - its callback has told it
 ) -> None:
@@ -225,8 +227,7 @@ def analyze(
     method = choice(method, _METHODS, "--method")
     if fix and method == "welch":
         raise typer.BadParameter(
-            "the paper's route takes all of them from the file; leave it out, or take "
-            "--method all.",
+            "the Welch fits take all of them from the file; leave it out, or take --method all.",
             param_hint="--fix",
         )
     if method == "record":

@@ -51,7 +51,7 @@ def campaign_command(
     json : Path, optional
         New file for all results; ``-`` for standard output, which then holds nothing else.
     jobs : int, optional
-        Worker processes, by default one a core.
+        Worker processes, by default one per core.
     dask : str, optional
         Address of a Dask scheduler to use instead.
     with_paper : bool

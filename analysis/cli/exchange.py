@@ -46,7 +46,7 @@ _Target = Annotated[
     typer.Argument(metavar="OUT", readable=False, help="New file: .csv, .mat, .uff, .unv, .uf58."),
 ]
 _Binary = Annotated[
-    bool, typer.Option("--binary", help="Of a universal file: 8-byte floats instead of text.")
+    bool, typer.Option("--binary", help="Write 8-byte floats instead of text (universal files).")
 ]
 
 
@@ -80,14 +80,14 @@ def import_command(
         float | None,
         typer.Option(metavar="HZ", help="Instead of --time: samples per second, without gaps."),
     ] = None,
-    reference: Annotated[str | None, _channel("Angle that the motor was to have.")] = None,
+    reference: Annotated[str | None, _channel("Reference of the motor angle.")] = None,
     torque_command: Annotated[str | None, _channel("Torque commanded to the motor.")] = None,
-    fx: Annotated[str | None, _channel("Force in the sensor's frame; N, mN, kN, lbf.")] = None,
-    fy: Annotated[str | None, _channel("Likewise.")] = None,
-    fz: Annotated[str | None, _channel("Likewise.")] = None,
-    tx: Annotated[str | None, _channel("Torque in the sensor's frame.")] = None,
-    ty: Annotated[str | None, _channel("Likewise.")] = None,
-    tz: Annotated[str | None, _channel("Likewise.")] = None,
+    fx: Annotated[str | None, _channel("Force along x, sensor frame; N, mN, kN, lbf.")] = None,
+    fy: Annotated[str | None, _channel("Force along y, sensor frame.")] = None,
+    fz: Annotated[str | None, _channel("Force along z, sensor frame.")] = None,
+    tx: Annotated[str | None, _channel("Torque about x, sensor frame.")] = None,
+    ty: Annotated[str | None, _channel("Torque about y, sensor frame.")] = None,
+    tz: Annotated[str | None, _channel("Torque about z, sensor frame.")] = None,
     rest: Annotated[
         str | None, typer.Option(metavar="T0,T1", help="Rest before the sweep, s from the start.")
     ] = None,
@@ -98,7 +98,8 @@ def import_command(
         ),
     ] = None,
     ring_down: Annotated[
-        str | None, typer.Option(metavar="T0,T1", help="Ring-down after the sweep, likewise.")
+        str | None,
+        typer.Option(metavar="T0,T1", help="Ring-down after the sweep, s from the start."),
     ] = None,
     angle_delay_s: Annotated[
         float, typer.Option(metavar="S", help="Age of the angle at its time stamp.")
@@ -115,7 +116,7 @@ def import_command(
     ] = "",
     specimen: Annotated[
         str,
-        typer.Option(metavar="TEXT", help="Label of the specimen: campaigns tell by it."),
+        typer.Option(metavar="TEXT", help="Label of the specimen; campaigns compare it."),
     ] = "",
     note: Annotated[
         str, typer.Option(metavar="TEXT", help="Note, stored in the session file.")

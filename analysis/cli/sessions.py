@@ -34,7 +34,7 @@ def session_command(
     files : sequence of Path
     routes : Routes
     report : Path, optional
-        Folder of the report of one file, or of one folder a file.
+        Folder of the report of one file, or of one folder per file.
     json : Path, optional
         New file for all results; ``-`` for standard output, which then holds nothing else.
     rerun : Path, optional

@@ -30,8 +30,8 @@ Estimator = Annotated[
     str,
     typer.Option(
         metavar="h1|h2|hv|iv|fft",
-        help="Estimate that is fitted: Welch's H1, H2 or Hv, Hiv by way of the reference (noise "
-        "that the controller feeds back is no response then), or one FFT of the whole record.",
+        help="Estimator that is fitted: Welch's H1, H2 or Hv, Hiv with the reference as instrument "
+        "(not biased by noise that the controller feeds back), or one FFT of the whole record.",
     ),
 ]
 Segment = Annotated[

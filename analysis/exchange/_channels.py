@@ -191,6 +191,12 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
     ------
     ExchangeError
         If the unit is missing or unknown, or there is no name before it.
+
+    Examples
+    --------
+    >>> from analysis.exchange import parse_choice
+    >>> parse_choice("Motor/Angle:mrad", "angle")
+    ChannelChoice(channel='Motor/Angle', unit='mrad', factor=0.001)
     """
     channel, colon, unit = text.rpartition(":")
     if not colon or not channel.strip():

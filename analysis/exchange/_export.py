@@ -49,6 +49,14 @@ def export_record(session: Path, target: Path, *, binary: bool = False) -> Table
         If the file exists or cannot be written.
     rigd.session.SessionError
         If the session cannot be read.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from analysis.exchange import export_record
+    >>> table = export_record(Path("session.mcap"), Path("record.csv"))
+    >>> [column.name for column in table.columns][:3]
+    ['tick', 'angle_reference_rad', 'angle_rad']
     """
     check_target(target, binary=binary)
     table = record_table(session)
@@ -67,6 +75,15 @@ def export_frf(
     """Write the frequency response that an analysis with these settings and band would fit.
 
     Otherwise as `export_record`; the analysis' own errors come on top.
+
+    Parameters
+    ----------
+    session, target, binary
+        As for `export_record`.
+    settings : WelchSettings
+        Estimator and segments.
+    band_hz : tuple of float, optional
+        First and last frequency; by default what suits the record.
     """
     check_target(target, binary=binary)
     table = frf_table(session, settings, band_hz)

@@ -43,6 +43,13 @@ def read_specimen(path: Path) -> Specimen:
     ------
     ExchangeError
         If the file cannot be read, or a number of the beam is missing or not positive.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from analysis.exchange import read_specimen
+    >>> read_specimen(Path("rig.toml")).beam.length_m
+    0.98
     """
     try:
         with path.open("rb") as stream:

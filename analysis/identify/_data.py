@@ -283,7 +283,15 @@ class Decimation:
 
     @classmethod
     def to_band(cls, rate_hz: float, highest_hz: float) -> Decimation:
-        """Choose the lowest rate that holds 0 to `highest_hz`, which is at most 0.4 `rate_hz`."""
+        """Choose the lowest rate that holds 0 to `highest_hz`, which is at most 0.4 `rate_hz`.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Rate of the record.
+        highest_hz : float
+            Highest frequency that is kept.
+        """
         factor = max(int(rate_hz / (_RATE_OVER_BAND * highest_hz)), 1)
         new_rate_hz = rate_hz / factor
         stop_hz = new_rate_hz / 2
@@ -323,9 +331,15 @@ class Decimation:
 def fast_length(at_least: int) -> int:
     """Least number not below `at_least` (1 or more) whose prime factors are at most 11.
 
-    Of real values a transform is a fifth faster with factors up to 5 (``real=True``), which no fit
+    A transform of real values is a fifth faster with factors up to 5 (``real=True``), which no fit
     shows in its time; but the grid of the Laplace variable follows the length (`Prediction`), and
     with it the last digits of every estimate.
+
+    Examples
+    --------
+    >>> from analysis.identify import fast_length
+    >>> fast_length(1013)
+    1024
     """
     from scipy.fft import next_fast_len
 

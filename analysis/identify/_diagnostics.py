@@ -294,8 +294,8 @@ def unexplained(
     if related.related:
         where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
         what = (
-            f"Part of the torque follows the motor, {where}, in a way that no uniform or nearly "
-            "uniform beam does: something else moves along."
+            f"Unmodelled linear dynamics {where}: part of the torque follows the motor as it does "
+            "with no uniform or nearly uniform beam."
         )
         remedy = (
             "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "

@@ -119,11 +119,14 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class Mode:
-    """One mode of the beam on a motor that stands still."""
+    """One mode of the beam with locked hub (clamped–free)."""
 
     number: int
+    """From 1 on."""
     frequency_hz: Quantity
+    """Frequency of the free decay."""
     damping_ratio: Quantity
+    """Share of the critical damping."""
     shown: bool
     """Whether the record shows it; else it is computed from the model."""
 

@@ -36,7 +36,9 @@ class Line:
     """An oscillation of one frequency, all through the record, that the motor did not cause."""
 
     frequency_hz: float
+    """Frequency of the sinusoid."""
     amplitude_nm: float
+    """Its amplitude in the torque."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,6 +122,12 @@ class Unknowns:
 
         Parameters
         ----------
+        structure : Structure
+            Says which damping parameters are free.
+        nominal : Plant
+            Beam and rig as the file states them.
+        free : tuple of str
+            Settings that are estimated.
         modes : int
             How many modes count; with 1 the beam is uniform.
         extras : collection of str

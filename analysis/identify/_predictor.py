@@ -354,6 +354,10 @@ class Prediction:
 
         Parameters
         ----------
+        plant : Plant
+            Beam and rig.
+        wrt : sequence of str
+            Names of the derivatives, k of them.
         factor : int
             Rate, in multiples of `rate_hz`.
         places : ndarray of int, shape (p,)

@@ -107,6 +107,8 @@ class Comparison:
 
     Attributes
     ----------
+    measurement : Measurement
+        Record at its full rate.
     angle_rad, torque_nm : ndarray, shape (m,)
         Both channels in the band at the decimated rate; unknown torque filled by what is expected.
     decimation : Decimation
@@ -156,6 +158,13 @@ class Comparison:
         """Bring a measurement into the band.
 
         The mean of the residual is never compared: it is the torque sensor's zero.
+
+        Parameters
+        ----------
+        measurement : Measurement
+            Record at its full rate.
+        band_hz : tuple of float
+            First and last frequency.
 
         Raises
         ------
@@ -396,7 +405,15 @@ class Comparison:
         return replace(self, torque_nm=torque_nm)
 
     def lost_gradient(self, plant: Plant, wrt: tuple[str, ...]) -> NDArray[np.complex128]:
-        """Compute what unknown torques would have given to the gradient's spectra, (k, K)."""
+        """Compute what unknown torques would have given to the gradient's spectra, (k, K).
+
+        Parameters
+        ----------
+        plant : Plant
+            Beam and rig.
+        wrt : tuple of str
+            Names of the derivatives, k of them.
+        """
         unknown = ~self.measurement.torque_known
         lost = np.zeros((len(wrt), self.frequency_hz.size), dtype=np.complex128)
         if unknown.any():
@@ -566,7 +583,15 @@ class Objective:
     def normal_equations(
         self, x: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NormalEquations:
-        """Sum of squares at `x`, with what a Gauss-Newton step needs."""
+        """Sum of squares at `x`, with what a Gauss-Newton step needs.
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Unknowns.
+        weight : ndarray, shape (K,)
+            Inverse standard deviation of the noise, bin by bin.
+        """
         return self.project(self.linearise(x), weight).normal_equations()
 
     def minimum(

@@ -126,7 +126,15 @@ class InputRelation:
 
 
 def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Share of the power up to each bin, shape (K,), of a whitened residual."""
+    """Share of the power up to each bin, shape (K,), of a whitened residual.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.identify import cumulative_periodogram
+    >>> print(cumulative_periodogram(np.array([1, 1j, -1, 1])))
+    [0.25 0.5  0.75 1.  ]
+    """
     power = np.cumsum(residual.real**2 + residual.imag**2)
     share: NDArray[np.float64] = power / power[-1]
     return share

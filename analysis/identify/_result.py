@@ -45,14 +45,18 @@ class DampingSize:
 
 @dataclass(frozen=True, slots=True)
 class ModeEstimate:
-    """One mode of the beam on a motor that stands still, from the fitted plant."""
+    """One mode of the beam with locked hub (clamped–free), from the fitted plant."""
 
     number: int
+    """From 1 on."""
     frequency_hz: float
     """Frequency of the free decay, 0 if over-damped."""
     frequency_std_hz: float
+    """Its standard deviation."""
     damping_ratio: float
+    """Above 1 if over-damped."""
     damping_ratio_std: float
+    """Its standard deviation."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,7 @@ def _about(candidate: Candidate) -> str:
     """Name one of several explanations, with its size."""
     kind = _beside(candidate)
     if kind == _MODES_FREE:
-        return "modes that each have a stiffness of their own"
+        return "a stiffness correction per mode"
     value = candidate.fit.parameters[kind]
     return {
         "root_compliance_rad_per_nm": f"an elastic clamp of {_reciprocal(value):.3g} N·m/rad",

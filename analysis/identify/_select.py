@@ -285,7 +285,7 @@ def of_headline(
     """
     free = told.fit.structure
     kind = told.name.partition(", ")[2]
-    beam = ", on a beam whose modes each have a stiffness of their own" if kind == _FREE else ""
+    beam = ", on a non-uniform beam (stiffness correction per mode)" if kind == _FREE else ""
     if kind and not beam:
         beam = f", beside {kind}"
     if len(told.visible_modes) < _SEVERAL:
@@ -303,9 +303,9 @@ def of_headline(
     said += [order(each) for each in orders]
     if told.explained:
         said.append(
-            "What it leaves is noise: nothing in the record asks for more."
+            "The residual is noise; no unmodelled effect found."
             if alone
-            else "What it leaves is noise, but something else explains the record as well."
+            else "The residual is noise, but another model explains the record as well."
         )
     return said
 
@@ -331,7 +331,7 @@ def order(verdict: OrderVerdict) -> str:
             "must not be taken for a property of the beam."
         )
     if verdict.status == "compatible":
-        return f"The order {name} of the {of} is {value}: 1 would do."
+        return f"The order {name} of the {of} is {value}, consistent with 1."
     if verdict.status == "fractional":
         return f"The order {name} of the {of} is {value}; 1 is excluded."
     return (

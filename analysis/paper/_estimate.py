@@ -43,6 +43,13 @@ def estimate(
 ) -> tuple[FrequencyResponse, FrequencyResponse]:
     """Estimate the response that is to be fitted, and the whole-record one to compare it with.
 
+    Parameters
+    ----------
+    record : Record
+        One session on its time grid.
+    settings : WelchSettings
+        Estimator, segments and band.
+
     Returns
     -------
     response, whole_record : FrequencyResponse

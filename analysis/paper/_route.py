@@ -54,7 +54,20 @@ def fit_indices(
     measured: NDArray[np.complex128],
     model: NDArray[np.complex128],
 ) -> Indices:
-    """Evaluate Eqs. (28) to (30) on complex deviations ``|G - Ĝ|``, all of shape (n,)."""
+    """Evaluate Eqs. (28) to (30) on complex deviations ``|G - Ĝ|``, all of shape (n,).
+
+    Parameters
+    ----------
+    omega_rad_s : ndarray, shape (n,)
+        Angular frequencies, positive.
+    measured, model : ndarray of complex, shape (n,)
+        Responses in N·m/rad.
+
+    References
+    ----------
+    Fractional-Order Models of Damping Phenomena in a Flexible Sensing Antenna Used for Haptic Robot
+    Navigation, Eqs. 28 to 30.
+    """
     deviation = np.abs(measured - model)
     square = deviation**2
     return Indices(
@@ -72,7 +85,9 @@ class Peak:
     """A resonant peak: the bin where the magnitude is largest, and the magnitude there."""
 
     frequency_hz: float
+    """Frequency of the bin."""
     magnitude_db: float
+    """In dB re 1 unit of the response."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +119,16 @@ def resonant_peaks(
     tuple of Peak or None, length m
         None where no bin between those limits is a local maximum: the mode is damped away, or
         lies outside the band. In dB re 1 unit of the response.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.paper import resonant_peaks
+    >>> frequency_hz = np.linspace(1, 4, 301)
+    >>> response = 1 / (2.5**2 - frequency_hz**2 + 0.05j * frequency_hz)
+    >>> (peak,) = resonant_peaks(frequency_hz, response, np.array([2.5]))
+    >>> print(f"{peak.frequency_hz:.2f} Hz, {peak.magnitude_db:.1f} dB")
+    2.50 Hz, 18.1 dB
     """
     magnitude = np.abs(response)
     ratio = np.sqrt(mode_hz[1:] / mode_hz[:-1])
@@ -128,6 +153,18 @@ def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
     """Deviations ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` in dB, Eqs. (31) and (32).
 
     The paper averages them over sessions; this is the term of one.
+
+    Parameters
+    ----------
+    measured, model : Peak
+        The same peak of either response.
+
+    Examples
+    --------
+    >>> from analysis.paper import Peak, peak_deviation
+    >>> found = peak_deviation(Peak(2.55, -10.0), Peak(2.56, -10.4))
+    >>> print(f"{found.frequency_rad_s:.4f} rad/s, {found.magnitude_db:.1f} dB")
+    0.0628 rad/s, 0.4 dB
     """
     return PeakDeviation(
         frequency_rad_s=2 * np.pi * abs(measured.frequency_hz - model.frequency_hz),
@@ -207,10 +244,30 @@ def loudest_moment_s(
     The envelope is the magnitude of the analytic signal in ``frequency_hz (1 ± bandwidth)``, so
     it works for a chirp as for any other excitation.
 
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        The signal.
+    rate_hz : float
+        Its sampling rate.
+    frequency_hz : float
+        Middle of the band.
+    bandwidth : float
+        Half the width of the band, as a share of its middle.
+
     Returns
     -------
     float
         Seconds from the first value.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.paper import loudest_moment_s
+    >>> t = np.arange(10_000) / 1000
+    >>> values = np.exp(-((t - 4) ** 2)) * np.sin(2 * np.pi * 5 * t)
+    >>> print(f"{loudest_moment_s(values, 1000, 5.0):.2f} s")
+    4.00 s
     """
     padded = 1 << (len(values) - 1).bit_length()
     frequencies_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)

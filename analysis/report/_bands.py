@@ -179,7 +179,7 @@ class LossFactors:
     ----------
     frequency_hz : ndarray, shape (n,)
     internal, external : LossFactor or None
-        Of the material and of the surroundings; None if the structure lacks it.
+        Loss by the material and by the surroundings; None if the structure lacks it.
     total : LossFactor
         Their sum: at a mode twice its damping ratio, but for squares of the loss factor.
     """

@@ -21,6 +21,13 @@ if TYPE_CHECKING:
 def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Any]:
     """Collect everything.
 
+    Parameters
+    ----------
+    campaign : Campaign
+        Results of all sessions.
+    with_paper : bool
+        Whether the paper's numbers stand beside these.
+
     Returns
     -------
     dict

@@ -102,7 +102,7 @@ def index_figure(campaign: CampaignResult) -> Figure:
 
 _COLUMNS: Final = 4
 _POOLED: Final = "#C3DCED"
-"""Of an interval: the pooled line's blue, but light and opaque."""
+"""Colour of an interval: the pooled line's blue, but light and opaque."""
 
 
 def pooled_figure(campaign: CampaignResult) -> Figure:
@@ -144,7 +144,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
                    label="session, ± 1.96 of its standard deviation"),
             Line2D([], [], color=style.BLUE, label="pooled"),
             Patch(facecolor=_POOLED, label="its 95 % interval"),
-            Patch(facecolor=style.SHADE, label="true value in one more session, 95 %"),
+            Patch(facecolor=style.SHADE, label="95 % prediction interval"),
         ],
         loc="upper left", ncols=4, borderaxespad=0.0,
         bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),

@@ -107,7 +107,7 @@ def _how(campaign: CampaignResult, made_at: datetime) -> list[Facts]:
             ],
         ),
         (
-            "The paper's route",
+            "Welch method (as in the paper)",
             [
                 ("estimator", settings.estimator),
                 ("band", f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz"),

@@ -207,8 +207,8 @@ def sessions_table(campaign: CampaignResult) -> Table:
         "Sessions, and what each says by itself",
         (
             Column("file", "file", WORDS), Column("selects", "selected", WORDS),
-            Column("what is left", "left", WORDS),
-            Column("found beside the beam", "findings", WORDS),
+            Column("residual", "left", WORDS),
+            Column("other effects", "findings", WORDS),
             Column("group" if groups else "", "group", WORDS),
         ),
         (

@@ -43,13 +43,13 @@ NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 
 
 def indices_of_record_fit(fit: RecordFit, welch: WelchAnalysis) -> tuple[IndexValues, IndexValues]:
-    """Compute the indices of a whole-record fit in the band of the paper's route.
+    """Compute the indices of a whole-record fit in the band of the Welch fits.
 
     Parameters
     ----------
     fit : RecordFit
     welch : WelchAnalysis
-        Of the same record.
+        Welch fits of the same record.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
     -------
     dict
         ``headline``: what the record says, with flags; ``fits`` and ``modes``: lists of objects as
-        the document has them of the paper's route,
+        the document has them of the Welch fits,
         with ``estimator`` "record"; ``records``: one object with verdict, noise, hum and, of the
         selected fit, response and loss factors with their 95 % bands. Numbers may be numpy's or
         not finite, as `finite` takes them. What is not reported is flagged, not
@@ -236,7 +236,7 @@ def document(
     -------
     dict
         ``versions``, ``headlines`` (what each whole record says, with flags), ``files`` (what was
-        read, and how the paper's route estimated it), ``fits``, ``modes``, ``peaks``, ``records``,
+        read, and how the Welch method estimated it), ``fits``, ``modes``, ``peaks``, ``records``,
         ``errors``: lists of objects that name their file.
         Finite numbers only.
     """
@@ -397,7 +397,7 @@ def _name(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of what computed the results."""
+    """Versions of what computed the results."""
     return {
         "rigd": rigd.__version__,
         "python": platform.python_version(),

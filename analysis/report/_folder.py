@@ -52,7 +52,15 @@ def report_folders(files: Sequence[Path], report: Path | None) -> list[Path]:
 
 
 def check_new_file(path: Path, what: str) -> None:
-    """Raise OutputExistsError if a path exists, naming what it was to be."""
+    """Raise OutputExistsError if a path exists, naming what it was to be.
+
+    Parameters
+    ----------
+    path : Path
+        The new file.
+    what : str
+        Option that asked for it.
+    """
     if os.path.lexists(path):
         raise OutputExistsError(
             f"{what} {path} exists; choose another name or move it away, nothing is overwritten."
@@ -94,6 +102,13 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 def write_new(path: Path, content: str | bytes) -> None:
     """Write a new file, text in UTF-8, with the folders it needs.
+
+    Parameters
+    ----------
+    path : Path
+        The new file.
+    content : str or bytes
+        What goes into it.
 
     Raises
     ------

@@ -26,7 +26,7 @@ class Picture:
     Attributes
     ----------
     name : str
-        Of its file, without the ending.
+        Name of its file, without the ending.
     description : str
         What is seen in it, for those who do not see it, and as its caption.
     png : bytes

@@ -83,7 +83,7 @@ def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure
     )
     figure = style.new_figure(
         11.0, 8.2, f"{name} — frequency response",
-        f"coupling torque over motor angle  ·  measured: ratio of the whole record's transforms, "
+        f"coupling torque over motor angle  ·  measured: empirical transfer function estimate, "
         f"delay removed  ·  model: type {fit.structure.name}",
     )  # fmt: skip
     count = max(len(shown), 1)
@@ -343,7 +343,7 @@ def _spectrum(axes: Axes, analysis: RecordAnalysis, fit: RecordFit) -> None:
     few = slice(None, None, max(frequency_hz.size // _SMOOTH_POINTS, 1))
     axes.plot(
         frequency_hz[few], 1e3 * np.sqrt(analysis.noise_nm2_per_hz[few]), color=style.BLUE,
-        label="taken for noise",
+        label="noise model",
     )  # fmt: skip
     for mode in fit.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)

@@ -40,12 +40,12 @@ def record_page(
         The figures; the table of the modes follows the first one.
     modes : Table
     tables : sequence of Table
-        Of the whole-record fits.
+        Tables of the whole-record fits.
     made_at : datetime
         When, with a time zone.
     paper_pictures : sequence of Picture, optional
     paper_tables : sequence of Table, optional
-        Of the paper's route; without tables its section is left out.
+        Figures and tables of the Welch fits; without tables their section is left out.
 
     Returns
     -------

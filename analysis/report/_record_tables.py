@@ -1,4 +1,4 @@
-"""Tables of a record: whole-record fits, structures, damping by amplitude; the paper's route."""
+"""Tables of a record: whole-record fits, structures, damping by amplitude; Welch fits."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 _STRONG_CORRELATION: Final = 0.9
 _MARKED: Final = (
-    f"{MARK} must not be taken for a property of the antenna; the remark says why. The number "
-    "belongs to the model's curve."
+    f"{MARK} not a property of the antenna, for the reason in the remark: do not interpret. The "
+    "number belongs to the model's curve."
 )
 
 
@@ -55,7 +55,7 @@ def modes_table(whole: WholeRecord) -> Table:
             rows.append((marked(count(mode.number)), *map(greyed, cells)))
     return Table.of(
         "modes",
-        f"Modes of the beam on a motor that stands still: type {told.name}",
+        f"Modes with locked hub (clamped–free): type {told.name}",
         (
             Column("Mode", "mode"),
             Column("Frequency (Hz)", "frequency_hz"),
@@ -140,7 +140,7 @@ def condition_table(whole: WholeRecord) -> Table | None:
         )
     return Table.of(
         "on_condition",
-        f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which would do",
+        f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which suffices",
         (
             Column("Parameter", "parameter", WORDS),
             Column("Unit shown", "unit_shown", WORDS),
@@ -342,7 +342,7 @@ _INDEX_UNITS: Final = "MSE and WMSE in (N·m/rad)², MD in N·m/rad."
 
 
 def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) -> Table:
-    """Parameters and indices of every fit of the paper's route.
+    """Parameters and indices of every Welch fit.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ class Table:
     Attributes
     ----------
     name : str
-        Of its CSV file, without the ending, and of the list of its rows in JSON.
+        Name of its CSV file, without the ending, and of the list of its rows in JSON.
     caption : str
     columns : tuple of Column
         Those that people see, in their order; the first one names the rows.
@@ -257,7 +257,7 @@ def unreported(structure: Structure, withheld: Collection[str]) -> frozenset[str
     Parameters
     ----------
     structure : Structure
-        Of the fit.
+        Structure of the fit.
     withheld : collection of str
         Orders that the data do not support, "alpha" or "lambda".
 

@@ -85,7 +85,7 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
 
 _FIGURES: Final = ("signals", "frf", "torque")
 _FIGURES_BESIDE_RECORD: Final = ("frf",)
-"""Of the paper's route, where the whole-record fit has signals and torque of its own."""
+"""Figures of the Welch fits where the whole-record fit has its own of signals and torque."""
 
 
 def write_report(
@@ -125,7 +125,15 @@ def write_report(
 
 
 def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
-    """Name the figures of the paper's route that a report has."""
+    """Name the figures of the Welch fits that a report has.
+
+    Parameters
+    ----------
+    paper : bool
+        Whether the Welch fits were run.
+    whole_record : bool
+        Whether the whole-record fits were run.
+    """
     if not paper:
         return ()
     return _FIGURES_BESIDE_RECORD if whole_record else _FIGURES

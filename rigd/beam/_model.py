@@ -33,9 +33,18 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """Uniform slender beam, clamped on the motor's shaft and free at its tip."""
+    """Uniform slender beam, clamped on the motor's shaft and free at its tip.
+
+    Examples
+    --------
+    >>> from rigd.beam import Beam
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> print(f"{beam.inertia_kg_m2:.3e} kg·m²")
+    1.475e-03 kg·m²
+    """
 
     length_m: Annotated[float, Gt(0)]
+    """From the motor's axis to the tip."""
     density_kg_per_m: Annotated[float, Gt(0)]
     """Mass per unit of length, rho."""
     bending_stiffness_n_m2: Annotated[float, Gt(0)]
@@ -67,9 +76,13 @@ class Damping:
     """
 
     zeta: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Internal coefficient, in s^alpha."""
     alpha: Annotated[float, Ge(0), Lt(2)] = 1.0
+    """Internal order."""
     gamma: Annotated[float, Ge(0)] = 0.0
+    """External coefficient, in s^lambda/m⁴."""
     lambda_: Annotated[float, Ge(0), Lt(2)] = 1.0
+    """External order."""
 
 
 # Transfer function
@@ -114,7 +127,13 @@ class TransferGrid:
         self._parts = [slice(i, i + _BLOCK) for i in range(0, points.size, _BLOCK)]
 
     def evaluate(self, beam: Beam, damping: Damping) -> Complex:
-        """Coupling torque per motor angle, G(s) in N·m/rad, of the grid's shape."""
+        """Coupling torque per motor angle, G(s) in N·m/rad, of the grid's shape.
+
+        Parameters
+        ----------
+        beam, damping
+            Parameters of the exact model.
+        """
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         for part in self._parts:
             c = 1 + damping.zeta * self._power(damping.alpha, part)
@@ -201,14 +220,73 @@ class TransferGrid:
 
 
 def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
-    """Coupling torque per motor angle, G(s) in N·m/rad (Eq. 25), of the shape of `s` (rad/s)."""
+    """Coupling torque per motor angle (Eq. 25 of the paper).
+
+    Parameters
+    ----------
+    s
+        Laplace variable in rad/s, of any shape.
+    beam, damping
+        Parameters of the exact model.
+
+    Returns
+    -------
+    g : complex ndarray, shape of `s`
+        G(s) in N·m/rad.
+
+    References
+    ----------
+    Fractional-Order Models of Damping Phenomena in a Flexible Sensing Antenna Used for Haptic Robot
+    Navigation, Eq. 25.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.beam import Beam, Damping, transfer
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> s = 2j * np.pi * np.array([1.0, 10.0])
+    >>> g = transfer(s, beam, Damping(zeta=1e-4))
+    >>> print(np.round(np.abs(g), 4))
+    [0.0684 0.1306]
+    """
     return TransferGrid(s).evaluate(beam, damping)
 
 
 def transfer_and_gradient(
     s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
 ) -> tuple[Complex, Complex]:
-    """G(s) and its derivatives: see `TransferGrid.evaluate_with_gradient`."""
+    """G(s) and its derivatives with respect to parameters.
+
+    Parameters
+    ----------
+    s
+        Laplace variable in rad/s, of any shape.
+    beam, damping
+        Parameters of the exact model.
+    wrt
+        Names from `PARAMETERS`: see `TransferGrid.evaluate_with_gradient`.
+
+    Returns
+    -------
+    g : complex ndarray, shape of `s`
+        In N·m/rad.
+    gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
+
+    Raises
+    ------
+    ValueError
+        If a name is not one of `PARAMETERS`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.beam import Beam, Damping, transfer_and_gradient
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> damping = Damping(zeta=7e-5, alpha=0.9)
+    >>> g, gradient = transfer_and_gradient(2j * np.pi * np.array([1.0, 2.0, 5.0]), beam, damping)
+    >>> g.shape, gradient.shape
+    ((3,), (4, 3))
+    """
     return TransferGrid(s).evaluate_with_gradient(beam, damping, wrt)
 
 

@@ -70,8 +70,11 @@ class Realisation:
     c: Real
     """(n,) in N·m."""
     direct_inertia_kg_m2: float
+    """D, not negative."""
     direct_viscosity_nm_s_per_rad: float
+    """V, not negative."""
     direct_stiffness_nm_per_rad: float
+    """K, not negative."""
     relative_error: float
     """Largest ``|realised - exact| / |exact|`` between 0.05 and 100 Hz."""
     poles_rad_s: Complex
@@ -131,6 +134,18 @@ def realise(
         If the error is larger, naming the error achieved; if the realisation would make a
         frictionless motor unstable; if the exact beam itself is not passive: negative
         coefficients, orders outside 0…2; or if the beam has more than 300 modes to realise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.beam import Beam, Damping, realise, transfer
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> damping = Damping(zeta=7e-5, alpha=0.9)
+    >>> realisation = realise(beam, damping)
+    >>> s = 2j * np.pi * np.geomspace(0.1, 50, 200)
+    >>> error = np.abs(realisation.transfer(s) / transfer(s, beam, damping) - 1)
+    >>> bool(error.max() < 1e-3)
+    True
     """
     _check_passive(damping)
     loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
@@ -322,12 +337,15 @@ class CoupledModel:
     acceleration: Real
     """(n,) row: angular acceleration in rad/s², to which τ adds `acceleration_per_torque`."""
     acceleration_per_torque: float
+    """In rad/(s² N·m)."""
     beam_torque: Real
     """(n,) row: Γ, what the beam takes, in N·m; τ adds `beam_torque_per_torque`."""
     beam_torque_per_torque: float
+    """Share of τ that reaches the beam at once."""
     sensor_torque: Real
     """(n,) row: what a sensor between motor and clamp measures, ``Γ + J_tool θ''``, in N·m."""
     sensor_torque_per_torque: float
+    """Share of τ that passes the sensor at once."""
     sensed_torque: Real | None = None
     """(n,) row: what the sensor's filter lets through, in N·m; None: it has none."""
 
@@ -336,6 +354,15 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
     """Let the sensor's torque through a low-pass filter, of order 1 or 2 (Butterworth).
 
     The filter's states come last.
+
+    Parameters
+    ----------
+    model
+        Motor and beam.
+    corner_hz
+        Corner frequency of the filter.
+    order
+        1, or 2 (Butterworth).
     """
     n, omega = model.b.size, 2 * math.pi * corner_hz
     a = np.zeros((n + order, n + order))
@@ -421,10 +448,26 @@ def couple(
 def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     """``x(t + duration) = phi x(t) + gamma τ``, exact for a τ held over the duration.
 
+    Parameters
+    ----------
+    model
+        Motor and beam.
+    duration_s
+        Time over which τ is held.
+
     Returns
     -------
     phi : (n, n)
     gamma : (n,)
+
+    Examples
+    --------
+    >>> from rigd.beam import couple, propagator
+    >>> motor = couple(None, motor_inertia_kg_m2=2e-3)
+    >>> phi, gamma = propagator(motor, 0.1)
+    >>> print(phi, gamma.round(6))
+    [[1.  0.1]
+     [0.  1. ]] [ 2.5 50. ]
     """
     n = model.b.size
     extended = np.zeros((n + 1, n + 1))

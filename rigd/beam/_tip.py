@@ -55,6 +55,16 @@ def tip_motion(beam: Beam, damping: Damping, angle_rad: Real, rate_hz: float) ->
         Motor angle from rest, shape (n,).
     rate_hz
         Samples a second.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.beam import Beam, Damping, tip_motion
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
+    >>> angle_rad = 0.02 * np.sin(2 * np.pi * np.arange(5000) / 1000)
+    >>> motion = tip_motion(beam, Damping(zeta=7e-5), angle_rad, rate_hz=1000)
+    >>> print(f"{1e3 * motion.deflection_m:.1f} mm, {motion.slope_rad:.4f} rad")
+    14.2 mm, 0.0201 rad
     """
     n = angle_rad.size
     padded = _quick_length(int(np.ceil(_PADDED * n)))

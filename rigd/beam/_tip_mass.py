@@ -51,6 +51,7 @@ class LoadedResponse:
     """
 
     response: Complex
+    """G in N·m/rad."""
     by_elastic: Complex
     """Derivative with respect to c."""
     by_inertial: Complex
@@ -126,7 +127,15 @@ class LoadedBeam:
         return elastic, self.beam.density_over_stiffness * s * s + external
 
     def slope(self, s: Complex, at: LoadedResponse) -> Complex:
-        """Differentiate `LoadedResponse.response` by s."""
+        """Differentiate `LoadedResponse.response` by s.
+
+        Parameters
+        ----------
+        s
+            As for `transfer`.
+        at
+            Value of `at` there.
+        """
         log_s, damping = np.log(s), self.damping
         internal = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
         external = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)

@@ -41,7 +41,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> Measureme
     cpu
         The core.
     priority
-        Of SCHED_FIFO; 0 for the ordinary policy.
+        Priority under SCHED_FIFO; 0 for the ordinary policy.
 
     Raises
     ------
@@ -78,8 +78,8 @@ def measured(output: str, rate_hz: float) -> Measurement:
     Parameters
     ----------
     output
-        Of ``cyclictest --histogram`` with one thread: lines of a delay in whole µs and how often
-        it came; what is beyond the histogram is counted as the largest delay of all.
+        Printed by ``cyclictest --histogram`` with one thread: lines of a delay in whole µs and
+        how often it came; what is beyond the histogram is counted as the largest delay of all.
     rate_hz
         Wake-ups a second.
 

@@ -84,10 +84,15 @@ class Figures:
     """Percentiles, in µs."""
 
     p50: float
+    """Median."""
     p90: float
+    """90th percentile."""
     p99: float
+    """99th percentile."""
     p999: float
+    """99.9th percentile."""
     largest: float
+    """Maximum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,16 +100,21 @@ class Measurement:
     """One loop, run for some seconds."""
 
     name: str
+    """What ran, and beside what."""
     rate_hz: float
+    """Rate of the loop."""
     lateness_us: npt.NDArray[np.float64]
     """(n,) of every tick that was run: wake-up after the deadline that was waited for."""
     work_us: npt.NDArray[np.float64]
     """(n,) from the wake-up to the end of its work; empty where none was done."""
     scheduled: int
+    """Ticks that were due."""
     missed: int
+    """Ticks that were skipped."""
     cpu_percent: float | None = None
     """Load of one core by the process of the loop."""
     page_faults: int | None = None
+    """Page faults of the loop's process; None: not counted."""
 
     @property
     def held(self) -> float:
@@ -125,7 +135,16 @@ class Measurement:
 
 
 def figures(values_us: npt.NDArray[np.float64]) -> Figures:
-    """Return the percentiles of at least one value."""
+    """Return the percentiles of at least one value.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.bench import figures
+    >>> found = figures(np.arange(101.0))
+    >>> found.p50, found.p99, found.largest
+    (50.0, 99.0, 100.0)
+    """
     return Figures(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
 
 

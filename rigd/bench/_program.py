@@ -31,10 +31,15 @@ class Results:
     """All measurements."""
 
     profile: str
+    """Name of the profile."""
     rate_hz: float
+    """Rate that was asked for."""
     seconds: float
+    """Length of each measurement."""
     spin_us: float
+    """Last part of each wait that was spent polling."""
     granted: dict[str, str]
+    """Real-time setting → what the system granted."""
     load_average: tuple[float, float, float]
     """Load average of this computer before the measurements."""
     rounds: list[tuple[Measurement, Measurement | None]] = field(default_factory=list)
@@ -170,7 +175,17 @@ class Bench:
     def session(
         self, name: str, *, rate_hz: float | None = None, live: bool = False
     ) -> Measurement:
-        """Measure a whole session, at the usual rate unless told otherwise."""
+        """Measure a whole session, at the usual rate unless told otherwise.
+
+        Parameters
+        ----------
+        name
+            What the results call it.
+        rate_hz
+            Rate of the loop, by default the bench's.
+        live
+            With the live view.
+        """
         rate_hz = rate_hz or self._rate_hz
         self._begin(name)
         profile = loops.rig_for(self._profile, rate_hz, self._spin_us)

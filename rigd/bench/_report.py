@@ -108,7 +108,8 @@ def _rows(results: Results) -> list[Measurement]:
 
 def _table(rows: list[Measurement]) -> Iterator[str]:
     yield (
-        f"{'':{_NAME}}{'lateness, µs':>40}   {'work, µs':>16}   {'missed':>7}  {'CPU':>5}  faults"
+        f"{'':{_NAME}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
+        f"{'CPU':>5}  faults"
     )
     yield (
         f"{'':{_NAME}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
@@ -149,7 +150,7 @@ def _peer_lines(results: Results) -> Iterator[str]:
         yield f"No cyclictest to compare with: {results.no_peer}."
         return
     yield (
-        f"Lateness of the loop alone over cyclictest's, same core and policy, median of "
+        f"Wake-up latency of the loop alone over cyclictest's, same core and policy, median of "
         f"{len(results.rounds)} rounds in turn: p50 {ratios[0]:.2f}, p99 {ratios[1]:.2f}."
     )
 

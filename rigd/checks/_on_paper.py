@@ -27,7 +27,7 @@ friction alone.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import degrees, inf, isinf, radians
+from math import degrees, inf, isinf, log10, radians
 from pathlib import Path
 
 from rigd.beam import RealisationError
@@ -65,7 +65,7 @@ def loop_rows(profile: Profile) -> Iterator[Row]:
     yield Row(
         "loop",
         "stability",
-        f"every mode decays, the slowest at {-loop.growth_per_s:.2g} /s",
+        f"closed loop stable, slowest pole {loop.growth_per_s:.2g} 1/s",
         "stable",
         Verdict.OK,
     )
@@ -77,17 +77,15 @@ def loop_rows(profile: Profile) -> Iterator[Row]:
 
 def _margin_rows(margins: Margins, least_gain: float, least_delay_s: float) -> Iterator[Row]:
     group = f"loop, {margins.cut}"
-    too_strong = (
-        "any" if margins.gain_up == inf else _at(f"{margins.gain_up:.2f}", margins.gain_up_hz)
-    )
+    too_strong = "any" if margins.gain_up == inf else _at(_db(margins.gain_up), margins.gain_up_hz)
     too_weak = (
-        "0" if margins.gain_down == 0.0 else _at(f"{margins.gain_down:.2f}", margins.gain_down_hz)
+        "any" if margins.gain_down == 0.0 else _at(_db(margins.gain_down), margins.gain_down_hz)
     )
     yield Row(
         group,
         "gain margin",
-        f"factor {too_weak} to {too_strong}",
-        f"{1 / least_gain:.2f} to {least_gain:.2f}",
+        f"{too_weak} / {too_strong}",
+        f"{_db(1 / least_gain)} / {_db(least_gain)}",
         grade(fail=False, warn=margins.gain_up < least_gain or margins.gain_down > 1 / least_gain),
     )
     yield Row(
@@ -108,11 +106,15 @@ def _margin_rows(margins: Margins, least_gain: float, least_delay_s: float) -> I
     )
     yield Row(
         group,
-        "distance from -1",
+        "modulus margin",
         _at(f"{margins.modulus:.2f}", margins.modulus_hz),
         "",
         Verdict.OK,
     )
+
+
+def _db(gain: float) -> str:
+    return f"{20 * log10(gain):+.1f} dB"
 
 
 def _at(value: str, frequency_hz: float) -> str:
@@ -348,7 +350,7 @@ def profile_rows(profile: Profile) -> Iterator[Row]:
     assumed = [key for key, source in profile.sources.items() if source == "assumed"]
     yield Row(
         "profile",
-        "numbers assumed",
+        "unverified profile values",
         f"{len(assumed)} of {len(profile.sources)}",
         "none",
         grade(fail=False, warn=bool(assumed)),

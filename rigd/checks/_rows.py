@@ -72,11 +72,15 @@ class Row:
     """One thing that was looked at; all texts are for the operator."""
 
     group: str
+    """Part of the rig it belongs to."""
     what: str
+    """Quantity."""
     found: str
+    """Its value."""
     wanted: str
     """Value it is compared with; empty if there is none."""
     verdict: Verdict
+    """Whether it will do."""
     detail: str = ""
     """Text that is too long for a table."""
 
@@ -131,7 +135,15 @@ OF_AN_EDS = {
 
 
 def print_table(rows: Sequence[Row], consequences: Mapping[str, str] = OF_A_RIG) -> None:
-    """Print the table, what is too long for it, and the verdict, to standard output."""
+    """Print the table, what is too long for it, and the verdict, to standard output.
+
+    Parameters
+    ----------
+    rows
+        Rows, those of a group together.
+    consequences
+        Verdict → what follows, said under the table.
+    """
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), expand=False)
     table.add_column("what", ratio=5, overflow="fold")
     table.add_column("found", ratio=9, overflow="fold")

@@ -32,7 +32,8 @@ def _tell(asked: bool) -> None:
 
 def before_a_command(
     version: Annotated[
-        bool, typer.Option("--version", callback=_tell, is_eager=True, help="Say which it is.")
+        bool,
+        typer.Option("--version", callback=_tell, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
     """Take the options that stand before a command; they have done their work by then."""

@@ -28,15 +28,15 @@ def check(
         typer.Option(
             "--eds",
             metavar="FILE",
-            help="Check only what the EDS or DCF file of a drive tells, and connect to nothing.",
+            help="Check only the EDS or DCF file of a drive; connect to nothing.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check everything that can be checked without a torque: profile, buses, devices, loop.
+    """Check profile, buses, devices and control loop, without torque.
 
-    Ends with 0 if a session can be run (warnings allowed), and with 1 if not. With --eds, say on
-    paper whether a drive can be used: by itself, or with --profile also under that profile.
+    Exits with 0 if a session can be run (warnings allowed), and with 1 if not. With --eds, only the
+    file of a drive is checked: by itself, or with --profile also against that profile.
 
     Example: rigd check --profile antenna_can
     """
@@ -83,12 +83,14 @@ def _report(rows: "list[Row]", *, as_json: bool, on_paper: bool) -> None:
 def reset(
     profile: Annotated[
         str | None,
-        typer.Option("--profile", help="Whose rig (default: that of the running daemon, or sim)."),
+        typer.Option(
+            "--profile", help="Profile of the rig (default: the running daemon's, or sim)."
+        ),
     ] = None,
 ) -> None:
-    """Reset a fault, after its cause is removed. No torque; the drive stays off.
+    """Reset a fault after its cause is removed. No torque; the drive stays off.
 
-    Where a daemon has the rig, it is asked to; otherwise the fault of the drive is reset.
+    A daemon that owns the rig does it; without one, the fault of the drive is reset directly.
 
     Example: rigd reset --profile antenna_can
     """
@@ -121,25 +123,26 @@ def _end_as_by_ctrl_c() -> None:
 def bench(
     profile: ProfileName = "sim",
     rate: Annotated[
-        float, typer.Option("--rate", min=100.0, max=16_000.0, help="Of the loop, Hz.")
+        float, typer.Option("--rate", min=100.0, max=16_000.0, help="Rate of the loop (Hz).")
     ] = 1000.0,
     seconds: Annotated[
-        float, typer.Option("--seconds", min=1.0, max=3600.0, help="Of each measurement, s.")
+        float,
+        typer.Option("--seconds", min=1.0, max=3600.0, help="Duration of each measurement (s)."),
     ] = 10.0,
     spin_us: Annotated[
         float,
         typer.Option(
-            "--spin-us", min=0.0, max=200.0, help="Last part of each wait spent polling, µs."
+            "--spin-us", min=0.0, max=200.0, help="Last part of each wait spent polling (µs)."
         ),
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
-    """Measure how late the loop wakes up on this computer, and which rate it can hold.
+    """Measure the wake-up latency of the loop on this computer, and the highest rate it can hold.
 
-    The loop of a session, with everything simulated: no hardware is touched. Alone and beside
-    cyclictest in turn (package rt-tests, if installed); then with the recorder, the live view and
-    a busy program on the other cores; then at higher rates. Of the profile only the real-time
-    settings count. Some three minutes; leave the computer alone meanwhile.
+    Runs the loop of a session with everything simulated; no hardware is touched. It runs in turn
+    with cyclictest (package rt-tests, if installed), then with the recorder, the live view and a
+    busy program on the other cores, then at higher rates. Only the real-time settings of the
+    profile are used. Takes about three minutes; do not use the computer meanwhile.
 
     Example: rigd bench --seconds 10
     """

@@ -40,9 +40,7 @@ def serve(
     output: Output = SESSIONS,
     group: Annotated[
         str | None,
-        typer.Option(
-            "--group", help="Let the members of this group command it too, over /run/rigd."
-        ),
+        typer.Option("--group", help="Let members of this group control it too, over /run/rigd."),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
@@ -50,7 +48,7 @@ def serve(
     fast: Fast = False,
     hardware: Hardware = False,
 ) -> None:
-    """Own a rig and run sessions for rigd start, until Ctrl-C or SIGTERM ends it safely.
+    """Run the rig daemon, which runs sessions for rigd start; Ctrl-C or SIGTERM ends it safely.
 
     Example: rigd serve --profile antenna_can --output /data/sessions
     """
@@ -66,7 +64,7 @@ def serve(
 
 DaemonOf = Annotated[
     str | None,
-    typer.Option("--profile", help="Whose daemon (default: the only one that is running)."),
+    typer.Option("--profile", help="Profile of the rig (default: the only running daemon)."),
 ]
 
 
@@ -101,10 +99,10 @@ def rig_name(profile: str | None) -> str | None:
 
 def status(
     profile: DaemonOf = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it, until Ctrl-C.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Update it until Ctrl-C.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show how the daemon, its rig and a running session are.
+    """Show the status of daemon, rig and session.
 
     Example: rigd status --watch
     """
@@ -177,7 +175,7 @@ def _file_of_last(status: dict[str, Any]) -> str:
 
 
 def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Average the sensor at rest, and make that its zero. No torque.
+    """Tare the sensor: take its mean at rest as zero. No torque.
 
     Example: rigd tare
     """
@@ -193,7 +191,7 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Make the angle where the motor stands the zero, to which the limits are relative. No torque.
+    """Set the zero of the angle, from which limits count, where the motor stands. No torque.
 
     Example: rigd zero
     """
@@ -202,9 +200,7 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(json.dumps(_measured(told)))
     else:
-        typer.echo(
-            f"The zero is where the motor stands now; before, that was {told['moved_rad']:.5f} rad."
-        )
+        typer.echo(f"Zero set (shift {told['moved_rad']:.5f} rad).")
 
 
 def reset_by_daemon(profile: str | None) -> bool:

@@ -13,7 +13,7 @@ def info(
     path: Annotated[Path, typer.Argument(metavar="FILE", readable=False, help="A session file.")],
     as_json: AsJson = False,
 ) -> None:
-    """Say what is in a session file.
+    """Show the contents of a session file.
 
     Example: rigd info sessions/20261120-101500-chirp.mcap
     """
@@ -32,7 +32,7 @@ def recover(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Save what is intact of torn or damaged session files.
+    """Recover the intact part of torn or damaged session files.
 
     Writes X.mcap beside X.mcap.part, and X.recovered.mcap beside a damaged X.mcap: every sample up
     to the damage, marked as recovered. Nothing is overwritten or removed.

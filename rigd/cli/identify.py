@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 identify_app = typer.Typer(
     cls=CrewGroup,
-    help="Measure data of the rig that its profile has to state.",
+    help="Measure parameters of the rig for its profile.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -40,7 +40,7 @@ identify_app = typer.Typer(
 
 @identify_app.callback()
 def identify() -> None:
-    """Measure data of the rig that its profile has to state.
+    """Measure parameters of the rig for its profile.
 
     Example: rigd identify motor --profile sim --fast
     """
@@ -52,11 +52,11 @@ def motor(
     output: Output = SESSIONS,
     torque_percent: Annotated[
         float,
-        typer.Option("--torque-percent", help="Largest predicted torque, % of the rated torque."),
+        typer.Option("--torque-percent", help="Largest predicted torque (% of the rated torque)."),
     ] = 40.0,
     stroke_rad: Annotated[
         float,
-        typer.Option("--stroke-rad", help="Largest angle to either side of the start, rad."),
+        typer.Option("--stroke-rad", help="Largest angle to either side of the start (rad)."),
     ] = 0.8,
     from_files: Annotated[
         list[Path] | None,
@@ -64,7 +64,7 @@ def motor(
             "--from",
             metavar="FILE",
             readable=False,
-            help="Estimate from a file recorded before, and move nothing; once for each file.",
+            help="Estimate from a recorded file and move nothing; repeat for each file.",
         ),
     ] = None,
     seed: Seed = None,
@@ -72,7 +72,7 @@ def motor(
     hardware: Hardware = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure inertia, friction, torque constant and delay of the motor, with deviations.
+    """Measure inertia, friction, torque constant and delay of the motor, with uncertainties.
 
     Three sessions of 25, 60 and 75 s: the shaft goes to and fro at constant speed, with a small
     multisine on it, with a larger one, then at four speeds. The first only serves to design the

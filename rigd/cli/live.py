@@ -67,19 +67,19 @@ def ended_gently() -> Iterator[None]:
 def live(
     profile: Annotated[
         str | None,
-        typer.Option("--profile", help="Whose live view (default: the only one that is running)."),
+        typer.Option("--profile", help="Profile of the rig (default: the only running live view)."),
     ] = None,
     web: Annotated[
         bool, typer.Option("--web", help="Print the address for a browser; open no window.")
     ] = False,
     wait: Annotated[
-        bool, typer.Option("--wait", help="If there is no live view yet, wait until there is.")
+        bool, typer.Option("--wait", help="Wait for a live view if none is running.")
     ] = False,
 ) -> None:
-    """Open the live view of a rig in a window. It stays, and shows one session after the other.
+    """Open the live view of a rig in a window; it stays open from session to session.
 
-    Shown are the sessions of rigd run … --live, and those of a daemon that was started with
-    rigd serve … --live. docs/live_view.md tells how to look at them from another computer.
+    Shows the sessions of rigd run … --live, and of a daemon that was started with
+    rigd serve … --live. docs/live_view.md describes the view from another computer.
 
     Example: rigd live --profile antenna_can
     """
@@ -227,7 +227,7 @@ def replay(
 ) -> None:
     """Show a recorded session in the layout of the live view, played from its start.
 
-    docs/opening_sessions.md tells what else opens session files.
+    docs/opening_sessions.md lists other programs that open session files.
 
     Example: rigd replay sessions/20261120-101500-chirp.mcap
     """

@@ -90,7 +90,7 @@ SESSIONS = Path("sessions")
 """Where session files go unless told otherwise."""
 Seed = Annotated[
     int | None,
-    typer.Option("--seed", min=0, help="Of a simulated rig's noise (default: the profile's)."),
+    typer.Option("--seed", min=0, help="Seed of a simulated rig's noise (default: the profile's)."),
 ]
 Fast = Annotated[
     bool, typer.Option("--fast", help="Do not wait for real time (simulated rigs only).")
@@ -99,15 +99,13 @@ AsJson = Annotated[bool, typer.Option("--json", help="Write one JSON document to
 
 Hardware = Annotated[
     bool,
-    typer.Option(
-        "--hardware", help="Move the hardware, even if somebody simulates it out of reach."
-    ),
+    typer.Option("--hardware", help="Move the hardware, even if another user simulates the rig."),
 ]
 
 Repeat = Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions.")]
-Operator = Annotated[str, typer.Option("--operator", help="Goes into the file.")]
-Specimen = Annotated[str, typer.Option("--specimen", help="Goes into the file.")]
-Note = Annotated[str, typer.Option("--note", help="Goes into the file.")]
+Operator = Annotated[str, typer.Option("--operator", help="Operator name, stored in the file.")]
+Specimen = Annotated[str, typer.Option("--specimen", help="Specimen, stored in the file.")]
+Note = Annotated[str, typer.Option("--note", help="Note, stored in the file.")]
 Force = Annotated[
     bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
 ]

@@ -61,7 +61,7 @@ def list_profiles() -> None:
 
 @profiles_app.command()
 def show(name: NameOrFile) -> None:
-    """Write a profile to standard output, as it stands in its file.
+    """Print a profile as it stands in its file.
 
     Example: rigd profiles show sim
     """
@@ -122,7 +122,7 @@ def new(
         typer.Option("--from", help="Profile to start from, with a CiA 402 drive."),
     ] = "antenna_can",
 ) -> None:
-    """Write a profile for a drive: what its EDS file tells, and what the terminal is asked for.
+    """Write a profile for a drive, from its EDS file and from answers on the terminal.
 
     Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
     motor are asked for; Enter keeps the value shown, which stays "assumed". What the drive lacks is

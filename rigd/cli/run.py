@@ -47,19 +47,19 @@ run_app = typer.Typer(
 )
 start_app = typer.Typer(
     name="start",
-    help="Have the daemon run one or more sessions; Ctrl-C stops them safely.\n\n"
+    help="Run one or more sessions on the daemon; Ctrl-C stops them safely.\n\n"
     "Example: rigd start chirp --repeat 20",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
-Amplitude = Annotated[float, typer.Option("--amplitude", help="Amplitude, rad.")]
-StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the band starts, Hz.")]
-StopHz = Annotated[float, typer.Option("--stop-hz", help="Frequency where the band ends, Hz.")]
-Duration = Annotated[float, typer.Option("--duration", help="Duration of the excitation, s.")]
-Rest = Annotated[float, typer.Option("--rest", help="Rest before it, s.")]
-RingDown = Annotated[float, typer.Option("--ring-down", help="Holding after it, s.")]
-Taper = Annotated[float, typer.Option("--taper", help="Fade in and out over this time, s.")]
+Amplitude = Annotated[float, typer.Option("--amplitude", help="Amplitude (rad).")]
+StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the band starts (Hz).")]
+StopHz = Annotated[float, typer.Option("--stop-hz", help="Frequency where the band ends (Hz).")]
+Duration = Annotated[float, typer.Option("--duration", help="Duration of the excitation (s).")]
+Rest = Annotated[float, typer.Option("--rest", help="Rest before the excitation (s).")]
+RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after it (s).")]
+Taper = Annotated[float, typer.Option("--taper", help="Fade-in and fade-out time (s).")]
 
 
 Parameters = Callable[..., "dict[str, Value]"]
@@ -176,7 +176,7 @@ def chirp(
 def hold(
     duration: Duration = 10.0, rest: Rest = 1.0, ring_down: RingDown = 0.0
 ) -> "dict[str, Value]":
-    """Hold the motor where it stands, for noise and drift.
+    """Hold the motor at its start angle, to measure noise and drift.
 
     Example: rigd run hold --duration 30
     """
@@ -190,7 +190,7 @@ def step(
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
 ) -> "dict[str, Value]":
-    """Step by an amplitude.
+    """Step the reference by an amplitude.
 
     Example: rigd run step --amplitude 0.01
     """
@@ -207,13 +207,13 @@ def multisine(
     amplitude: Amplitude = 0.025,
     start_hz: StartHz = 0.05,
     stop_hz: StopHz = 50.0,
-    period: Annotated[float, typer.Option("--period", help="Period of the signal, s.")] = 20.0,
+    period: Annotated[float, typer.Option("--period", help="Period of the signal (s).")] = 20.0,
     duration: Duration = 120.0,
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
     taper: Taper = 0.0,
     phase_seed: Annotated[
-        int, typer.Option("--phase-seed", min=0, help="Of the random phases.")
+        int, typer.Option("--phase-seed", min=0, help="Seed of the random phases.")
     ] = 0,
 ) -> "dict[str, Value]":
     """Excite with equal sines of random phase; the amplitude is the peak of their sum.
@@ -259,22 +259,24 @@ def modes(
     ],
     amplitude: Annotated[
         float,
-        typer.Option("--amplitude", help="Amplitude in each band, lower where limits ask, rad."),
+        typer.Option(
+            "--amplitude", help="Amplitude in each band, lower where limits require (rad)."
+        ),
     ] = 0.025,
     stop_hz: Annotated[
-        float, typer.Option("--stop-hz", help="Modes above are left out, Hz.")
+        float, typer.Option("--stop-hz", help="Highest mode that is excited (Hz).")
     ] = 50.0,
     widths: Annotated[
-        float, typer.Option("--widths", help="Half-power widths to either side of a mode.")
+        float, typer.Option("--widths", help="Half of a band, in half-power widths of its mode.")
     ] = 1.0,
     duration: Duration = 120.0,
     rest: Rest = 1.0,
     ring_down: RingDown = 15.0,
     taper: Annotated[
-        float, typer.Option("--taper", help="Fade in and out of every sweep over this time, s.")
+        float, typer.Option("--taper", help="Fade-in and fade-out time of each sweep (s).")
     ] = 1.0,
 ) -> "dict[str, Value]":
-    """Sweep narrow bands round the modes that an analysis found, for smaller deviations.
+    """Sweep narrow bands around the modes of an analysis, for smaller uncertainties.
 
     Example: rigd run modes fits.json --repeat 5
     """

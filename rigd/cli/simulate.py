@@ -13,7 +13,7 @@ def simulate(
     lock_step: Annotated[
         bool,
         typer.Option(
-            "--lock-step", help="Move on by one period a SYNC, as fast as they come (run --fast)."
+            "--lock-step", help="Advance one period per SYNC, as fast as they come (run --fast)."
         ),
     ] = False,
     log: Annotated[
@@ -32,11 +32,11 @@ def simulate(
             "--eds", metavar="FILE", help="Simulate the drive that this EDS or DCF file describes."
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing on the terminal.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing on the terminal.")] = False,
 ) -> None:
-    """Put a simulated rig on the wire in place of a profile's devices; Ctrl-C ends it.
+    """Simulate the devices of a profile on the wire; Ctrl-C ends it.
 
-    Sessions of the same profile find it by themselves. Its drive and its sensor speak the protocols
+    Sessions of the same profile find it automatically. Its drive and its sensor use the protocols
     of the real ones, on a socket or a virtual CAN bus and on a pseudo-terminal. With --eds the
     drive has the objects of the manufacturer's file and no others.
 
@@ -61,18 +61,18 @@ def inject(
         list[str] | None, typer.Argument(metavar="[SPEC]...", help="Faults, as above.")
     ] = None,
 ) -> None:
-    """Inject faults into a running simulated rig; without any, say how it stands.
+    """Inject faults into a running simulated rig; without any, show its status.
 
-    A fault happens at once, or with @SECONDS so long after the drive was first enabled. It lasts
-    as long as for= says, else until `end`. Times are of the simulated rig.
+    A fault happens at once, or with @SECONDS that long after the drive was first enabled. It lasts
+    for the time of for=, else until `end`. Times are those of the simulated rig.
 
     \b
     drop,from=drive|sensor|host[,id=0x181][,frames=3]  the next frames are lost
-    drop,from=sensor,bytes=5                  so many bytes on a sensor's serial line
-    delay,from=...,ms=2[,id=...][,frames=3]   they come later
-    corrupt,from=...[,byte=0][,id=...][,frames=3]  one byte of each is inverted
-    reorder,from=...[,id=...][,frames=3]      each comes after the next one
-    freeze,device=drive|sensor[,for=0.5]      it neither hears nor says anything
+    drop,from=sensor,bytes=5                  that many bytes on a sensor's serial line
+    delay,from=...,ms=2[,id=...][,frames=3]   frames are delayed
+    corrupt,from=...[,byte=0][,id=...][,frames=3]  one byte of each frame is inverted
+    reorder,from=...[,id=...][,frames=3]      frames are swapped
+    freeze,device=drive|sensor[,for=0.5]      the device stops communicating
     emcy,code=0x8130[,register=1]             the drive reports an emergency
     sto[,for=0.5]                             the drive's wired stop is dropped
     busoff[,for=0.5]                          the host's CAN controller is off the bus
@@ -80,13 +80,13 @@ def inject(
     status,bits=0x0080[,for=0.5]              the sensor reports errors
     jump,counts=-500                          the encoder slips
     cut[,device=bus|sensor]                   the bus, or a sensor's serial line, is cut
-    restart,device=drive|sensor               it starts anew by itself
-    power_cycle,device=drive|sensor           it is switched off and on
+    restart,device=drive|sensor               the device restarts by itself
+    power_cycle,device=drive|sensor           the device is switched off and on
     lag,ms=3.2[,for=0.5]                      the drive's actual torque (6077) is late
-    no_bit_12[,for=0.5]                       its statusword does not say that it follows
-    no_pre_operational[,for=0.5]              it does not take NMT pre-operational
-    no_watch[,for=0.5]                        it does not notice a silent host
-    end[,fault=sto]                           faults of one kind, or all, are over
+    no_bit_12[,for=0.5]                       the statusword never shows that the drive follows
+    no_pre_operational[,for=0.5]              the drive ignores NMT pre-operational
+    no_watch[,for=0.5]                        the drive does not notice a silent host
+    end[,fault=sto]                           end faults of one kind, or all
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
     """  # noqa: D301 - the mark that keeps lines apart is no raw text

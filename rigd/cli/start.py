@@ -84,7 +84,7 @@ def start_sessions(
     note: Note = "",
     force: Force = False,
     detach: Annotated[
-        bool, typer.Option("--detach", help="Do not wait for the end; rigd status shows it.")
+        bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -162,8 +162,8 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         slow = signals["rate_hz"] < 0.999 * expected_hz
         yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if slow else ""
         late = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
-        yield "late, 50 and 99 %", late, ""
-        yield "work of a tick, 99 %", f"{signals['work_p99_us']:.0f} µs", ""
+        yield "wake-up latency p50, p99", late, ""
+        yield "execution time p99", f"{signals['work_p99_us']:.0f} µs", ""
     lost = f"{health['missed']}, {health['late']}, {health['lost']}"
     bad = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
     yield "missed, late, lost", lost, bad
@@ -175,15 +175,15 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield "bus errors", str(errors), "yellow" if errors else ""
     if health["sensor_status"] is not None:
         status = health["sensor_status"]
-        yield "sensor", f"status {status:#06x}" if status else "well", "red" if status else ""
+        yield "sensor", f"status {status:#06x}" if status else "OK", "red" if status else ""
     if health["disk_free_mb"] is not None:
         yield "free on the disk", f"{1e-3 * health['disk_free_mb']:.1f} GB", ""
     if health["view_dropped"]:
-        yield "not shown live", f"{health['view_dropped']} samples", "yellow"
+        yield "dropped by the viewer", f"{health['view_dropped']} samples", "yellow"
 
 
 def _processes(processes: list[dict[str, Any]]) -> Table:
-    table = _table("process", "pid", "state", "s ago")
+    table = _table("process", "pid", "state", "heartbeat, s ago")
     for process in processes:
         bad = process["state"] in ("hung", "ended")
         table.add_row(
@@ -196,7 +196,7 @@ def _processes(processes: list[dict[str, Any]]) -> Table:
 
 
 def _topics(topics: list[dict[str, Any]], *, recording: bool) -> Table:
-    table = _table("topic", "records", "Hz", "of Hz", "waiting")
+    table = _table("topic", "records", "Hz", "of Hz", "backlog")
     for topic in topics:
         table.add_row(
             topic["name"],

@@ -66,12 +66,17 @@ class LoopModel:
     """Parameters of the closed loop."""
 
     rate_hz: float
+    """Ticks a second."""
     beam: Beam | None
     """None: the motor alone."""
     damping: Damping
+    """Damping of the beam."""
     motor_inertia_kg_m2: float
+    """At the output shaft."""
     viscous_nm_s_per_rad: float
+    """Viscous friction of the motor, at the output shaft."""
     tool_inertia_kg_m2: float
+    """Inertia between torque sensor and beam."""
     actuation_delay_s: float
     """From a tick to the moment its command takes effect; any fraction of a period."""
     angle_delay_s: float
@@ -79,6 +84,7 @@ class LoopModel:
     torque_delay_s: float
     """Age of the coupling torque at the tick that uses it."""
     settings: ControlSettings
+    """Settings of the controller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +92,9 @@ class LoopResponse:
     """Response of the loop, tick by tick; each of shape (n,)."""
 
     angle_rad: Real
+    """At the output shaft."""
     velocity_rad_s: Real
+    """At the output shaft."""
     torque_nm: Real
     """The command, friction compensation included, not limited."""
     coupling_torque_nm: Real
@@ -242,6 +250,14 @@ def close_loop(model: LoopModel) -> ClosedLoop:
         If the controller cannot be designed, or a delay is out of proportion.
     RealisationError
         If the beam's damping cannot be realised.
+
+    Examples
+    --------
+    >>> from rigd.control import close_loop
+    >>> from rigd.profile import load_profile
+    >>> loop = close_loop(load_profile("sim").loop_model())
+    >>> loop.spectral_radius < 1
+    True
     """
     settings = model.settings
     gains = design_pid(model.motor_inertia_kg_m2, model.viscous_nm_s_per_rad, settings.pole_rad_s)

@@ -150,6 +150,13 @@ class Client:
         A daemon that has turned this client away, because there were too many, is asked again: it
         has not obeyed then.
 
+        Parameters
+        ----------
+        command
+            A request of docs/control_socket.md.
+        **fields
+            Its further fields.
+
         Raises
         ------
         RefusedByDaemonError
@@ -188,6 +195,13 @@ class Client:
 
     def send(self, command: str, **fields: object) -> None:
         """Send a request whose reply nobody waits for.
+
+        Parameters
+        ----------
+        command
+            A request of docs/control_socket.md.
+        **fields
+            Its further fields.
 
         Raises
         ------
@@ -313,6 +327,13 @@ def stop_session(path: Path) -> Document:
 
 def await_end(path: Path, patience_s: float) -> Document | None:
     """Wait until a daemon says that no session runs.
+
+    Parameters
+    ----------
+    path
+        Socket of the daemon.
+    patience_s
+        Longest wait.
 
     Returns
     -------

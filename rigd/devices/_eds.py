@@ -58,8 +58,11 @@ class EdsEntry:
     """One object, or one sub-index of one, as the file describes it."""
 
     index: int
+    """Index of the object."""
     sub: int
+    """Sub-index; 0 for a plain variable."""
     name: str
+    """As the file has it."""
     data_type: int
     """Data type by CiA 301: 0x0006 is UNSIGNED16; 0: not stated."""
     access: str
@@ -69,7 +72,9 @@ class EdsEntry:
     default: int | None
     """Value after power-up, or the one that a DCF sets; None: not told, or no whole number."""
     low: int | None
+    """Least value; None: not stated."""
     high: int | None
+    """Largest value; None: not stated."""
     content: bytes = b""
     """The default where it is a text, a block or a fraction, as the drive holds it; empty: not
     told."""
@@ -90,12 +95,15 @@ class Eds:
     """Content of a drive's EDS or DCF file."""
 
     path: Path
+    """The file."""
     node_id: int
     """Node number for which the file was read."""
     vendor_name: str
+    """As the file has it."""
     vendor_id: int
     """Value of object 1018:1; 0: not stated."""
     product_name: str
+    """As the file has it."""
     product_code: int
     """Value of object 1018:2; 0: not stated."""
     revision: int
@@ -108,7 +116,13 @@ class Eds:
     """By index and sub-index; a plain variable has the sub-index 0."""
 
     def get(self, index: int, sub: int = 0) -> EdsEntry | None:
-        """Return an object, or None where the file has none."""
+        """Return an object, or None where the file has none.
+
+        Parameters
+        ----------
+        index, sub
+            Index and sub-index of the object.
+        """
         return self.entries.get((index, sub))
 
     def has(self, index: int) -> bool:

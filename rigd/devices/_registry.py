@@ -74,7 +74,15 @@ def reality(rig: RigParameters) -> Reality:
 
 
 def what_moves(rig: RigParameters, moving: Reality) -> str:
-    """Say what will move, the hardware or its simulation."""
+    """Say what will move, the hardware or its simulation.
+
+    Parameters
+    ----------
+    rig
+        Parameters of the rig.
+    moving
+        What `reality` found.
+    """
     if moving is not Reality.HARDWARE:
         how = "in this process" if moving is Reality.SIMULATED else moving.value
         return f"No hardware: {rig.name} is simulated ({how})."

@@ -28,6 +28,7 @@ class SimulatorAddress:
     """Address of a simulated rig."""
 
     pid: int
+    """Its process."""
     control_socket: str
     """Unix socket that takes faults to inject; as long as it answers, the simulator runs."""
     can_socket: str = ""
@@ -56,7 +57,15 @@ def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
 
 
 def announce(rig_name: str, address: SimulatorAddress) -> Path:
-    """Write down where the simulator of a rig is, until `forget`; return the file."""
+    """Write down where the simulator of a rig is, until `forget`; return the file.
+
+    Parameters
+    ----------
+    rig_name
+        Name of the profile that it stands in for.
+    address
+        Where it is.
+    """
     path = _address_file(rig_name)
     write_address(path, asdict(address))
     return path

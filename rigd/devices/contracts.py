@@ -175,6 +175,8 @@ class Devices:
     """The devices of one rig."""
 
     drive: Drive
+    """Drive of the motor."""
     sensor: WrenchSensor
+    """Force-torque sensor under the clamp."""
     simulated: bool
     """No motor moves: the rig may run under the virtual clock."""

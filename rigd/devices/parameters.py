@@ -23,11 +23,15 @@ class Motor:
     """Motor and gear as seen from the output shaft."""
 
     inertia_kg_m2: Positive
+    """Inertia of rotor and gear."""
     viscous_nm_s_per_rad: NonNegative
+    """Viscous friction."""
     coulomb_nm: NonNegative
+    """Coulomb friction."""
     rated_torque_nm: Positive
     """Torque of 1000 thousandths in the drive (its object 6076)."""
     peak_torque_nm: Positive
+    """Largest torque that is ever commanded."""
     continuous_torque_nm: Positive = math.inf
     """Continuous (rms) torque rating; infinite: none is known."""
     thermal_time_constant_s: Positive = 10.0
@@ -49,7 +53,9 @@ class WrenchSensor:
     """Force-torque sensor; every sequence of six is fx, fy, fz (N), tx, ty, tz (N·m)."""
 
     resolution: tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, NonNegative]
+    """Smallest step of each axis."""
     range: tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+    """Magnitude at the end of each axis' range."""
     projection: tuple[float, float, float, float, float, float]
     """Torque about the motor axis = projection · wrench: axis, sign and lever arm in one."""
     tool_inertia_kg_m2: NonNegative = 0.0
@@ -78,9 +84,11 @@ class Simulation:
     torque_noise_nm: NonNegative
     """Standard deviation of white noise on each torque axis, each sample."""
     force_noise_n: NonNegative
+    """Standard deviation of white noise on each force axis, each sample."""
     offset: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """What the sensor shows without a load, N and N·m: what the tare has to take away."""
     seed: Annotated[int, Ge(0)] = 0
+    """Seed of the noise."""
     clamp_compliance_rad_per_nm: NonNegative = field(default=0.0, metadata=OPTIONAL)
     """By how much the clamp turns, between sensor and beam, for a torque; 0: it is rigid."""
     tip_mass_kg: NonNegative = field(default=0.0, metadata=OPTIONAL)
@@ -103,7 +111,9 @@ class Selection:
     """Which driver serves each device: names in :mod:`rigd.devices._registry`."""
 
     drive: Annotated[str, MinLen(1)]
+    """Name of the drive's driver."""
     sensor: Annotated[str, MinLen(1)]
+    """Name of the sensor's driver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +123,9 @@ class CanBus:
     interface: Annotated[str, MinLen(1)]
     """"socketcan", or another interface of python-can."""
     channel: Annotated[str, MinLen(1)]
+    """Name of the bus, such as ``can0``."""
     bitrate_bit_s: Annotated[int, Ge(10_000), Le(1_000_000)]
+    """Bit rate of the bus."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +143,7 @@ class ServoDrive:
     """A CiA 402 drive on CANopen, in cyclic synchronous torque mode."""
 
     node_id: Annotated[int, Ge(1), Le(127)]
+    """Node number of the drive."""
     vendor_id: Annotated[int, Ge(0), Le(0xFFFFFFFF)]
     """Identity object 1018:1 as it has to be; 0 accepts any."""
     product_code: Annotated[int, Ge(0), Le(0xFFFFFFFF)]
@@ -218,7 +231,9 @@ class AtiSerial:
     """An ATI Digital F/T sensor on a serial line."""
 
     port: Annotated[str, MinLen(1)]
+    """Serial port, such as ``/dev/ttyUSB0``."""
     baud: Annotated[int, Gt(0)]
+    """Bits a second."""
     stream_hz: Positive
     """Records a second that the sensor streams."""
     filter: Literal["mean", "triangle"]
@@ -235,7 +250,17 @@ class AtiSerial:
         return max(1, round(self.stream_hz / rate_hz))
 
     def weights(self, rate_hz: float) -> tuple[float, ...]:
-        """Return the decimating filter, oldest record first; the weights sum to one."""
+        """Return the decimating filter, oldest record first; the weights sum to one.
+
+        Examples
+        --------
+        >>> from rigd.devices import AtiSerial
+        >>> sensor = AtiSerial("/dev/ttyUSB0", 1_250_000, 3000.0, "triangle", 1, "", 32767)
+        >>> [round(9 * weight) for weight in sensor.weights(rate_hz=1000)]
+        [1, 2, 3, 2, 1]
+        >>> round(1e6 * sensor.filter_delay_s(1000))  # µs
+        667
+        """
         n = self.records_per_tick(rate_hz)
         if self.filter == "mean":
             return (1.0 / n,) * n
@@ -251,18 +276,32 @@ class RigParameters:
     """Everything a driver may need to know of the rig it belongs to."""
 
     rate_hz: Annotated[float, Gt(0), Le(20_000)]
+    """Ticks a second."""
     beam: Beam
+    """Nominal beam."""
     damping: Damping
+    """Nominal damping of the beam."""
     motor: Motor
+    """Motor and gear."""
     encoder: Encoder
+    """Encoder at the output shaft."""
     sensor: WrenchSensor
+    """Force-torque sensor."""
     actuation: Actuation
+    """From the command to the torque."""
     devices: Selection
+    """Drivers of drive and sensor."""
     simulation: Simulation | None = field(default=None)
+    """Noise of the simulated rig; None: it cannot be simulated in the process."""
     name: str = "rig"
     """Name of the profile: by it a driver finds the simulated rig that stands in for this one."""
     can: CanBus | None = field(default=None)
+    """CAN bus. None: the rig has none."""
     acquisition: Acquisition | None = field(default=None)
+    """Deadlines of the readings. None: the rig has none."""
     cia402: ServoDrive | None = field(default=None)
+    """Drive on CANopen. None: the rig has none."""
     ati_can: AtiCan | None = field(default=None)
+    """Sensor on CAN. None: the rig has none."""
     ati_serial: AtiSerial | None = field(default=None)
+    """Sensor on a serial line. None: the rig has none."""

@@ -212,7 +212,15 @@ class Cycle:
         self.flags = flags
 
     def step(self, due_ns: int, reference_rad: float) -> Violation | None:
-        """Do a whole tick; where a limit is violated the torque is off when this returns."""
+        """Do a whole tick; where a limit is violated the torque is off when this returns.
+
+        Parameters
+        ----------
+        due_ns
+            When the tick was due.
+        reference_rad
+            Reference of this tick, from the rig's zero.
+        """
         self.observe(due_ns)
         flags = self.flags & ~_TORQUE_OFF
         watch = self.watch
@@ -260,6 +268,15 @@ class Cycle:
         its inertia lets it, but the other way round, has the sign of its angle or torque wrong, or
         is turned by somebody at the shaft itself. Called after a tick whose check found a limit
         violated.
+
+        Parameters
+        ----------
+        inertia_kg_m2
+            Inertia of the motor.
+        rate_hz
+            Ticks a second.
+        resolution_rad
+            Resolution of the encoder.
         """
         recent = self._recent
         if len(recent) < _RECENT_TICKS:
@@ -291,6 +308,13 @@ class Cycle:
 
     def check_encoder(self, standstill: Standstill, due_ns: int) -> None:
         """Compare the angle just read with those before it, the torque being off.
+
+        Parameters
+        ----------
+        standstill
+            Monitor of the angle at rest.
+        due_ns
+            When the tick was due.
 
         Raises
         ------

@@ -310,7 +310,15 @@ class Pulse:
         self.still_s = 0.0
 
     def look(self, beat: int, now_s: float) -> float:
-        """Take a look at its beat and return for how long it has not changed, in s."""
+        """Take a look at its beat and return for how long it has not changed, in s.
+
+        Parameters
+        ----------
+        beat
+            Count that the process adds to while it is at work.
+        now_s
+            Time of a monotonic clock.
+        """
         passed_s = min(now_s - self._looked_s, self._MOST_PER_LOOK_S)
         self.still_s = self.still_s + passed_s if beat == self._beat else 0.0
         self._beat, self._looked_s = beat, now_s

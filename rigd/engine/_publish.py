@@ -99,7 +99,7 @@ _ROOM_POLL_S = 0.0002
 class Counts:
     """Counts of a record's ticks: scheduled = recorded + missed + lost.
 
-    Of the recorded ticks, `late` woke late, and `stale_angles` and `stale_wrenches` hold a
+    Among the recorded ticks, `late` woke late, and `stale_angles` and `stale_wrenches` hold a
     reading that is not of their own tick.
     """
 

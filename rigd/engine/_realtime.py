@@ -47,7 +47,7 @@ def obtain(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]
     Parameters
     ----------
     priority
-        Of SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
+        Priority under SCHED_FIFO, 1 to 99; 0 leaves the scheduling policy as it is.
     cpu
         The one core to run on; -1 for the last isolated one, or where none is isolated the last one
         this process may use.
@@ -82,7 +82,7 @@ class Precedence:
     Parameters
     ----------
     priority
-        Of SCHED_RR; 0 leaves the scheduling policy as it is.
+        Priority under SCHED_RR; 0 leaves the scheduling policy as it is.
     loop_cpu
         ``realtime.cpu``, which says where the loop runs.
     root

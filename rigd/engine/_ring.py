@@ -61,7 +61,17 @@ class Ring:
 
     @classmethod
     def create(cls, record_size: int, capacity: int, fd: int) -> Self:
-        """Lay out an empty ring in the memory of `fd`, from :func:`shared_memory_fd`."""
+        """Lay out an empty ring in the memory of `fd`, from :func:`shared_memory_fd`.
+
+        Parameters
+        ----------
+        record_size
+            Bytes of a record.
+        capacity
+            Number of records.
+        fd
+            Descriptor of the memory.
+        """
         reserve(fd, HEADER_SIZE + capacity * record_size)
         return cls(RingSpec(fd, record_size, capacity))
 
@@ -209,6 +219,13 @@ class ReferenceSpec:
 
 def put_reference(fd: int, reference_rad: "NDArray[np.float64]") -> ReferenceSpec:
     """Place a reference, shape (n,), in the memory of `fd`.
+
+    Parameters
+    ----------
+    fd
+        Descriptor of the memory.
+    reference_rad
+        From the rig's zero, one a tick.
 
     Raises
     ------

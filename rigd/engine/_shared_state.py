@@ -110,7 +110,13 @@ UNKNOWN = -1
 
 
 class Board:
-    """Array of signed 64-bit words, indexed by :class:`Word`."""
+    """Array of signed 64-bit words, indexed by :class:`Word`.
+
+    Parameters
+    ----------
+    fd
+        Descriptor of the memory, laid out by `create`.
+    """
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -163,8 +169,11 @@ class Event:
     """One line of the session's log."""
 
     t_ns: int
+    """Time since the session's start."""
     level: Level
+    """How grave it is."""
     message: str
+    """Text for the operator."""
 
 
 def write_event(ring: Ring, event: Event) -> None:

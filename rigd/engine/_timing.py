@@ -121,6 +121,13 @@ def _clock_since_boot() -> Callable[[], int]:
 class Metronome:
     """Absolute deadlines, one a period; a missed tick is skipped, never made up in a burst.
 
+    Parameters
+    ----------
+    clock
+        Real or virtual time.
+    rate_hz
+        Ticks a second.
+
     Attributes
     ----------
     tick
@@ -131,6 +138,14 @@ class Metronome:
         The same on the clock: it goes on evenly through a restart.
     lateness_ns
         Wake-up latency: time since its deadline, less than a period.
+
+    Examples
+    --------
+    >>> from rigd.engine import Metronome, VirtualClock
+    >>> metronome = Metronome(VirtualClock(), rate_hz=1000)
+    >>> metronome.restart()
+    >>> [metronome.wait() for _ in range(3)], metronome.t_ns
+    ([0, 0, 0], 2000000)
     """
 
     def __init__(self, clock: Clock, rate_hz: float) -> None:

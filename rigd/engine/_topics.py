@@ -69,6 +69,7 @@ class ChannelSpecs:
     rings: tuple[RingSpec, ...]
     """All rings, in the order of :data:`TOPICS`."""
     board_fd: int
+    """Descriptor of the board's memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +77,15 @@ class Channels:
     """The rings, in the order of :data:`TOPICS`, and the board."""
 
     events: Ring
+    """Lines of the log."""
     controls: Ring
+    """Terms of the controller."""
     timings: Ring
+    """Ages of the readings."""
     samples: Ring
+    """Samples."""
     board: Board
+    """State that every process can read."""
     reference_fd: int = -1
     """Where the supervisor places the reference of a session."""
 
@@ -111,7 +117,17 @@ class Channels:
 
 
 def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:
-    """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory."""
+    """Lay out the memory for sessions at ``rate_hz`` in descriptors of shared memory.
+
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    fds
+        Descriptors, as many as `TOPICS` and one for the board.
+    buffered_s
+        Time that the rings hold.
+    """
     *for_rings, for_board, for_reference = fds
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)

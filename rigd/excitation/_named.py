@@ -44,6 +44,12 @@ def make_excitation(
     ------
     ExcitationError
         If a value is absurd.
+
+    Examples
+    --------
+    >>> from rigd.excitation import make_excitation
+    >>> make_excitation("step", {"amplitude_rad": 0.01}, rate_hz=1000).parameters["amplitude_rad"]
+    0.01
     """
     make = KINDS[kind]
     if "rig" in inspect.signature(make).parameters:

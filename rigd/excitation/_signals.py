@@ -187,6 +187,13 @@ def chirp(
     ------
     ExcitationError
         If an option is not finite, out of range, or does not fit the rate.
+
+    Examples
+    --------
+    >>> from rigd.excitation import chirp
+    >>> sweep = chirp(rate_hz=1000)  # the paper's
+    >>> sweep.segments
+    {'rest': (0, 1000), 'sweep': (1000, 121000), 'ring_down': (121000, 136000)}
     """
     positive("amplitude_rad", amplitude_rad, "rad")
     within_a_turn("amplitude_rad", amplitude_rad)
@@ -213,10 +220,25 @@ def hold(
 ) -> Excitation:
     """Hold the start angle, for noise and drift.
 
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    duration_s
+        Time of the segment ``sweep``.
+    rest_s, ring_down_s
+        Time before and after it.
+
     Raises
     ------
     ExcitationError
         If an option is not finite or out of range.
+
+    Examples
+    --------
+    >>> from rigd.excitation import hold
+    >>> hold(rate_hz=1000, duration_s=2.0).segments
+    {'rest': (0, 1000), 'sweep': (1000, 3000), 'ring_down': (3000, 3000)}
     """
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {"duration_s": duration_s, "rest_s": rest_s, "ring_down_s": ring_down_s}
@@ -234,10 +256,27 @@ def step(
 ) -> Excitation:
     """Step by ``amplitude_rad`` (either sign) at the sweep's first tick.
 
+    Parameters
+    ----------
+    rate_hz
+        Ticks a second.
+    amplitude_rad
+        Angle of the step, not 0.
+    duration_s
+        Time of the segment ``sweep``.
+    rest_s, ring_down_s
+        Time before and after it.
+
     Raises
     ------
     ExcitationError
         If an option is not finite or out of range.
+
+    Examples
+    --------
+    >>> from rigd.excitation import step
+    >>> step(rate_hz=1000, amplitude_rad=0.01).reference_rad[[999, 1000, -1]]
+    array([0.  , 0.01, 0.01])
     """
     finite("amplitude_rad", amplitude_rad, "rad")
     if amplitude_rad == 0.0:
@@ -298,6 +337,16 @@ def multisine(
     ------
     ExcitationError
         If an option is not finite, out of range, or does not fit the others.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.excitation import multisine
+    >>> signal = multisine(rate_hz=1000, amplitude_rad=0.01, stop_hz=20, period_s=10, duration_s=20)
+    >>> print(f"peak {np.abs(signal.reference_rad).max():.3f} rad")
+    peak 0.010 rad
+    >>> print(f"crest factor {signal.parameters['crest_factor']:.2f}")
+    crest factor 3.30
     """
     positive("amplitude_rad", amplitude_rad, "rad")
     within_a_turn("amplitude_rad", amplitude_rad)

@@ -322,13 +322,18 @@ class MotorEstimate:
     """Estimate of the motor, at its output shaft."""
 
     inertia_kg_m2: Quantity
+    """Inertia of the motor without the tool."""
     viscous_nm_s_per_rad: Quantity
+    """Viscous friction."""
     coulomb_nm: Quantity
+    """Coulomb friction."""
     torque_scale: Quantity
     """True torque over commanded torque; without a standard deviation it is held at 1, and the
     other quantities count in the drive's own torque."""
     actuation_delay_s: Quantity
+    """From the command to the torque."""
     windows: int
+    """Windows of the records that count."""
     dropped: int
     """Windows in which the shaft may have stood still."""
     misfit: float

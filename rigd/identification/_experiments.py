@@ -98,6 +98,13 @@ def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float)
     """Make a short multisine session with little motion, to design the others' controller by.
 
     See :func:`multisine_session`.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    torque_percent, stroke_rad
+        As for `multisine_session`.
     """
     return _ride(TRIAL, profile, torque_percent, stroke_rad)
 
@@ -155,6 +162,13 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
     """Make passes to and fro at four constant speeds.
 
     Parameters, and what is raised, as for :func:`multisine_session`.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    torque_percent, stroke_rad
+        As for `multisine_session`.
     """
     limit_nm = _torque_limit(profile, torque_percent)
     loop = close_loop(profile.loop_model())

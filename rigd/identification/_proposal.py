@@ -33,6 +33,13 @@ def tuned(profile: Profile, estimate: MotorEstimate) -> Profile:
 
     The commands keep their scale: inertia, friction and feed-forward are divided by it instead.
     Where the loop is not stable with the profile's pole, it gets a cautious one.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    estimate
+        Estimate of its motor.
     """
     scale = estimate.torque_scale.value
     motor = replace(
@@ -105,8 +112,11 @@ class Proposal:
     """An estimate beside the profile it is to improve."""
 
     estimate: MotorEstimate
+    """Estimate of the motor."""
     rows: tuple[Row, ...]
+    """Quantity by quantity, the estimate beside the profile."""
     notes: tuple[str, ...]
+    """Sentences for the operator."""
 
     def table(self) -> list[str]:
         """Return the comparison as lines of text."""

@@ -241,7 +241,15 @@ class Backlog:
         return bool(self._waiting or self._owed)
 
     def put(self, drawings: "list[Drawing]", samples: int) -> None:
-        """Add drawings that show so many samples; if need be, make room."""
+        """Add drawings that show so many samples; if need be, make room.
+
+        Parameters
+        ----------
+        drawings
+            What is to be drawn, in order.
+        samples
+            How many samples they show.
+        """
         if drawings:
             self._waiting.append((drawings, samples))
             self.samples += samples

@@ -116,6 +116,13 @@ class Draft:
     def answer(self, key: str, text: str) -> None:
         """Take an answer, of the operator from a data sheet.
 
+        Parameters
+        ----------
+        key
+            Dotted key of the profile.
+        text
+            What was typed.
+
         Raises
         ------
         ValueError

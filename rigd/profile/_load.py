@@ -53,6 +53,13 @@ def load_profile(name_or_path: str | Path) -> Profile:
     ProfileError
         If there is no such file, or anything in it is wrong; every problem is named with its
         key, value, unit and remedy.
+
+    Examples
+    --------
+    >>> from rigd.profile import load_profile
+    >>> rig = load_profile("sim").rig
+    >>> rig.rate_hz, rig.beam.length_m
+    (1000.0, 0.98)
     """
     path = _find(name_or_path)
     try:

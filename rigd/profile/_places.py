@@ -31,7 +31,7 @@ class ProfileFile:
     name
         What ``--profile`` takes: the file's name without ``.toml``.
     path
-        Of the file.
+        The file.
     origin
         Where it comes from.
     """

@@ -158,15 +158,23 @@ class Profile:
     """One rig, as its profile describes it."""
 
     name: str
+    """Name of the rig."""
     description: str
+    """One line on it."""
     path: Path
+    """The file."""
     text: str
     """The file as read, for the session that uses it."""
     rig: RigParameters
+    """Parameters that its drivers need."""
     control: ControlSettings
+    """Settings of the controller."""
     limits: Limits
+    """Levels that end a session."""
     session: SessionSettings
+    """Settings round a record."""
     realtime: RealtimeSettings
+    """What its processes ask of the operating system."""
     sources: Mapping[str, str]
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None

@@ -92,6 +92,13 @@ def check_new(path: Path) -> None:
 def write_new(path: Path, text: str) -> None:
     """Write a file that does not exist yet.
 
+    Parameters
+    ----------
+    path
+        The new file.
+    text
+        Its text.
+
     Raises
     ------
     ProfileError
@@ -115,7 +122,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
         What is copied, with all its comments. Where it names the drive's EDS file, that is named
         by its whole path in the copy, whose folder is another one.
     path
-        Of the copy.
+        Name in the copy.
     name
         What the profile calls itself in the copy; None: as before.
 

@@ -43,7 +43,9 @@ class Plan:
     """A session that stays within the limits."""
 
     prediction: Prediction
+    """What the session is predicted to do."""
     warnings: tuple[str, ...]
+    """Sentences for the operator."""
     tip_in_words: str
     """What the free end will do, and whether the linear model holds there."""
 
@@ -87,7 +89,15 @@ class Foresight:
 
 
 def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value]) -> Excitation:
-    """Make an excitation for a rig: see `rigd.excitation._named.make_excitation`."""
+    """Make an excitation for a rig: see `rigd.excitation._named.make_excitation`.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    kind, parameters
+        Name and options of the excitation.
+    """
     return make_excitation(kind, parameters, profile.rig.rate_hz, Foresight(profile))
 
 

@@ -117,6 +117,13 @@ class Crew:
     def lay_out(self, rate_hz: float, *, fast: bool = False) -> None:
         """Size the shared memory for sessions at ``rate_hz``, `fast` under the virtual clock.
 
+        Parameters
+        ----------
+        rate_hz
+            Ticks a second.
+        fast
+            Under the virtual clock.
+
         Raises
         ------
         OSError

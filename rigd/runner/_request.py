@@ -47,8 +47,11 @@ class Order:
     """A session to run, already checked against the profile's limits."""
 
     profile: Profile
+    """Profile of the rig."""
     excitation: Excitation
+    """Reference, tick by tick."""
     path: Path
+    """Final name of the session file."""
     notes: tuple[tuple[str, str], ...] = ()
     """Operator, specimen, note, number in a series: metadata as given."""
 
@@ -150,6 +153,15 @@ def make_folder(folder: Path) -> None:
 def make_room(folder: Path, excitation: Excitation, limits: Limits) -> None:
     """Make the folder, and see that a session fits on its disk and leaves room there.
 
+    Parameters
+    ----------
+    folder
+        Folder of the session files.
+    excitation
+        Reference, whose length sets the size of the file.
+    limits
+        The profile's, with the space that has to stay free.
+
     Raises
     ------
     NoRoomError
@@ -176,6 +188,15 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     """Name a new session file: time, excitation, and its number in a series.
 
     Nothing is created; the recorder refuses a name that is taken.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session files.
+    kind
+        Name of the excitation.
+    number
+        Number in a series; None: it is the only one.
     """
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
     if number is not None:

@@ -117,18 +117,25 @@ class SessionResult:
     path: Path | None
     """Path of the file; None: it ended before tick 0, or no complete file could be made."""
     outcome: str
+    """``complete``, ``stopped``, ``fault`` or ``unknown``."""
     reason: str
+    """Why it ended, a sentence; empty if it is complete."""
     scheduled: int
+    """Ticks that were due."""
     recorded: int | None
     """None, as `lost`, where it is not known before the file is recovered."""
     missed: int
+    """Ticks that the loop skipped."""
     late: int
+    """Ticks that woke late."""
     lost: int | None
+    """Samples that were taken and not recorded."""
     fault: bool
     """Something failed, in the record or after it, whatever was asked for meanwhile."""
     stale_angles: int = 0
     """Recorded ticks with a stale angle; `stale_wrenches` counts stale wrenches."""
     stale_wrenches: int = 0
+    """Recorded ticks with a stale wrench."""
     live_dropped: int = 0
     """Samples that the live view did not get."""
     part: Path | None = None
@@ -164,9 +171,13 @@ class SessionProgress:
     """Progress of a running session."""
 
     phase: Phase
+    """Where the session is."""
     tick: int
+    """Number of the last tick."""
     missed: int
+    """Ticks missed so far."""
     late: int
+    """Ticks that woke late so far."""
 
 
 Watcher = Callable[[SessionProgress, list[Event]], None]

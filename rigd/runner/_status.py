@@ -109,7 +109,9 @@ class ProcessStatus:
     """Status of one process of the table."""
 
     name: str
+    """Name in the table of processes."""
     pid: int
+    """Process id."""
     state: str
     """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
     still_s: float
@@ -135,14 +137,21 @@ class RigStatus:
     """Status of the rig, as read from shared memory."""
 
     phase: Phase
+    """Where the session is."""
     angle_rad: float
     """Angle from the rig's zero."""
     coupling_torque_nm: float
+    """Measured torque, tared."""
     torque_command_nm: float
+    """Last command."""
     tick: int
+    """Number of the last tick."""
     missed: int
+    """Ticks missed so far."""
     late: int
+    """Ticks that woke late so far."""
     lost: int
+    """Samples lost so far."""
     bus_load_percent: float | None
     """Load of the busiest line; None where there is none."""
     bus_errors: int | None
@@ -156,7 +165,9 @@ class RigStatus:
     signals: SignalStatus | None
     """Figures of the record; None before its first sample."""
     processes: tuple[ProcessStatus, ...]
+    """Processes of the rig."""
     topics: tuple[TopicStatus, ...]
+    """Traffic to the recorder."""
     live_view: LiveAddress | None = None
     """Address at which the sessions are shown, if they are."""
 

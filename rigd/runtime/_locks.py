@@ -43,6 +43,13 @@ class HeldFile:
     def acquire(self, holder: str, *, alone: bool = True) -> None:
         """Take it, or share it with others that do not want it alone.
 
+        Parameters
+        ----------
+        holder
+            What others are told of who has it.
+        alone
+            Whether nobody else may have it meanwhile.
+
         Raises
         ------
         HeldError

@@ -28,10 +28,12 @@ class Limits:
     """
 
     angle_rad: Positive
+    """Angle from the zero, either way."""
     stop_angle_rad: Positive
     """Where the shaft is stopped by force, or something tears; nothing checks it in a session, but
     the rig has to come to rest by itself between `angle_rad` and here."""
     velocity_rad_s: Positive
+    """Speed of the output shaft, either way."""
     acceleration_rad_s2: Positive
     """More than the motor can do to the shaft: an angle that shows more has jumped."""
     tracking_error_rad: Positive
@@ -46,6 +48,7 @@ class Limits:
     stale_ticks_in_a_row: Annotated[int, Ge(1)]
     """Ticks for which an old angle or wrench may stand in for one that did not come."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
+    """Ticks that the loop may miss one after the other."""
     missed_percent: BelowAll
     """Share of all ticks scheduled so far, counted as at least ten seconds' worth."""
     tare_drift_nm: Positive
@@ -75,6 +78,12 @@ class Violation:
         The value must not fall below the limit, instead of exceeding it.
     warning
         The level that was reached instead, if the limit was not left yet.
+
+    Examples
+    --------
+    >>> from rigd.safety import Violation
+    >>> print(Violation("angle", 1.02, 1.0, "rad", key="limits.angle_rad"))
+    The angle of 1.02 rad exceeds its limit of 1 rad (limits.angle_rad).
     """
 
     channel: str
@@ -93,7 +102,8 @@ class Violation:
         left = "is below its limit of" if self.below else "exceeds its limit of"
         how = left
         if self.warning is not None:
-            how = f"is past its warning level of {self.warning:.4g} {self.unit}; its limit is"
+            side = "below" if self.below else "above"
+            how = f"is {side} its warning level of {self.warning:.4g} {self.unit}; its limit is"
         where = f" ({self.key})" if self.key else ""
         remedy = f" {self.remedy}" if self.remedy else ""
         return (
@@ -210,7 +220,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "torque command",
-        "torque that the controller asks for",
+        "torque command of the controller",
         "N·m",
         "limits.torque_command_nm",
         "motor.peak_torque_nm",
@@ -221,7 +231,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "i²t",
-        "motor's mean torque (i²t)",
+        "motor's rms torque (i²t)",
         "N·m",
         "motor.continuous_torque_nm",
         0.8,
@@ -284,7 +294,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stale angle share",
-        "part of ticks without a new angle",
+        "share of ticks without a new angle",
         "%",
         "limits.stale_percent",
         0.5,
@@ -295,7 +305,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "stale wrench share",
-        "part of ticks without a new wrench",
+        "share of ticks without a new wrench",
         "%",
         "limits.stale_percent",
         0.5,
@@ -315,7 +325,7 @@ INTERLOCKS: Final = (
     ),
     Interlock(
         "missed share",
-        "part of ticks missed",
+        "share of missed ticks",
         "%",
         "limits.missed_percent",
         0.8,

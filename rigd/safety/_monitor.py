@@ -301,6 +301,13 @@ class LimitWatch:
         It has to be called in every tick that has such a reading, and in the next. A controller
         that is fed an old angle turns the motor without limit, and neither speed nor tracking error
         would show it.
+
+        Parameters
+        ----------
+        angle_stale, wrench_stale
+            No new angle, or no new wrench, came in this tick.
+        saturated
+            The wrench is at the end of the sensor's range.
         """
         self._stale_angles = self._stale_angles + 1 if angle_stale else 0
         self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0

@@ -100,7 +100,21 @@ class Status(IntFlag):
 
 
 def field_tag(number: int, protobuf_type: str) -> int:
-    """Return the tag byte of field `number` (1–15) of a fixed-layout message."""
+    """Return the tag byte of field `number` (1–15) of a fixed-layout message.
+
+    Parameters
+    ----------
+    number
+        1 to 15.
+    protobuf_type
+        "sfixed64", "fixed32" or "double".
+
+    Examples
+    --------
+    >>> from rigd.session import field_tag
+    >>> hex(field_tag(2, "fixed32"))
+    '0x15'
+    """
     return number << 3 | _WIRE_TYPES[protobuf_type]
 
 
@@ -165,6 +179,36 @@ def pack_sample_into(
 
     Called once a tick. `lateness_ns` and `work_ns` are clamped to 0…2³²−1 ns; any other value that
     its field cannot hold raises ``struct.error``.
+
+    Parameters
+    ----------
+    buffer
+        Memory to write to.
+    offset
+        Place of the message in it, in bytes.
+    t_ns
+        Scheduled time of the tick since the session's start.
+    tick
+        Number of the tick.
+    angle_reference_rad, angle_rad
+        Reference and measured angle.
+    torque_command_nm, coupling_torque_nm
+        Torque commanded, and torque measured about the motor's axis.
+    fx_n, fy_n, fz_n, tx_nm, ty_nm, tz_nm
+        Wrench in the sensor's frame, tared.
+    status
+        Bits of `Status`.
+    lateness_ns, work_ns
+        Wake-up latency and execution time of the tick.
+
+    Examples
+    --------
+    >>> from rigd.session import SAMPLE_SIZE, decode_samples, pack_sample_into
+    >>> block = bytearray(SAMPLE_SIZE)
+    >>> pack_sample_into(block, 0, 5_000_000, 5, 0.01, 0.009, *[0.0] * 8, 0, 12_000, 90_000)
+    >>> sample = decode_samples(block)[0]
+    >>> print(sample["tick"], sample["angle_rad"], sample["lateness_ns"])
+    5 0.009 12000
     """
     if not 0 <= lateness_ns <= 0xFFFFFFFF:
         lateness_ns = 0 if lateness_ns < 0 else 0xFFFFFFFF
@@ -195,7 +239,23 @@ def pack_control_into(
     friction_nm: float,
     unlimited_torque_nm: float,
 ) -> None:
-    """Write one control message of ``CONTROL_SIZE`` bytes into `buffer` at `offset`."""
+    """Write one control message of ``CONTROL_SIZE`` bytes into `buffer` at `offset`.
+
+    Parameters
+    ----------
+    buffer
+        Memory to write to.
+    offset
+        Place of the message in it, in bytes.
+    t_ns
+        Scheduled time of the tick since the session's start.
+    tick
+        Number of the tick.
+    proportional_nm, integral_nm, derivative_nm, feedforward_nm, friction_nm
+        Terms of the controller.
+    unlimited_torque_nm
+        Their sum.
+    """
     # fmt: off
     _pack_control(
         buffer, offset,
@@ -214,7 +274,21 @@ def pack_timing_into(
     angle_age_s: float,
     wrench_age_s: float,
 ) -> None:
-    """Write one timing message of ``TIMING_SIZE`` bytes into `buffer` at `offset`."""
+    """Write one timing message of ``TIMING_SIZE`` bytes into `buffer` at `offset`.
+
+    Parameters
+    ----------
+    buffer
+        Memory to write to.
+    offset
+        Place of the message in it, in bytes.
+    t_ns
+        Scheduled time of the tick since the session's start.
+    tick
+        Number of the tick.
+    angle_age_s, wrench_age_s
+        Age of either reading when it was used.
+    """
     _pack_timing(buffer, offset, 0x09, t_ns, 0x15, tick, 0x19, angle_age_s, 0x21, wrench_age_s)
 
 

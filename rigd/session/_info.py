@@ -32,11 +32,15 @@ class SessionInfo:
     """Summary of a session file without analysing it."""
 
     path: Path
+    """The file."""
     size_bytes: int
+    """Its size."""
     start_utc: str
     """ISO 8601, to the microsecond."""
     rate_hz: float
+    """Nominal rate."""
     samples: int
+    """Recorded samples."""
     ticks: int
     """Ticks from the first recorded one to the last, both counted."""
     duration_s: float
@@ -46,9 +50,13 @@ class SessionInfo:
     status_counts: dict[str, int]
     """Name of a status bit → samples that have it; only those that occur."""
     segments: dict[str, tuple[int, int]]
+    """Name → first tick and end (exclusive)."""
     metadata: dict[str, str]
+    """The record ``session``, texts cut to what can be read."""
     outcome: dict[str, str] | None
+    """How the session ended; None if the file does not tell."""
     events: list[Event]
+    """Its log, texts cut as well."""
     attachments: dict[str, int]
     """Name → bytes."""
     left_out: list[str]
@@ -118,6 +126,13 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
     ------
     SessionError
         If the file cannot be read or does not state a rate greater than 0.
+
+    Examples
+    --------
+    >>> from rigd.session import describe
+    >>> found = describe("session.mcap")
+    >>> found.rate_hz, found.samples, found.outcome["outcome"]
+    (1000.0, 21500, 'complete')
     """
     path = Path(path)
     session = read_session(path, fields=SURVEY_FIELDS, max_samples=MAX_SURVEYED)

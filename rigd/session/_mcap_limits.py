@@ -143,7 +143,7 @@ def unpacked(
     Parameters
     ----------
     zstd
-        Of :func:`zstd_decompressor`.
+        Made by :func:`zstd_decompressor`.
     compression
         Compression that the chunk names.
     packed

@@ -67,6 +67,7 @@ class Event:
     name: str
     """Process or part that spoke."""
     message: str
+    """Text for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ class Session:
     """A session as recorded."""
 
     path: Path
+    """The file."""
     samples: npt.NDArray[np.void]
     """(n,) of ``SAMPLE_DTYPE``, ticks strictly increasing."""
     start_utc_ns: int
@@ -85,7 +87,9 @@ class Session:
     outcome: dict[str, str] | None
     """How the session ended, None if the file does not tell."""
     events: list[Event]
+    """Its log, in the order of time."""
     attachments: dict[str, bytes]
+    """Name → contents."""
     events_left_out: int = 0
     """Further lines of the log, for which there was no room."""
 
@@ -144,6 +148,15 @@ def read_session(
     SessionError
         If the file is missing, empty, not an MCAP file, incomplete, damaged, too large, of a later
         format version, or no session.
+
+    Examples
+    --------
+    >>> from rigd.session import read_session
+    >>> session = read_session("session.mcap")
+    >>> session.segments
+    {'rest': (0, 500), 'sweep': (500, 20500), 'ring_down': (20500, 21500)}
+    >>> print(session.samples["angle_rad"].size, session.number("beam_length_m"))
+    21500 0.98
     """
     path = Path(path)
     log = _Log()

@@ -74,9 +74,11 @@ class Recovery:
     """Result of a recovery."""
 
     source: Path
+    """The file that was given."""
     path: Path | None
     """The new file; None if `source` is a sound session already."""
     samples: int
+    """Samples that are intact."""
     outcome: Mapping[str, str]
     """The record ``outcome`` of the new file, with what was lost."""
     damage: str | None

@@ -506,7 +506,15 @@ def copy_new(descriptor: int, target: Path) -> None:
 
 
 def rename_new(source: Path, target: Path) -> None:
-    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists."""
+    """Rename a file, atomically failing with ``FileExistsError`` if `target` exists.
+
+    Parameters
+    ----------
+    source
+        The file.
+    target
+        Its new name, on the same disk.
+    """
     try:
         os.link(source, target)
     except OSError as error:

@@ -64,6 +64,11 @@ class FrequencyResponse:
     def band(self, first_hz: float, last_hz: float) -> "FrequencyResponse":
         """Bins from `first_hz` to `last_hz`, both included.
 
+        Parameters
+        ----------
+        first_hz, last_hz : float
+            Ends of the band.
+
         Raises
         ------
         SpectralError
@@ -153,8 +158,11 @@ class Segmentation:
     """Lengths of Welch's segments, their overlap and their transform, all in samples."""
 
     segment_length: int = PAPER_SEGMENT_LENGTH
+    """Samples of one segment."""
     overlap: int = PAPER_OVERLAP
+    """Samples that neighbours have in common."""
     nfft: int = PAPER_NFFT
+    """Length of the transform, at least that of a segment."""
 
 
 def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
@@ -182,7 +190,21 @@ def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
 
 
 def segment_count(samples: int, segment_length: int, overlap: int) -> int:
-    """Count the whole segments in a record; a rest at its end is unused."""
+    """Count the whole segments in a record; a rest at its end is unused.
+
+    Parameters
+    ----------
+    samples
+        Length of the record.
+    segment_length, overlap
+        In samples.
+
+    Examples
+    --------
+    >>> from rigd.spectral import segment_count
+    >>> segment_count(120_000, 17266, 2590)
+    8
+    """
     return max(0, (samples - overlap) // (segment_length - overlap))
 
 
@@ -193,6 +215,15 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
     segments of 15 % overlap miss a record of 120 000 samples by five: seven are then averaged
     without a word, the record ends at 105.3 s and the third resonance of a 120 s chirp is lost.
 
+    Parameters
+    ----------
+    samples
+        Length of the record.
+    segments
+        How many are to fit.
+    overlap_fraction
+        Overlap as a share of the segment, from 0 to below 1.
+
     Returns
     -------
     (segment_length, overlap) : tuple of int
@@ -202,6 +233,12 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
     ------
     SpectralError
         If the record is too short for that many segments.
+
+    Examples
+    --------
+    >>> from rigd.spectral import segment_lengths
+    >>> segment_lengths(120_000, 8, 0.15)
+    (17266, 2590)
     """
     if segments < 1 or not 0 <= overlap_fraction < 1:
         raise SpectralError(
@@ -358,6 +395,22 @@ def welch_response(
     ------
     SpectralError
         If the record is shorter than one segment, or a record or setting makes no sense.
+
+    References
+    ----------
+    P. D. Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE
+    Trans. Audio Electroacoust. 15 (1967) 70-73.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.spectral import welch_response
+    >>> x = np.random.default_rng(1).standard_normal(10_000)
+    >>> y = 2 * np.roll(x, 1)  # a gain of 2, one sample late
+    >>> found = welch_response(x, y, 1000.0, segment_length=500, overlap=250, nfft=500)
+    >>> gain, lag_rad = abs(found.response[50]), -np.angle(found.response[50])
+    >>> print(f"{found.frequency_hz[50]:g} Hz: {gain:.2f}, {lag_rad:.2f} rad")
+    100 Hz: 2.00, 0.63 rad
     """
     x, y = checked_records(input_, output, rate_hz)
     check_segmentation(segment_length, overlap, nfft)
@@ -408,6 +461,18 @@ def fft_response(
     ------
     SpectralError
         If a record holds values that are not finite, the input is zero, or `nfft` is too short.
+
+    References
+    ----------
+    L. Ljung, System Identification, 2nd edition, section 6.3: empirical transfer function estimate.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.spectral import fft_response
+    >>> x = np.array([1.0, 0.0, 0.0, 0.0])
+    >>> print(fft_response(x, 3 * x, rate_hz=4.0).response)
+    [3.+0.j 3.+0.j 3.+0.j]
     """
     x, y = checked_records(input_, output, rate_hz)
     length = x.size if nfft is None else nfft
@@ -458,6 +523,23 @@ def instrumental_response(
     ------
     SpectralError
         As `rigd.spectral.welch_response`, and if the reference is 0 throughout.
+
+    References
+    ----------
+    P. E. Wellstead, "Non-parametric methods of system identification", Automatica 17 (1981) 55-69.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.spectral import instrumental_response, welch_response
+    >>> reference, noise = np.random.default_rng(1).standard_normal((2, 100_000))
+    >>> input_ = reference - 0.5 * noise  # a controller feeds the noise back
+    >>> output = 3 * input_ + noise
+    >>> lengths = {"segment_length": 500, "overlap": 250, "nfft": 500}
+    >>> h1 = welch_response(input_, output, 1000.0, **lengths)
+    >>> hiv = instrumental_response(reference, input_, output, 1000.0, **lengths)
+    >>> print(f"{np.median(h1.response.real):.1f}, {np.median(hiv.response.real):.1f}")
+    2.6, 3.0
     """
     checked_records(input_, output, rate_hz)
     if not np.any(reference):

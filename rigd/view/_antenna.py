@@ -42,7 +42,7 @@ FACTOR: Final = 2.0
 The paper's chirp turns the motor by 25 mrad, and when it passes the first resonance the tip swings
 by a third of the beam's length: the one is still seen, the other still in the picture.
 """
-TITLE: Final = f"Antenna, its motion drawn × {FACTOR:g}"
+TITLE: Final = f"Antenna (displacement × {FACTOR:g})"
 
 DRAWN_HZ: Final = 20.0
 TRAIL_S: Final = 0.5
@@ -190,7 +190,7 @@ def label(tip_m: float) -> str:
     """Return the text of the tip's deflection, to two figures or 0.1 mm."""
     tip_mm = 1e3 * tip_m
     text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
-    return f"tip bends ± {text} mm, drawn × {FACTOR:g}"
+    return f"tip deflection ± {text} mm, drawn × {FACTOR:g}"
 
 
 def _small_damping(beam: Beam) -> Damping:

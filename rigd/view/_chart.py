@@ -132,6 +132,11 @@ class Chart:
         """Return where points are on the canvas, (n, 2), from values (n,) of either axis.
 
         What lies beyond an axis is put at its end.
+
+        Parameters
+        ----------
+        x, y
+            Values of either axis, shape (n,).
         """
         left, top, right, bottom = self.frame
         across, up = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
@@ -211,7 +216,17 @@ class Chart:
         stream.log(f"{self.entity}/{name}", shape, static=static)
 
     def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
-        """Write a text into the middle of the frame; an empty one takes it away."""
+        """Write a text into the middle of the frame; an empty one takes it away.
+
+        Parameters
+        ----------
+        stream
+            Recording to draw into.
+        text
+            Empty: none.
+        color
+            Red, green, blue, 0 to 255.
+        """
         import rerun as rr
 
         left, top, right, bottom = self.frame
@@ -229,7 +244,15 @@ class Chart:
         )
 
     def draw_shade(self, stream: "RecordingStream", name: str) -> None:
-        """Draw what `move_shade` moves: two-dimensional views fill nothing but images."""
+        """Draw what `move_shade` moves: two-dimensional views fill nothing but images.
+
+        Parameters
+        ----------
+        stream
+            Recording to draw into.
+        name
+            Name of the shade.
+        """
         import rerun as rr
 
         pixel = np.array([[GREY]], dtype=np.uint8)
@@ -248,7 +271,17 @@ class Chart:
         )
 
     def move_shade(self, stream: "RecordingStream", name: str, first: float, last: float) -> None:
-        """Shade the chart between two values of its horizontal axis, and nowhere else."""
+        """Shade the chart between two values of its horizontal axis, and nowhere else.
+
+        Parameters
+        ----------
+        stream
+            Recording to draw into.
+        name
+            Name of the shade.
+        first, last
+            Values of the horizontal axis.
+        """
         _, top, _, bottom = self.frame
         left, right = self.place([first, last], self.y.first)[:, 0]
         self._put_shade(stream, name, (left, top, right, bottom))
@@ -357,7 +390,19 @@ def _width(text: str) -> float:
 
 
 def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return ticks and grid lines of a logarithmic axis: at 1, 2 and 5 of each decade, at all."""
+    """Return ticks and grid lines of a logarithmic axis: at 1, 2 and 5 of each decade, at all.
+
+    Parameters
+    ----------
+    first, last
+        Ends of the axis, above 0.
+
+    Examples
+    --------
+    >>> from rigd.view import decades
+    >>> decades(0.5, 20.0)[0]
+    (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+    """
     exponents = range(int(np.floor(np.log10(first))), int(np.ceil(np.log10(last))) + 1)
     found = [
         (digit, float(f"{digit}e{exponent}")) for exponent in exponents for digit in range(1, 10)
@@ -370,7 +415,21 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
 
 
 def steps(first: float, last: float, most: int) -> tuple[float, ...]:
-    """Return round values from `first` to `last`, `most` of them at the most."""
+    """Return round values from `first` to `last`, `most` of them at the most.
+
+    Parameters
+    ----------
+    first, last
+        Ends of the axis.
+    most
+        Largest number of values.
+
+    Examples
+    --------
+    >>> from rigd.view import steps
+    >>> steps(1.0, 47.0, 6)
+    (10.0, 20.0, 30.0, 40.0)
+    """
     least = (last - first) / most
     scale = 10.0 ** np.floor(np.log10(least))
     step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least)
@@ -398,7 +457,17 @@ class Thinning:
 
     @classmethod
     def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
-        """Gather points from `first` to `last` in groups of equal ratio, leaving out empty ones."""
+        """Gather points from `first` to `last` in groups of equal ratio, leaving out empty ones.
+
+        Parameters
+        ----------
+        grid
+            Frequencies of the points, increasing.
+        first, last
+            Band that is kept.
+        groups
+            Largest number of groups.
+        """
         edges = np.geomspace(first, last, groups + 1)
         # A point at the very end belongs to the last group.
         edges[-1] = np.nextafter(last, np.inf)

@@ -229,7 +229,15 @@ def magnitude_db(response: Complex) -> Real:
 
 
 def phase_deg(response: Complex) -> Real:
-    """Phase in degrees, from −90 to below 270."""
+    """Phase in degrees, from −90 to below 270.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rigd.view import phase_deg
+    >>> print(phase_deg(np.array([1.0, 1j, -1.0, -1j])))
+    [  0.  90. 180. -90.]
+    """
     turned: Real = np.mod(np.degrees(np.angle(response)) - _PHASE_FROM_DEG, 360.0)
     return turned + _PHASE_FROM_DEG
 

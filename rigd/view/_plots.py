@@ -201,7 +201,7 @@ SIGNALS = Source(
 
 AGES = Plot(
     "ages_ms",
-    "Age of the readings when used (ms)",
+    "Measurement latency (ms)",
     (
         Curve("angle (ms)", SKY_BLUE, lambda r: 1e3 * r["angle_age_s"], 2.5),
         Curve("wrench (ms)", GREEN, lambda r: 1e3 * r["wrench_age_s"]),
@@ -223,7 +223,7 @@ BACKLOG = Plot(
     "backlog_samples",
     "Recorder's lag and not shown (samples)",
     (
-        Curve("waiting for the recorder (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
+        Curve("recorder backlog (samples)", SKY_BLUE, lambda r: r["recorder_lag_ticks"]),
         Curve("dropped by the view (samples)", GREY, lambda r: r["view_dropped"]),
     ),
 )

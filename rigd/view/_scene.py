@@ -103,7 +103,15 @@ class Picture:
         return [partial(send_note, note=note) for note in events]
 
     def health(self, t_ns: int, health: Health) -> list[Drawing]:
-        """Take a reading of the health, a few times a second."""
+        """Take a reading of the health, a few times a second.
+
+        Parameters
+        ----------
+        t_ns
+            Time since the session's start.
+        health
+            What was read.
+        """
         return [
             *self._plot(HEALTH, health_record(t_ns, health)),
             partial(send_summary, subject=self._subject, t_ns=t_ns, health=health),

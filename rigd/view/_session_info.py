@@ -75,7 +75,15 @@ class Note:
 
 
 def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
-    """Return the last line of a session's log: how it ended, at the time of its last sample."""
+    """Return the last line of a session's log: how it ended, at the time of its last sample.
+
+    Parameters
+    ----------
+    t_ns
+        Time of the last sample.
+    outcome, reason
+        How the session ended, and why.
+    """
     return Note(
         t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
     )
@@ -164,7 +172,7 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
         ("missed ticks", _number(health.missed_ticks), not health.missed_ticks),
         ("late ticks", _number(health.late_ticks), not health.late_ticks),
         ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
-        ("waiting for the recorder", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
+        ("recorder backlog", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
         ("not shown here", _number(health.view_dropped, "{:.0f} samples"), True),
         ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
         ("bus errors", _number(health.bus_errors), not health.bus_errors),

@@ -124,7 +124,7 @@ def test_large_residuals_are_descended_in_fewer_steps_than_gauss_newtons():
         return np.concatenate((j.real, j.imag), axis=1).T
 
     rough = descend(misfit, np.array([0.4, 2.3]), FREE, relative_tolerance=1e-3)
-    plain = least_squares(stacked, rough.x, slopes_of, xtol=1e-15, ftol=1e-14, gtol=1e-15)
+    plain = scipy.optimize.least_squares(stacked, rough.x, slopes_of, xtol=1e-15, ftol=1e-14, gtol=1e-15)
     near = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=np.zeros((2, 2)))
     assert near.cost > 1.0
     assert near.cost <= 2 * plain.cost * (1 + 1e-13)
@@ -190,7 +190,7 @@ def test_a_large_residual_costs_few_evaluations_more():
     start = np.array([1.0, 1.5, 0.5])
     ours = Counted(decays, slopes)
     found = descend(ours, start, free(3), relative_tolerance=1e-12)
-    other = least_squares(decays, start, slopes, xtol=1e-15, ftol=1e-12, gtol=1e-15)
+    other = scipy.optimize.least_squares(decays, start, slopes, xtol=1e-15, ftol=1e-12, gtol=1e-15)
     assert 2 * other.cost > 5
     assert found.cost == pytest.approx(2 * other.cost, rel=1e-10)
     assert found.evaluations == ours.asked

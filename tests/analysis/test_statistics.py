@@ -52,7 +52,7 @@ def test_chi_squares_come_as_arrays():
 
 @pytest.mark.parametrize("deviate", [-30.0, -5.0, -0.1, 0.0, 2.0, 5.0, 20.0, 36.0, 37.5])
 def test_a_deviate_is_exceeded_as_rarely_as_its_chi_square(deviate):
-    """Of two degrees of freedom the probability is exp(-value / 2), also beyond 1e-290."""
+    """With two degrees of freedom the probability is exp(-value / 2), also beyond 1e-290."""
     value = -2 * math.log1p(-normal_p_value(-deviate)) if deviate < 0 else 0.0
     if deviate >= 0:
         value = -2 * math.log(normal_p_value(deviate))

@@ -68,7 +68,7 @@ def test_an_angle_that_stays_where_it_ends_shakes_nothing():
 
 @pytest.mark.parametrize(("frequency_hz", "slope_of_share"), [(2.5536, 1.3765), (16.003, 4.781)])
 def test_the_same_deflection_slopes_more_in_a_higher_mode(frequency_hz, slope_of_share):
-    """Of the clamped beam's modes; the tip's slope over its deflection relative to the length."""
+    """Modes of the clamped beam; the tip's slope over its deflection relative to the length."""
     t = np.arange(8000) / 1000.0
     angle = 1e-3 * np.minimum(t, 1) * np.sin(2 * np.pi * frequency_hz * t)
     motion = tip_motion(BEAM, VI, angle, 1000.0)

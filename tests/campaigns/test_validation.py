@@ -56,7 +56,7 @@ def test_a_trial_whose_worker_is_killed_is_lost_and_the_others_are_done(shaken):
 
 
 def test_the_verdict_says_over_how_many_a_prediction_is(shaken):
-    (foresight,) = (s for s in shaken.verdict.sentences if s.startswith("From the others"))
+    (foresight,) = (s for s in shaken.verdict.sentences if s.startswith("Leave-one-out error"))
     assert "mean of 3 of 4 sessions" in foresight
     told = shaken.verdict.sentences[-1]
     assert told.startswith("Of 4 sessions to be predicted from the others, 3 were and 1 was not")

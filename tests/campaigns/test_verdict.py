@@ -132,7 +132,7 @@ def test_nothing_is_1_that_excludes_1(estimates_of, alpha, rival, status):
     assert order.status == status
     assert order.value == pytest.approx(alpha)
     assert order.interval[0] < alpha < order.interval[1]
-    assert ("1 would do" in sentences.order(order)) == (status == "compatible")
+    assert ("consistent with 1" in sentences.order(order)) == (status == "compatible")
 
 
 def test_the_numbers_are_the_freest_structure_s_whatever_bic_selects(estimates_of, make_session):
@@ -210,7 +210,7 @@ def test_a_session_that_dismisses_what_all_select_is_named(make_session, estimat
 
 def test_words_about_scatter_and_misfit(estimates_of):
     (best,) = ranked(estimates_of("VI", 100.0))
-    assert "they repeat" in sentences.scatter(best)
+    assert "No between-session variance" in sentences.scatter(best)
     shaken = replace(best, parameters=(replace(best.parameters[0], chance=1e-4),))
     assert "differ by more than their own uncertainties in ζ" in sentences.scatter(shaken)
     assert "no structure tried" in sentences.left_over(replace(best, misfit=9.0), 4, 4)

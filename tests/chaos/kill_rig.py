@@ -65,7 +65,7 @@ DIRECT_CHANGES = (
     ("\nvelocity_rad_s = { value = 15.0", "\nvelocity_rad_s = { value = 50.0"),
     ("tracking_error_rad = { value = 0.5", "tracking_error_rad = { value = 1.5"),
 )
-"""Of which a profile without a bus has but some."""
+"""Settings of the profiles; one without a bus has but some of them."""
 REST_S, RING_DOWN_S = 0.2, 0.3
 
 MODULES = {
@@ -106,7 +106,7 @@ OFF_WITHIN_S = {
     **{(victim, how): 1.0 for victim in ("control", "supervisor", "all") for how in _ASKING},
 }
 LOST_S = 0.5
-"""Of a record that may be lost, where only its file tells."""
+"""Time of a record that may be lost, where only its file tells."""
 
 _GRACE_S = 0.2
 """For which a virtual machine stands still now and then; a standstill is not the rig's."""

@@ -27,7 +27,7 @@ def test_the_shipped_loops_are_fine(name):
         "gain margin",
         "phase margin",
         "delay margin",
-        "distance from -1",
+        "modulus margin",
     ]
     assert [row.group for row in rows[1::4]] == [
         "loop, torque command",

@@ -29,7 +29,7 @@ def test_the_worst_row_is_the_verdict():
 
 
 def test_assumed_numbers_are_one_warning_that_names_them(can_profile):
-    found = by_name(profile_rows(can_profile))["numbers assumed"]
+    found = by_name(profile_rows(can_profile))["unverified profile values"]
     assert found.verdict is Verdict.WARNING
     assumed = [key for key, source in can_profile.sources.items() if source == "assumed"]
     assert found.found == f"{len(assumed)} of {len(can_profile.sources)}"

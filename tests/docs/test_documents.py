@@ -10,7 +10,7 @@ DOCUMENTS = sorted(
     [PROJECT / "README.md", PROJECT / "CONTRIBUTING.md", *(PROJECT / "docs").rglob("*.md")]
 )
 TO_BE_MADE = re.compile(r"NAME|sessions/")
-"""Of files that a reader is to make."""
+"""Files that a reader is to make."""
 
 
 def anchors(path):

@@ -31,13 +31,13 @@ MODULES = {"rigd.engine.control_process": "control", "rigd.engine.recorder": "re
 
 _LOOK_S = 0.05
 _ENDLESS_HOURS = 500.0
-"""Of rig time: more than any hour of the clock comes to."""
+"""Rig time: more than any hour of the clock comes to."""
 WARM_UP = 0.2
 """Part of the sessions that is left out: what is imported late, and what a heap settles to."""
 ENOUGH = 100
 """Sessions from which on a trend is judged."""
 FLAT_KB = 2048
-"""Of growth over the whole campaign that is accepted: `rigd run` remembers what came of its
+"""Growth over the whole campaign that is accepted: `rigd run` remembers what came of its
 sessions, some 3 kB each, to tell it at its end."""
 FLAT_DESCRIPTORS = 1
 """Likewise: between two sessions one or two are open that a look in mid-session does not see."""
@@ -60,7 +60,7 @@ class Look:
     """Its own alone: what a leak would add to."""
     descriptors: int
     shared_kb: int
-    """Of shared memory behind its descriptors."""
+    """Shared memory behind its descriptors."""
 
     @classmethod
     def at(cls, pid: int) -> "Look | None":
@@ -115,7 +115,7 @@ class Growth:
 
     @property
     def share(self) -> float:
-        """Of what it was."""
+        """Growth over what it was."""
         return self.last / self.first - 1.0 if self.first else float(self.last > 0.0)
 
     @property
@@ -203,7 +203,7 @@ class Trend:
     slope: float
     """Per session, of the straight line through the medians of blocks."""
     uncertainty: float
-    """Of the slope, one standard deviation."""
+    """Uncertainty of the slope, one standard deviation."""
 
     @classmethod
     def of(cls, values: list[int]) -> "Trend":

@@ -65,7 +65,7 @@ def judge(result: dict[str, object], said: str, *, live: bool) -> Outcome:
     Parameters
     ----------
     result
-        Of the session, from the command's JSON.
+        Result of the session, from the command's JSON.
     said
         What the command wrote for the operator.
     live

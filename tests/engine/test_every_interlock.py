@@ -149,11 +149,11 @@ CASES = {
     ),
     "torque command": Case(
         asks_too_much,
-        r"The torque that the controller asks for of -?0\.0\d+ N·m exceeds .* of 0\.05 N·m",
+        r"The torque command of the controller of -?0\.0\d+ N·m exceeds .* of 0\.05 N·m",
     ),
     "i²t": Case(
         lambda s: motor(s, continuous_torque_nm=0.01, thermal_time_constant_s=0.5),
-        r"The motor's mean torque \(i²t\) of 0\.0\d+ N·m exceeds its limit of 0\.01 N·m",
+        r"The motor's rms torque \(i²t\) of 0\.0\d+ N·m exceeds its limit of 0\.01 N·m",
     ),
     "wrench range": Case(
         lambda s: sensor(s, added=[0.0, -25.0, 0.0, 0.0, 0.0, 0.0]),
@@ -176,11 +176,11 @@ CASES = {
             setattr(s.drive, "stale_at", MIDDLE),
             setattr(s.drive, "stale_pattern", (False, True, True)),
         ),
-        r"The part of ticks without a new angle of 1\.01 % exceeds its limit of 1 %",
+        r"The share of ticks without a new angle of 1\.01 % exceeds its limit of 1 %",
     ),
     "stale wrench share": Case(
         lambda s: sensor(s, stale=True, stale_every=2),
-        r"The part of ticks without a new wrench of 1\.01 % exceeds its limit of 1 %",
+        r"The share of ticks without a new wrench of 1\.01 % exceeds its limit of 1 %",
     ),
     "missed ticks": Case(
         lambda s: miss(s, 80_000_000),
@@ -188,7 +188,7 @@ CASES = {
     ),
     "missed share": Case(
         lambda s: miss(s, *[45_000_000] * 6),
-        r"The part of ticks missed of 2\.\d* % exceeds its limit of 2 %",
+        r"The share of missed ticks of 2\.\d* % exceeds its limit of 2 %",
     ),
     "wired stop": Case(drop_sto, r"Simulated drive: the wired stop \(STO\) was dropped.* reset"),
     "recorder lag": Case(lag, r"The recorder's lag of 1\.\d+ s exceeds its limit of 1 s"),
@@ -283,7 +283,7 @@ def test_a_small_drift_is_a_warning(make_session):
     assert (finished.outcome, finished.reason) == ("complete", "")
     [warning] = [event for event in session.events if event.level == "warning"]
     assert re.match(
-        r"The drift of the .* zero of 0\.00\d+ N·m is past its warning", warning.message
+        r"The drift of the .* zero of 0\.00\d+ N·m is above its warning", warning.message
     )
 
 
@@ -299,7 +299,7 @@ def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(mak
     assert (flagged == near).all()
     warnings = [event for event in session.events if event.level == "warning"]
     assert 1 <= len(warnings) <= 3
-    assert all(re.match(r"The angle of .* is past its warning level", w.message) for w in warnings)
+    assert all(re.match(r"The angle of .* is above its warning level", w.message) for w in warnings)
 
 
 def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session):

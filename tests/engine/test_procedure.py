@@ -236,7 +236,7 @@ def test_single_stale_angles_are_held_and_flagged(make_session):
     assert session.board[Word.STALE_ANGLES] == len(stale)
     # Six per cent of ten seconds, of which there may be ten: said once, and past the half of it.
     [warning] = [event.message for event in session.events if event.level == "warning"]
-    assert warning.startswith("The part of ticks without a new angle of 5 %")
+    assert warning.startswith("The share of ticks without a new angle of 5 %")
     assert "its limit is 10 % (limits.stale_percent)" in warning
 
 

@@ -64,7 +64,7 @@ MAT_HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D
 
 @pytest.mark.parametrize("dims", [(1, 2**28), (1, 1000)])
 def test_two_gigabytes_in_two_megabytes(tmp_path, dims):
-    """Of zeros, compressed; the dimensions say so, or do not."""
+    """Zeros, compressed; the dimensions say so, or do not."""
     size = 2**31
     body = mat_element(dims, size, b"")
     packer = zlib.compressobj(9)

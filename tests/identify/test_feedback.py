@@ -23,7 +23,7 @@ def fit(measurement, name):
 
 @cache
 def answers(n, damping):
-    """Of motor (2e-3 kg m², loop of 80 rad/s, one tick late) and beam to a torque, in Laplace."""
+    """Answers of beam and motor (2e-3 kg m², 80 rad/s, one tick late) to a torque, in Laplace."""
     s = 5 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
     turned = 500 * s * (s + 310) / (s + 80) ** 4 * np.exp(-s / RATE_HZ)
     return turned, turned * (transfer(s, LINK, damping) + CLAMP * s**2)

@@ -283,7 +283,7 @@ def test_no_descent_from_elsewhere_ends_lower(sessions, name):
 
 
 def test_a_wrong_structure_takes_few_evaluations(sessions, monkeypatch):
-    """Of the whole record; with straight Gauss-Newton steps types IV and V took 50 to 100."""
+    """By the whole record; with straight Gauss-Newton steps types IV and V took 50 to 100."""
     asked = []
     linearise = Objective._linearise
     monkeypatch.setattr(

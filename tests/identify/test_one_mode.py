@@ -1,6 +1,6 @@
 """A blade of one mode, as vibration laboratories record it: its damping does not go with the band.
 
-Of such a record the reaction is what a beam has at its first mode, plus a share of its quasi-static
+The reaction in such a record is what a beam has at its first mode, plus a share of its quasi-static
 response that no beam has: other modes and the fixture.
 """
 

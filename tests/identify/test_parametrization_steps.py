@@ -22,7 +22,7 @@ orders = st.floats(0.01, 1.99)
 
 
 def phases(x):
-    """Of the stiffness with its damping, and of the inertia with its own."""
+    """Phases of the stiffness with its damping, and of the inertia with its own."""
     found = []
     for loss, order, turn in ((x[0], x[1], 1), (x[2], x[3], -1)):
         angle = math.pi / 2 * order

@@ -12,7 +12,7 @@ from analysis.identify._residual_tests import (
 
 BINS = 4000
 HZ = np.arange(1, BINS + 1) / 80
-"""Of a record of 80 s, to 50 Hz."""
+"""Bins of a record of 80 s, to 50 Hz."""
 
 
 def noise(seed, count=BINS):

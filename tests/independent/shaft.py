@@ -15,7 +15,7 @@ class Shaft:
     viscous_nm_s_per_rad: float = 0.02
     coulomb_nm: float = 0.03
     rigid_kg_m2: float = 4.3e-5
-    """Of the beam, without the mode: 3 % of rho L³ / 3 for 4.7 g/m and 0.98 m."""
+    """Inertia of the beam, without the mode: 3 % of rho L³ / 3 for 4.7 g/m and 0.98 m."""
     mode_kg_m2: float = 1.43e-3
     mode_rad_s: float = 16.0
     """First eigenfrequency with the hub held."""

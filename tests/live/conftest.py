@@ -179,7 +179,7 @@ class Publisher:
 
     @property
     def server_pid(self) -> int:
-        """Of the server; there must be one."""
+        """Process id of the server; there must be one."""
         (pid,) = children(self.process.pid)
         return pid
 

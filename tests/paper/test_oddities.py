@@ -87,7 +87,7 @@ def paper_route(h1, link, names):
 
 @pytest.fixture(scope="module")
 def found(session, link):
-    """Of a beam whose internal damping is of order 1, and whose modes are not a uniform one's."""
+    """Fit to a beam of internal damping of order 1, whose modes are not a uniform one's."""
     h1 = session(INTEGER, offsets=NOT_UNIFORM).h1(noise_nm=1e-2, seed=1)
     return paper_route(h1, link, ["I", "III", "IV", "VI"])
 

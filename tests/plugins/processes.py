@@ -99,7 +99,7 @@ class Socket(NamedTuple):
 
     @property
     def addresses(self) -> tuple[str, str]:
-        """Of both ends, without ports."""
+        """Addresses of both ends, without ports."""
         return self.local.partition(":")[0], self.remote.partition(":")[0]
 
 

@@ -364,7 +364,7 @@ class Outcome:
     code: int
     megabytes: float
     seconds: float
-    """Of a processor."""
+    """Processor time."""
     printed: int
     words: str
     """The end of what was printed."""

@@ -59,7 +59,7 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert len(of_paper) == 12
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
     assert (best["type"], best["weighting"]) == ("VI", "omega")
-    for word in ("verdict", "Fits", "Resonant peaks", "Modes of", "session.report", "fits.json"):
+    for word in ("verdict", "Fits", "Resonant peaks", "Modes with", "session.report", "fits.json"):
         assert word in result.stdout
     assert (report / "tables.txt").read_text().splitlines()[0] in result.stdout
     # Welch's windows bias the damping by a third; the whole record tells the plant's.

@@ -14,7 +14,7 @@ from rigd.runner._request import load_rig
 
 @pytest.fixture
 def profile(write_profile):
-    """Of a name that nobody else on this computer simulates."""
+    """A profile of a name that nobody else on this computer simulates."""
     return write_profile("antenna_can", {"name": f'"out_of_reach_{os.getpid()}"'})
 
 

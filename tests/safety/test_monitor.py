@@ -137,10 +137,10 @@ def test_heat_lag_and_disk_mark_the_samples_until_they_are_well_again(watch):
     assert watch.check(0.0, 0.0, REST) is None
     assert watch.warning
     lag, disk = watch.take_notices()
-    assert "recorder's lag of 7.2 s is past its warning level of 6 s; its limit is 12 s" in lag
+    assert "recorder's lag of 7.2 s is above its warning level of 6 s; its limit is 12 s" in lag
     assert (
-        "free space of the session's disk of 400 MB is past its warning level of 500 MB; its limit "
-        "is 50 MB" in disk
+        "free space of the session's disk of 400 MB is below its warning level of 500 MB; its "
+        "limit is 50 MB" in disk
     )
 
 
@@ -175,7 +175,7 @@ def test_missed_ticks_near_their_limit_mark_the_next_sample(watch):
     assert not watch.warning
     [notice] = watch.take_notices()
     assert notice.startswith(
-        "The run of missed ticks of 22 ticks is past its warning level of 20 ticks; its limit is "
+        "The run of missed ticks of 22 ticks is above its warning level of 20 ticks; its limit is "
         "25 ticks"
     )
 
@@ -192,7 +192,7 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
     assert not watch.warning
     angle, wrench = watch.take_notices()
     assert angle == (
-        "The part of ticks without a new angle of 0.51 % is past its warning level of 0.5 %; its "
+        "The share of ticks without a new angle of 0.51 % is above its warning level of 0.5 %; its "
         "limit is 1 % (limits.stale_percent)."
     )
     assert "new wrench of 0.6 %" in wrench
@@ -202,7 +202,7 @@ def test_many_old_readings_near_their_limit_mark_the_next_sample(watch):
 def test_too_many_old_readings_end_a_session(watch, angles, wrenches, which):
     assert watch.check_stale_share(100, 100, 10_000) is None
     violation = watch.check_stale_share(angles, wrenches, 5)  # as if ten seconds had passed
-    assert violation.channel == f"part of ticks without a new {which}"
+    assert violation.channel == f"share of ticks without a new {which}"
     assert (violation.value, violation.limit) == (pytest.approx(1.01), 1.0)
     assert watch.check_stale_share(400, 400, 40_000) is None
 

@@ -93,7 +93,7 @@ def test_the_factor_stands_in_the_title_and_at_the_tip(samples, follow):
     [(0.0, "± 0.0 mm"), (0.00123, "± 1.2 mm"), (0.0456, "± 46 mm"), (0.3519, "± 350 mm")],
 )
 def test_label(tip_m, text):
-    assert antenna.label(tip_m) == f"tip bends {text}, drawn × {FACTOR:g}"
+    assert antenna.label(tip_m) == f"tip deflection {text}, drawn × {FACTOR:g}"
 
 
 def test_the_label_tells_the_largest_deflection_of_late(subject, samples, follow):

@@ -23,7 +23,7 @@ def test_a_session_that_goes_well(subject):
         "missed ticks": "0",
         "late ticks": "0",
         "lost ticks": "0",
-        "waiting for the recorder": "17 samples",
+        "recorder backlog": "17 samples",
         "not shown here": "0 samples",
         "bus load": "31 %",
         "bus errors": "0",

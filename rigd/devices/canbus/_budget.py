@@ -129,11 +129,13 @@ class BusLoad:
     """All recurring frames of a bus, and the part of its time that they take."""
 
     traffic: tuple[Traffic, ...]
+    """The frames."""
     plain: float
     """Part of the time, 0 to 1 and beyond, if no bit had to be stuffed."""
     worst: float
     """Load with as many stuffed bits as there can be."""
     frames_per_s: float
+    """Frames a second, all together."""
 
 
 def frame_bits(length: int) -> int:
@@ -178,6 +180,14 @@ def bus_load(rig: RigParameters) -> BusLoad:
     ------
     ValueError
         If the rig has no CAN bus.
+
+    Examples
+    --------
+    >>> from rigd.devices.canbus import bus_load
+    >>> from rigd.profile import load_profile
+    >>> load = bus_load(load_profile("antenna_can").rig)
+    >>> print(f"{load.frames_per_s:.0f} frames a second, {load.worst:.0%} of the bus at worst")
+    6150 frames a second, 60% of the bus at worst
     """
     if rig.can is None:
         raise ValueError("The rig has no CAN bus.")

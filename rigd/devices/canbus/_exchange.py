@@ -197,6 +197,13 @@ class CanExchange:
     def subscribe(self, can_id: int, handler: Handler) -> None:
         """Have a handler called with the data of each frame of this identifier.
 
+        Parameters
+        ----------
+        can_id
+            Identifier of 11 bits.
+        handler
+            Called with the data bytes.
+
         Raises
         ------
         DeviceError
@@ -264,6 +271,13 @@ class CanExchange:
 
     def wait_until(self, ready: Callable[[], bool], deadline_ns: int) -> bool:
         """Deliver frames until `ready` says yes, or until a time of ``time.monotonic_ns``.
+
+        Parameters
+        ----------
+        ready
+            Asked after every frame.
+        deadline_ns
+            Time of ``time.monotonic_ns``.
 
         Returns
         -------

@@ -49,10 +49,24 @@ read_head = Struct("=IB").unpack_from
 def pack_frame(can_id: int, data: bytes = b"") -> bytes:
     """Return the 16 bytes of a frame.
 
+    Parameters
+    ----------
+    can_id
+        Identifier of 11 bits.
+    data
+        At most eight bytes.
+
     Raises
     ------
     ValueError
         If the identifier has more than 11 bits, or there are more than eight bytes.
+
+    Examples
+    --------
+    >>> from rigd.devices.canbus import pack_frame, unpack_frame
+    >>> raw = pack_frame(0x181, b"rigd")
+    >>> len(raw), unpack_frame(raw)
+    (16, (385, b'rigd'))
     """
     if not 0 <= can_id <= SFF_MASK:
         raise ValueError(f"{can_id:#x} is no CAN identifier of 11 bits.")
@@ -307,6 +321,13 @@ def _words(error: Exception) -> str:
 
 def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
     """Open the bus that a profile names, or the one of the simulated rig that stands in for it.
+
+    Parameters
+    ----------
+    settings
+        The profile's ``[can]``.
+    simulator
+        Simulated rig that stands in; None: the bus itself.
 
     Raises
     ------

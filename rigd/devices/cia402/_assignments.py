@@ -52,6 +52,11 @@ class Assignment:
 def parse_assignment(text: str) -> Assignment:
     """Return what a text of ``cia402.set_objects`` says.
 
+    Parameters
+    ----------
+    text
+        ``index:sub type value``; index and sub-index in hexadecimal digits.
+
     Raises
     ------
     ValueError

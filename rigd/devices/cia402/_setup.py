@@ -71,7 +71,13 @@ class Outfit:
     assigned: tuple[str, ...]
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the drive has an object of the table."""
+        """Whether the drive has an object of the table.
+
+        Parameters
+        ----------
+        index, sub
+            Index and sub-index of the object.
+        """
         return requirement(index, sub) not in self.lacks
 
     @property

@@ -47,8 +47,11 @@ class Finding:
     what: str
     """``6072 Max torque``, or in words."""
     found: str
+    """What the file states."""
     wanted: str
+    """What rigd needs; empty: nothing certain."""
     grade: Grade
+    """What that means for the drive."""
     sentence: str = ""
     """What follows from a refusal or doubt, and the remedy, for the operator."""
     accept: str = ""

@@ -136,6 +136,12 @@ def parse_fault(spec: str) -> Fault:
     ------
     FaultError
         Naming the word that is wrong and what may stand in its place.
+
+    Examples
+    --------
+    >>> from rigd.sim.wire import parse_fault
+    >>> parse_fault("drop,from=drive,frames=3@10").kind
+    'drop'
     """
     body, at, time = spec.partition("@")
     kind, *words = (word.strip() for word in body.split(","))

@@ -225,6 +225,7 @@ class SimulatorOptions:
     log: Path | None = None
     """File of JSON lines, one an event; a new one."""
     faults: tuple[Fault, ...] = ()
+    """Faults to inject."""
     quiet: bool = False
     """Tell nothing on the terminal."""
     eds: Path | None = None
@@ -249,6 +250,13 @@ def check_on_wire(rig: RigParameters) -> None:
 
 def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
     """Run the simulated rig that stands in for a profile's, until a signal ends it.
+
+    Parameters
+    ----------
+    rig
+        Parameters of the rig.
+    options
+        How it is simulated, and what it tells.
 
     Returns
     -------
@@ -282,6 +290,13 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
 
 def inject(rig_name: str, specs: list[str]) -> list[str]:
     """Inject faults into the running simulated rig of a profile.
+
+    Parameters
+    ----------
+    rig_name
+        Name of the profile.
+    specs
+        Faults, as for `parse_fault`.
 
     Returns
     -------

@@ -93,7 +93,7 @@ def test_the_simulated_bus_brings_everything(ends):
 
 
 class RecordingLink:
-    """Of a kernel with CAN: takes the options, and every frame with an error of choice."""
+    """Link of a kernel with CAN: takes the options, and every frame with an error of choice."""
 
     family = getattr(socket, "AF_CAN", 29)
 

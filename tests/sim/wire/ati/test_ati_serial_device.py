@@ -272,7 +272,7 @@ def test_the_records_of_a_period_are_its_readings_oldest_first(serial_host, load
 
 
 def serial_host_calibration(host):
-    """Of a host that streams: stopped for it, and started again."""
+    """Calibration as read by a host that streams: stopped for it, and started again."""
     host.tell(JAM)
     calibration = host.calibration(2)
     assert host.tell(START) == STARTED

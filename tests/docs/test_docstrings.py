@@ -1,0 +1,154 @@
+"""Docstrings: what a door offers is described to the last argument, and the examples run.
+
+What has to be described are the arguments of functions, of classes and of their public methods,
+and the fields of dataclasses, by these names and no others. A function or a method of one argument
+may do without a section: its summary is about it.
+"""
+
+import ast
+import dataclasses
+import doctest
+import importlib
+import inspect
+import re
+import shutil
+import textwrap
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parents[2]
+SOURCES = sorted(path for room in ("rigd", "analysis") for path in (PROJECT / room).rglob("*.py"))
+DOORS = sorted(path for room in ("rigd", "analysis") for path in (PROJECT / room).rglob("*.pyi"))
+PUBLIC = [
+    path
+    for path in SOURCES
+    # The options of commands have their help.
+    if not path.name.startswith("_") and path.parent.name != "cli"
+]
+
+
+def name_of(path):
+    """Dotted name of a module or of a folder's door."""
+    return ".".join(path.relative_to(PROJECT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def offered(path):
+    """Functions and classes that a door offers, or that a public module defines."""
+    module = importlib.import_module(name_of(path))
+    if path.suffix == ".pyi":
+        names = [each.name for node in ast.parse(path.read_text()).body for each in node.names]
+        things = [getattr(module, name) for name in names]
+    else:
+        things = [
+            thing
+            for name, thing in vars(module).items()
+            if not name.startswith("_") and getattr(thing, "__module__", "") == module.__name__
+        ]
+    return [thing for thing in things if inspect.isfunction(thing) or inspect.isclass(thing)]
+
+
+def described(text, title):
+    """Names that a section of a numpydoc docstring describes."""
+    section = re.search(
+        rf"^{title}\n-+\n(.*?)(?=^\w[^\n]*\n---|\Z)", text, re.DOTALL | re.MULTILINE
+    )
+    entries = re.findall(r"^\S.*", section[1], re.MULTILINE) if section else []
+    return [name.strip(" *") for entry in entries for name in entry.split(" : ")[0].split(",")]
+
+
+def with_string(cls):
+    """Fields of a dataclass that a string stands under."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+    return [
+        field.target.id
+        for field, below in pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(below, ast.Expr)
+        and isinstance(below.value, ast.Constant)
+    ]
+
+
+def complaints_on_function(function, text, *, may_be_in_summary=True):
+    arguments = [each for each in inspect.signature(function).parameters if each != "self"]
+    found = described(text, "Parameters")
+    if found or not may_be_in_summary or len(arguments) > 1:
+        yield from (f"{each} is not described" for each in arguments if each not in found)
+        yield from (f"there is no {each}" for each in found if each not in arguments)
+
+
+def complaints_on_class(cls):
+    text = inspect.cleandoc(vars(cls)["__doc__"])
+    if dataclasses.is_dataclass(cls):
+        found = described(text, "Attributes")
+        own = [each.name for each in dataclasses.fields(cls) if each.name in cls.__annotations__]
+        missing = set(own) - {*found, *with_string(cls)}
+        yield from (f"{each} is not described" for each in missing)
+        yield from (f"there is no {each}" for each in found if not hasattr(cls, each))
+    elif "__init__" in vars(cls) and not getattr(cls, "_is_protocol", False):
+        yield from complaints_on_function(cls.__init__, text, may_be_in_summary=False)
+    for name in vars(cls):
+        method = getattr(cls, name)
+        if not name.startswith("_") and inspect.isroutine(method):
+            for each in complaints_on_function(method, inspect.getdoc(method)):
+                yield f"{name}: {each}"
+
+
+@pytest.mark.parametrize("path", [*DOORS, *PUBLIC], ids=name_of)
+def test_every_argument_and_field_is_described_by_its_name(path):
+    found = [
+        f"{thing.__module__}.{thing.__name__}: {complaint}"
+        for thing in offered(path)
+        for complaint in (
+            complaints_on_class(thing)
+            if inspect.isclass(thing)
+            else complaints_on_function(thing, inspect.getdoc(thing))
+        )
+    ]
+    assert not found
+
+
+@pytest.mark.parametrize(
+    ("text", "complaints"),
+    [
+        ("Sum.\n\nParameters\n----------\na, b : int\n    Numbers.", []),
+        (
+            "Sum.\n\nParameters\n----------\na\n    One.\n\nReturns\n-------\nb",
+            ["b is not described"],
+        ),
+        ("Sum.\n\nParameters\n----------\na, b, c\n    Numbers.", ["there is no c"]),
+        ("Sum of `a` and `b`.", ["a is not described", "b is not described"]),
+    ],
+)
+def test_the_check_finds_what_is_missing(text, complaints):
+    assert list(complaints_on_function(lambda a, b: a + b, text)) == complaints
+
+
+def test_descriptions_name_the_thing():
+    """Not "Of the copy.", but "Name of the copy."."""
+    found = {
+        name_of(path): lines
+        for path in SOURCES
+        if (lines := re.findall(r'^ *(?:""")?Of .*', path.read_text("utf-8"), re.MULTILINE))
+    }
+    assert not found
+
+
+EXAMPLES = [path for path in SOURCES if ">>> " in path.read_text("utf-8")]
+
+
+@pytest.fixture
+def folder_of_examples(short_chirps, tmp_path, monkeypatch):
+    """Have the files that examples name in the working folder."""
+    shutil.copy(short_chirps[0], tmp_path / "session.mcap")
+    shutil.copy(PROJECT / "hw_profiles" / "sim.toml", tmp_path / "rig.toml")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("folder_of_examples")
+@pytest.mark.parametrize("path", EXAMPLES, ids=name_of)
+def test_examples_give_what_they_say(path):
+    failed, tried = doctest.testmod(importlib.import_module(name_of(path)))
+    assert tried
+    assert not failed
