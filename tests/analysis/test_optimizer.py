@@ -124,7 +124,9 @@ def test_large_residuals_are_descended_in_fewer_steps_than_gauss_newtons():
         return np.concatenate((j.real, j.imag), axis=1).T
 
     rough = descend(misfit, np.array([0.4, 2.3]), FREE, relative_tolerance=1e-3)
-    plain = scipy.optimize.least_squares(stacked, rough.x, slopes_of, xtol=1e-15, ftol=1e-14, gtol=1e-15)
+    plain = scipy.optimize.least_squares(
+        stacked, rough.x, slopes_of, xtol=1e-15, ftol=1e-14, gtol=1e-15
+    )
     near = descend(misfit, rough.x, FREE, relative_tolerance=1e-14, second_part=np.zeros((2, 2)))
     assert near.cost > 1.0
     assert near.cost <= 2 * plain.cost * (1 + 1e-13)
