@@ -418,7 +418,15 @@ class DampingUnknowns:
 
     @classmethod
     def of(cls, structure: Structure, beam: Beam) -> DampingUnknowns:
-        """Take the beam's own modes as the frequencies at which damping is measured."""
+        """Take the beam's own modes as the frequencies at which damping is measured.
+
+        Parameters
+        ----------
+        structure : Structure
+            Says which parameters are free.
+        beam : Beam
+            Beam whose first two undamped modes are taken.
+        """
         first, second = (float(w) for w in undamped_frequencies_rad_s(beam, 2))
         return cls(
             structure=structure,

@@ -59,7 +59,15 @@ class NormalEquations:
     def held(
         self, x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Whether the cost pushes an unknown against a bound that it rests on, shape (k,)."""
+        """Whether the cost pushes an unknown against a bound that it rests on, shape (k,).
+
+        Parameters
+        ----------
+        x : ndarray, shape (k,)
+            Point at which these equations were formed.
+        lower, upper : ndarray, shape (k,)
+            Bounds of the unknowns.
+        """
         return ((x <= lower) & (self.gradient > 0)) | ((x >= upper) & (self.gradient < 0))
 
 
@@ -125,6 +133,7 @@ class Box:
     lower: NDArray[np.float64]
     """Least values, shape (k,)."""
     upper: NDArray[np.float64]
+    """Largest values, shape (k,)."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Least and largest step: any, cut off by `end`."""

@@ -195,7 +195,10 @@ def import_command(
 
 @export_app.command("record", epilog=_EXPORT_EPILOG)
 def export_record_command(session: _Session, target: _Target, binary: _Binary = False) -> None:
-    """Write the samples as recorded: time, angles, torques, wrench, status bits."""
+    """Write the samples as recorded.
+
+    Written are time, angles, torques, wrench and status bits.
+    """
     from analysis.exchange import export_record
 
     def run() -> None:
@@ -216,7 +219,10 @@ def export_frf_command(
     overlap: Overlap = None,
     nfft: Nfft = None,
 ) -> None:
-    """Write the frequency response from angle to coupling torque, as an analysis estimates it."""
+    """Write the estimated frequency response.
+
+    The response is from angle to coupling torque, estimated as in an analysis.
+    """
     from analysis.exchange import export_frf
 
     settings = welch_settings("I", "const", frf, segment, overlap, nfft)

@@ -618,7 +618,7 @@ class Objective:
         objective : Objective
             With the unknown torques as they were put last; `self` if all are known.
         minimum : Minimum
-            Of that.
+            Minimum of that objective.
         """
         x = start
         for _ in range(_FILLINGS):

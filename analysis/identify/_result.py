@@ -183,7 +183,17 @@ class RecordAnalysis:
 
     @classmethod
     def of(cls, fits: Iterable[RecordFit], noise: Noise, comparison: Comparison) -> RecordAnalysis:
-        """Put together fits to one comparison under one noise."""
+        """Put together fits to one comparison under one noise.
+
+        Parameters
+        ----------
+        fits : iterable of RecordFit
+            Fits in the order asked for.
+        noise : Noise
+            Noise under which all of them were made.
+        comparison : Comparison
+            Record and band that all of them were compared with.
+        """
         return cls(
             fits=tuple(fits),
             frequency_hz=comparison.frequency_hz,

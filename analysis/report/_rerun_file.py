@@ -68,7 +68,7 @@ _MORE_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
 _MOST_IN_WORDS: Final = 2
 """Models whose keys on a narrow chart say that what they name are weights."""
 _GROUPS: Final = 400
-"""Of points along the axis, two kept of each: enough for the pixels of a view."""
+"""Groups of points along the axis, two kept per group: enough for the pixels of a view."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,7 +113,7 @@ _SYMBOLS: Final = {
 def damping_sentences(told: Headline) -> tuple[str, ...]:
     """Say how the modes are damped, and by which internal and external damping.
 
-    Of modes that the record does not show nothing is said, nor of any where no number is the
+    Nothing is said about modes that the record does not show, nor about any where no number is the
     antenna's. Where part of the record is unexplained the numbers are named as what they would be,
     without intervals.
 

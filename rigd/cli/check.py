@@ -137,12 +137,13 @@ def bench(
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the wake-up latency of the loop on this computer, and the highest rate it can hold.
+    """Test the real-time performance of this computer.
 
-    Runs the loop of a session with everything simulated; no hardware is touched. It runs in turn
-    with cyclictest (package rt-tests, if installed), then with the recorder, the live view and a
-    busy program on the other cores, then at higher rates. Only the real-time settings of the
-    profile are used. Takes about three minutes; do not use the computer meanwhile.
+    Measures the wake-up latency of the loop, and the highest rate that this computer can hold. Runs
+    the loop of a session with everything simulated; no hardware is touched. It runs in turn with
+    cyclictest (package rt-tests, if installed), then with the recorder, the live view and a busy
+    program on the other cores, then at higher rates. Only the real-time settings of the profile are
+    used. Takes about three minutes; do not use the computer meanwhile.
 
     Example: rigd bench --seconds 10
     """

@@ -48,7 +48,9 @@ def serve(
     fast: Fast = False,
     hardware: Hardware = False,
 ) -> None:
-    """Run the rig daemon, which runs sessions for rigd start; Ctrl-C or SIGTERM ends it safely.
+    """Run the rig daemon; Ctrl-C or SIGTERM ends it safely.
+
+    The daemon runs the sessions of rigd start.
 
     Example: rigd serve --profile antenna_can --output /data/sessions
     """
@@ -191,7 +193,9 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
-    """Set the zero of the angle, from which limits count, where the motor stands. No torque.
+    """Set the zero of the angle where the motor stands.
+
+    The limits count from this zero. The torque stays off.
 
     Example: rigd zero
     """

@@ -72,7 +72,9 @@ def motor(
     hardware: Hardware = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure inertia, friction, torque constant and delay of the motor, with uncertainties.
+    """Measure the motor's inertia, friction, torque constant and delay.
+
+    Each value comes with its uncertainty.
 
     Three sessions of 25, 60 and 75 s: the shaft goes to and fro at constant speed, with a small
     multisine on it, with a larger one, then at four speeds. The first only serves to design the

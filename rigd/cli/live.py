@@ -76,10 +76,11 @@ def live(
         bool, typer.Option("--wait", help="Wait for a live view if none is running.")
     ] = False,
 ) -> None:
-    """Open the live view of a rig in a window; it stays open from session to session.
+    """Open the live view of a rig in a window.
 
-    Shows the sessions of rigd run … --live, and of a daemon that was started with
-    rigd serve … --live. docs/live_view.md describes the view from another computer.
+    The window stays open from session to session. It shows the sessions of rigd run … --live, and
+    of a daemon that was started with rigd serve … --live. docs/live_view.md describes the view from
+    another computer.
 
     Example: rigd live --profile antenna_can
     """
@@ -225,9 +226,10 @@ def replay(
         ),
     ] = None,
 ) -> None:
-    """Show a recorded session in the layout of the live view, played from its start.
+    """Show a recorded session in the layout of the live view.
 
-    docs/opening_sessions.md lists other programs that open session files.
+    The session is played from its start. docs/opening_sessions.md lists other programs that open
+    session files.
 
     Example: rigd replay sessions/20261120-101500-chirp.mcap
     """

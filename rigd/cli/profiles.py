@@ -29,11 +29,12 @@ profiles_app = typer.Typer(
 
 @profiles_app.callback()
 def profiles(context: typer.Context) -> None:
-    """List, show and copy the hardware profiles, or write a new one from a drive's EDS file.
+    """List, show and copy hardware profiles, or write a new one.
 
-    A name is looked for in hw_profiles of the working folder, then in the per-user folder
-    ($XDG_CONFIG_HOME/rigd/profiles, by default ~/.config/rigd/profiles), then among those that
-    came with the program. Without a command, the profiles are listed.
+    A new one is written from a drive's EDS file. A name is looked for in hw_profiles of the working
+    folder, then in the per-user folder ($XDG_CONFIG_HOME/rigd/profiles, by default
+    ~/.config/rigd/profiles), then among those that came with the program. Without a command, the
+    profiles are listed.
 
     Example: rigd profiles, then rigd profiles copy sim my_rig
     """
@@ -43,7 +44,9 @@ def profiles(context: typer.Context) -> None:
 
 @profiles_app.command("list")
 def list_profiles() -> None:
-    """List the profiles that --profile takes by name: where each is, and which others it hides.
+    """List the profiles that --profile takes by name.
+
+    The list says where each one is, and which others it hides.
 
     Example: rigd profiles list
     """
@@ -122,12 +125,12 @@ def new(
         typer.Option("--from", help="Profile to start from, with a CiA 402 drive."),
     ] = "antenna_can",
 ) -> None:
-    """Write a profile for a drive, from its EDS file and from answers on the terminal.
+    """Write a profile for a drive from its EDS file and from answers.
 
     Identity, bit rate and what follows from missing objects come from the file. Node id, gear and
-    motor are asked for; Enter keeps the value shown, which stays "assumed". What the drive lacks is
-    accepted only by a yes. Without a terminal nothing is asked or accepted, and what has to be
-    filled in is listed. No file is ever overwritten.
+    motor are asked for on the terminal; Enter keeps the value shown, which stays "assumed". What
+    the drive lacks is accepted only by a yes. Without a terminal nothing is asked or accepted, and
+    what has to be filled in is listed. No file is ever overwritten.
 
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """

@@ -47,7 +47,7 @@ run_app = typer.Typer(
 )
 start_app = typer.Typer(
     name="start",
-    help="Run one or more sessions on the daemon; Ctrl-C stops them safely.\n\n"
+    help="Run one or more sessions on the daemon; Ctrl-C stops safely.\n\n"
     "Example: rigd start chirp --repeat 20",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -216,7 +216,9 @@ def multisine(
         int, typer.Option("--phase-seed", min=0, help="Seed of the random phases.")
     ] = 0,
 ) -> "dict[str, Value]":
-    """Excite with equal sines of random phase; the amplitude is the peak of their sum.
+    """Excite with equal sines of random phase.
+
+    The amplitude is the peak of their sum.
 
     Example: rigd run multisine --amplitude 0.01 --period 20
     """
@@ -276,7 +278,9 @@ def modes(
         float, typer.Option("--taper", help="Fade-in and fade-out time of each sweep (s).")
     ] = 1.0,
 ) -> "dict[str, Value]":
-    """Sweep narrow bands around the modes of an analysis, for smaller uncertainties.
+    """Sweep narrow bands around the modes of an analysis.
+
+    The damping parameters become less uncertain than with a broad sweep of the same length.
 
     Example: rigd run modes fits.json --repeat 5
     """

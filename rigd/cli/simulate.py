@@ -61,10 +61,11 @@ def inject(
         list[str] | None, typer.Argument(metavar="[SPEC]...", help="Faults, as above.")
     ] = None,
 ) -> None:
-    """Inject faults into a running simulated rig; without any, show its status.
+    """Inject faults into a running simulated rig.
 
-    A fault happens at once, or with @SECONDS that long after the drive was first enabled. It lasts
-    for the time of for=, else until `end`. Times are those of the simulated rig.
+    Without a fault, the status of the rig is shown. A fault happens at once, or with @SECONDS that
+    long after the drive was first enabled. It lasts for the time of for=, else until `end`. Times
+    are those of the simulated rig.
 
     \b
     drop,from=drive|sensor|host[,id=0x181][,frames=3]  the next frames are lost

@@ -26,7 +26,15 @@ class UnknownGroupError(UserError):
 
 
 def socket_path(rig: str, folder: Path | None = None) -> Path:
-    """Return the socket of a rig's daemon, in the user's runtime folder unless told otherwise."""
+    """Return the path of the socket of a rig's daemon.
+
+    Parameters
+    ----------
+    rig
+        Name of the rig's profile.
+    folder
+        Folder of the socket; None: the user's runtime folder.
+    """
     return (folder or runtime_folder()) / f"{file_name(rig)}{_SUFFIX}"
 
 

@@ -66,7 +66,16 @@ class DaemonGoneError(FailureError):
 
 
 class RefusedByDaemonError(RigdError):
-    """The daemon refuses a request, or it failed; the message is the daemon's."""
+    """The daemon refuses a request, or it failed; the message is the daemon's.
+
+    Parameters
+    ----------
+    message
+        Reason that the daemon gives, for the operator.
+    wrong_use
+        The request itself has to be another (exit code 2); otherwise the same one may succeed
+        later.
+    """
 
     def __init__(self, message: str, *, wrong_use: bool) -> None:
         super().__init__(message)

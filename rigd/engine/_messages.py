@@ -44,9 +44,11 @@ class ControlJob:
     """The rig to attend to."""
 
     profile: "Profile"
+    """Profile whose devices are connected."""
     moving: "Reality | None"
     """What the operator was told would move, and nothing else may; None: nothing was told."""
     channels: "ChannelSpecs"
+    """Shared memory of the rig's processes."""
     fast: bool
     """Run under the virtual clock."""
 
@@ -78,11 +80,13 @@ class Connected:
     """The devices are connected, and the torque is off."""
 
     calibration: Mapping[str, Any]
+    """Identity and calibration as read from the sensor, for the file."""
     drive: Mapping[str, str]
     """What the drive states of itself, for the file."""
     realtime: Mapping[str, str]
     """The real-time settings that were granted, for the file."""
     simulated: bool
+    """The devices are simulated: no motor moves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +102,13 @@ class Finished:
     """A session has ended, and the torque is off."""
 
     outcome: str
+    """Outcome of the record: ``complete``, ``stopped`` or ``fault``."""
     reason: str
+    """Why the session ended early, or what failed after the record; empty if neither."""
     fault: bool
     """Something failed, in the record or after it."""
     counts: Mapping[str, int]
+    """Numbers of ticks: scheduled, missed, late, lost, and those with stale readings."""
     results: Mapping[str, str] = field(default_factory=dict)
     """Results for the record's outcome, in addition to the counts."""
     device_failed: bool = False
@@ -113,13 +120,15 @@ class Measured:
     """What was measured between sessions."""
 
     values: dict[str, Any]
+    """Results by name, as :meth:`rigd.runner.Rig.tare` and :meth:`rigd.runner.Rig.zero` return."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """Why it could not be measured."""
+    """It could not be measured."""
 
     reason: str
+    """What prevented it, such as a motor that moves; a sentence for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +147,9 @@ class RecorderJob:
     """The file to write."""
 
     path: Path
+    """Path of the session file; one that exists is not overwritten."""
     channels: "ChannelSpecs"
+    """Shared memory of the rig's processes."""
     realtime: "RealtimeSettings | None" = None
     """What it may ask of the scheduler; None: nothing, for it is not in real time."""
 
@@ -148,8 +159,11 @@ class FileHeader:
     """What stands in the file before its first sample."""
 
     metadata: Mapping[str, str]
+    """Metadata ``session`` of docs/session_format.md."""
     segments: Mapping[str, tuple[int, int]]
+    """First tick of each segment, and the tick after its last, by the segment's name."""
     attachments: Mapping[str, str]
+    """Texts of the attached files, by file name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +171,7 @@ class Close:
     """Close the file with its outcome."""
 
     outcome: Mapping[str, str]
+    """Metadata ``outcome`` of docs/session_format.md; the recorder counts the samples anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +196,9 @@ class Closed:
     counts: Mapping[str, int] = field(default_factory=dict)
     """What was counted in it."""
     outcome: str = ""
+    """``complete``, ``stopped`` or ``fault``, as in the file; empty if there is none."""
     reason: str = ""
+    """Reason as in the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +206,7 @@ class Failed:
     """A recorder or a live publisher cannot do its work, and ends."""
 
     reason: str
+    """What failed, for the operator."""
     taken: bool = False
     """The file is there already, and is somebody else's."""
     kept: Path | None = None

@@ -142,7 +142,7 @@ class Recorder:
         ]
         self._recorded = 0
         self.header: FileHeader | None = None
-        """Of the session, once the supervisor has sent it."""
+        """Header of the session; None until the supervisor has sent it."""
         self.begun = False
 
     def _begin(self, header: FileHeader) -> None:

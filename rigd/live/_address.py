@@ -47,7 +47,17 @@ class LiveAddress:
 
     @classmethod
     def of_this_process(cls, rig: str, grpc_port: int, page_port: int, server: int) -> Self:
-        """Return the address of a live view that this process publishes."""
+        """Return the address of a live view that this process publishes.
+
+        Parameters
+        ----------
+        rig
+            The profile's name.
+        grpc_port, page_port
+            Ports on loopback, for native viewers and for browsers.
+        server
+            Number of the server, another for each.
+        """
         pid = os.getpid()
         return cls(rig, pid, started_at(pid) or 0, grpc_port, page_port, server)
 

@@ -86,6 +86,7 @@ class LiveShown:
     """A session is shown from now on."""
 
     recording_id: str
+    """That of its :class:`LiveSession`."""
 
 
 # Rings

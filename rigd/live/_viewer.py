@@ -102,7 +102,22 @@ class _Window(_Playback):
 
 
 class Window(_Window):
-    """The viewer's window on the file `path`; the rest as of `_Window`."""
+    """The viewer's window on a file.
+
+    Parameters
+    ----------
+    path
+        Path of the recording.
+    scratch
+        Folder in which Rerun may leave files: it does when it is ended.
+    options
+        More of the program's command line.
+
+    Raises
+    ------
+    RerunError
+        If Rerun's program cannot be run.
+    """
 
     def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
         super().__init__((str(path.absolute()),), _MOST_MEMORY, scratch, options)
@@ -183,7 +198,22 @@ _HOSTS: Final = ("127.0.0.1", "localhost")
 
 
 class Viewer(_Window):
-    """The viewer's window on live views, first that at `address`; the rest as of `_Window`."""
+    """The viewer's window on live views.
+
+    Parameters
+    ----------
+    address
+        Live view that is shown first.
+    scratch
+        Folder in which Rerun may leave files: it does when it is ended.
+    options
+        More of the program's command line.
+
+    Raises
+    ------
+    RerunError
+        If Rerun's program cannot be run.
+    """
 
     def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
         self._connections = 0

@@ -97,7 +97,19 @@ class ProgressLine:
     def update(
         self, phase: Phase, tick: int, total: int, *, missed: int, late: int, number: str = ""
     ) -> None:
-        """Show how far the session is; `number` says which of a series."""
+        """Show how far the session is.
+
+        Parameters
+        ----------
+        phase
+            What the control process is doing.
+        tick, total
+            Number of ticks scheduled so far, and of all ticks of the record.
+        missed, late
+            Number of missed and of late ticks so far; shown once a tick is missed.
+        number
+            Number of the session in its series, such as ``2/5``; empty if it is the only one.
+        """
         self._state = {
             "description": f"{phase.words} {number}".rstrip(),
             "completed": tick,

@@ -27,10 +27,17 @@ _Tell = Callable[[str], None]
 class SeriesFailedError(FailureError):
     """No session, or no further one.
 
+    Parameters
+    ----------
+    message
+        Reason, for the operator.
+    results
+        The sessions before, and the one that failed if it had begun.
+
     Attributes
     ----------
     results
-        The sessions before, and the one that failed.
+        List of the same.
     """
 
     def __init__(self, message: str, results: Sequence[SessionResult] = ()) -> None:

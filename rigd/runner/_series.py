@@ -28,10 +28,35 @@ class SessionRig(Protocol):
         watcher: Watcher,
         listens: Callable[[], bool] = always,
     ) -> SessionResult:
-        """Run one session."""
+        """Run one session.
+
+        Parameters
+        ----------
+        order
+            Session to run.
+        stop
+            The operator's, which ends it.
+        watcher
+            Called some twenty times a second with the progress and the events since the last call.
+        listens
+            Whether a stop would be heard; if not, the supervisor gives no heartbeat.
+        """
 
     def show(self, order: Order, stop: StopRequest) -> str:
-        """Start its live view."""
+        """Show a session that is about to be run in the live view.
+
+        Parameters
+        ----------
+        order
+            Session to show.
+        stop
+            The operator's; the wait for the live view ends with it.
+
+        Returns
+        -------
+        str
+            Its address, or why there is none, for the operator.
+        """
 
 
 class SeriesWatcher(Protocol):

@@ -25,7 +25,16 @@ def file_name(rig: str) -> str:
 
 
 def address_files(pattern: str, *folders: Path) -> list[Path]:
-    """Return the files of a pattern in some folders (default: the user's own)."""
+    """Return the files of a pattern in some folders, sorted by path.
+
+    Parameters
+    ----------
+    pattern
+        Pattern of file names, as of :meth:`pathlib.Path.glob`.
+    *folders
+        Folders to search; one that cannot be read is left out. Without any, the user's runtime
+        folder is searched.
+    """
     found: list[Path] = []
     for folder in folders or (runtime_folder(),):
         with suppress(OSError):
@@ -37,6 +46,13 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
     """Write down an address for this user only, until it is withdrawn.
 
     Whoever reads it meanwhile gets the old or the new one. The folder is made.
+
+    Parameters
+    ----------
+    path
+        File to write; an older one is replaced.
+    address
+        What JSON can represent, by name.
 
     Raises
     ------

@@ -399,7 +399,7 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
 
     Examples
     --------
-    >>> from rigd.view import decades
+    >>> from rigd.view._chart import decades
     >>> decades(0.5, 20.0)[0]
     (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     """
@@ -426,7 +426,7 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
 
     Examples
     --------
-    >>> from rigd.view import steps
+    >>> from rigd.view._chart import steps
     >>> steps(1.0, 47.0, 6)
     (10.0, 20.0, 30.0, 40.0)
     """
@@ -434,7 +434,8 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
     scale = 10.0 ** np.floor(np.log10(least))
     step = next(digit * scale for digit in (1.0, 2.0, 5.0, 10.0) if digit * scale >= least)
     begin, end = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
-    return tuple(float(f"{value:.9g}") for value in step * np.arange(begin, end + 1))
+    values = step * np.arange(begin, end + 1) + 0.0  # adding makes −0 to 0
+    return tuple(float(f"{value:.9g}") for value in values)
 
 
 # Fewer points of a curve

@@ -264,7 +264,14 @@ def _measured_model(subject: "Subject", frequency_hz: Real, damping: Damping) ->
 
 
 def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
-    """Return the axis of a magnitude in whole steps, which ends far below the highest value."""
+    """Return the axis of a magnitude: whole steps of 20 dB, 140 dB at the most.
+
+    Parameters
+    ----------
+    lowest_db, highest_db
+        Values that the axis holds, in dB re 1 N·m/rad. Where they are too far apart, it begins
+        above the lowest.
+    """
     last = _STEP_DB * np.ceil(highest_db / _STEP_DB)
     first = max(_STEP_DB * np.floor(lowest_db / _STEP_DB), last - _DEEPEST_DB)
     ticks = steps(first, last, max(1, round((last - first) / _STEP_DB)))
@@ -274,7 +281,21 @@ def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
 def response_chart(
     entity: str, size: tuple[float, float], band_hz: tuple[float, float], y: Axis, *keys: Key
 ) -> Chart:
-    """Return a chart over frequency: its entity, size in points, band, vertical axis, legend."""
+    """Return a chart over frequency, with a logarithmic axis.
+
+    Parameters
+    ----------
+    entity
+        Entity path in Rerun.
+    size
+        Width and height of the canvas, in points.
+    band_hz
+        Ends of the frequency axis, above 0.
+    y
+        Vertical axis.
+    *keys
+        Entries of the legend, in reading order.
+    """
     ticks, lines = decades(*band_hz)
     frequency = Axis("Frequency (Hz)", *band_hz, ticks, lines, logarithmic=True)
     return Chart(entity, *size, frequency, y, keys)

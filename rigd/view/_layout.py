@@ -230,7 +230,17 @@ def _values(component: str) -> "VisualizerComponentMapping":
 
 
 def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
-    """Return the view of a chart, by its title, entity, and size in points."""
+    """Return the view of a chart.
+
+    Parameters
+    ----------
+    name
+        Title of the view.
+    entity
+        Entity path of the chart.
+    size
+        Width and height of its canvas, in points.
+    """
     import rerun.blueprint as rrb
 
     width, height = size
@@ -244,7 +254,17 @@ def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatia
 def chart_page(
     wide: "rrb.Spatial2DView", *narrow: "rrb.Spatial2DView", name: str | None = None
 ) -> "rrb.Vertical":
-    """Return a wide chart over narrow ones side by side."""
+    """Return a wide chart over narrow ones side by side.
+
+    Parameters
+    ----------
+    wide
+        View on top, with four sevenths of the height.
+    *narrow
+        Views below it, from left to right.
+    name
+        Title of the tab; None: none is set.
+    """
     import rerun.blueprint as rrb
 
     return rrb.Vertical(wide, rrb.Horizontal(*narrow), row_shares=[4, 3], name=name)

@@ -82,10 +82,13 @@ def complaints_on_class(cls):
     text = inspect.cleandoc(vars(cls)["__doc__"])
     if dataclasses.is_dataclass(cls):
         found = described(text, "Attributes")
-        own = [each.name for each in dataclasses.fields(cls) if each.name in cls.__annotations__]
+        fields = [each.name for each in dataclasses.fields(cls)]
+        own = [name for name in fields if name in cls.__annotations__]
         missing = set(own) - {*found, *with_string(cls)}
         yield from (f"{each} is not described" for each in missing)
-        yield from (f"there is no {each}" for each in found if not hasattr(cls, each))
+        # A field without slots or default is no attribute of the class.
+        existing = {*fields, *dir(cls)}
+        yield from (f"there is no {each}" for each in found if each not in existing)
     elif "__init__" in vars(cls) and not getattr(cls, "_is_protocol", False):
         yield from complaints_on_function(cls.__init__, text, may_be_in_summary=False)
     for name in vars(cls):

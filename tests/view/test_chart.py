@@ -74,6 +74,7 @@ def test_a_chart_counts_up_where_the_canvas_counts_down():
 def test_ticks_are_round():
     assert decades(0.5, 60.0)[0] == (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
     assert steps(0.0, 136.0, 15) == tuple(range(0, 140, 10))
+    assert str(steps(0.0, 136.0, 15)[0]) == "0.0"  # which equals -0.0
     assert steps(-60.0, 40.0, 5) == (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0)
     assert number(-0.0) == "0"
     assert number(-20.0) == "−20"
