@@ -31,7 +31,7 @@ from analysis.models import STRUCTURES
 from rigd.beam import transfer
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile
-from rigd.runner import Foresight
+from rigd.runner import LoopPreview
 
 POLE_RAD_S = 80.0
 
@@ -136,7 +136,7 @@ def main() -> None:
             write_modes(peer[0], document)
             for amplitude_rad in given.amplitude or [0.025, 0.1]:
                 options = {"amplitude_rad": amplitude_rad, "widths": given.widths}
-                rig = Foresight(profile_of(name))
+                rig = LoopPreview(profile_of(name))
                 excitation = modes(rate_hz=RATE_HZ, path=document, rig=rig, **options)
                 print(f"\nUp to {amplitude_rad:g} rad: {excitation.parameters['bands']}")
                 if given.engine:

@@ -12,7 +12,7 @@ from pathlib import Path
 from rigd.errors import RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile
-from rigd.runner import Crew, excitation_for, run_in_foreground
+from rigd.runner import ProcessGroup, excitation_for, run_in_foreground
 from rigd.runtime import StopRequest
 
 CHIRP = {
@@ -39,7 +39,7 @@ def main() -> None:
     try:
         results = run_in_foreground(
             chirp,
-            Crew(live=False),
+            ProcessGroup(live=False),
             stop,
             profile_name="sim",
             folder=folder,

@@ -181,7 +181,7 @@ def rigd_here(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     no_crew = StopRequest(), contextlib.nullcontext()
     for command in ("run", "identify"):
-        monkeypatch.setattr(f"rigd.cli.{command}.start_crew", lambda **_: no_crew)
+        monkeypatch.setattr(f"rigd.cli.{command}.start_processes", lambda **_: no_crew)
     monkeypatch.setattr("rigd.runtime.ignore", lambda **_: None)  # of the test runner
 
     return partial(run_here, app)

@@ -62,7 +62,7 @@ _DOUBTFUL: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class CandidateSet:
     """All candidates on one record, and what it takes to fit again.
 
     Attributes
@@ -96,7 +96,7 @@ class Field:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
-    ) -> Field:
+    ) -> CandidateSet:
         """Fit every structure; the freest alone where a sign or a unit is wrong.
 
         Raises
@@ -120,7 +120,7 @@ class Field:
         return with_extras(field.cross_checked())
 
     @classmethod
-    def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> Field:
+    def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
         """Take over what was fitted with a uniform beam."""
         comparison = uniform.comparison
         return cls(
@@ -165,7 +165,7 @@ class Field:
         least = min(lesser, key=lambda c: c.deviance, default=freest)
         return least if least.deviance - freest.deviance < _SHOWS else freest
 
-    def led_by(self, candidate: Candidate) -> Field:
+    def led_by(self, candidate: Candidate) -> CandidateSet:
         """Put one candidate first: the one whose numbers are told."""
         others = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *others))
@@ -242,17 +242,17 @@ class Field:
             max_evaluations=max_evaluations,
         )
 
-    def _without_leakage(self) -> Field:
+    def _without_leakage(self) -> CandidateSet:
         """Leave out what hum beyond the band spoils."""
         noise = without_leakage(self.noise, self.comparison, self.likeliest)
         return self.under(noise) if noise is not self.noise else self
 
-    def under(self, noise: Noise) -> Field:
+    def under(self, noise: Noise) -> CandidateSet:
         """Fit again under a noise that differs a little."""
         other = replace(self, noise=noise)
         return other.ranked(other.refit(c, FEW).candidate() for c in self.candidates)
 
-    def _with_modes_free(self, uniform: RecordFit) -> Field:
+    def _with_modes_free(self, uniform: RecordFit) -> CandidateSet:
         """Free the modes' stiffness from where a uniform beam explains the record."""
         fits = {candidate.structure.name: candidate.fit for candidate in self.candidates}
         found = []
@@ -267,7 +267,7 @@ class Field:
         measurement: Measurement,
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
-    ) -> Field:
+    ) -> CandidateSet:
         """Search for the modes wherever they are; the noise is that of the likelier beam."""
         loose = fit_record(measurement, FREE_STIFFNESS, fixed=fixed, band_hz=band_hz, uniform=False)
         found = tuple(Candidate(fit.structure, False, fit) for fit in loose.fits)
@@ -278,7 +278,7 @@ class Field:
             return every.under(self.noise)
         return every.under(without_leakage(noise, self.comparison, closest))
 
-    def cross_checked(self) -> Field:
+    def cross_checked(self) -> CandidateSet:
         """Start each from where the best is: over a flat valley a search may miss what is there."""
         field = self
         for _ in range(_CROSS_CHECKS):
@@ -290,7 +290,7 @@ class Field:
                 break
         return field
 
-    def tried_from(self, plant: Plant) -> Field:
+    def tried_from(self, plant: Plant) -> CandidateSet:
         """Start each from a plant that a search has found."""
         return self.ranked(self._from_plant(c, plant) for c in self.candidates).cross_checked()
 
@@ -310,7 +310,7 @@ class Field:
         found = self.descent(unknowns, first.x, MANY)
         return candidate if found.cost > least else found.candidate()
 
-    def with_orders_free(self) -> Field:
+    def with_orders_free(self) -> CandidateSet:
         """Free the orders too, on a beam of the best's kind, if that was not done."""
         best = self.best
         known = {c.structure.name for c in self.candidates if c.kind == best.kind}
@@ -326,12 +326,12 @@ class Field:
             return freed.cross_checked()
         return freed.under(min(found, key=lambda refit: refit.cost).noise_here())
 
-    def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> Field:
+    def with_columns(self, columns: NDArray[np.complex128], noise: Noise) -> CandidateSet:
         """Fit all again, with what is not linear beside the beam."""
         other = replace(self, columns=columns, noise=noise)
         return other.ranked(other.refit(c).candidate() for c in self.candidates).cross_checked()
 
-    def ranked(self, candidates: Iterable[Candidate]) -> Field:
+    def ranked(self, candidates: Iterable[Candidate]) -> CandidateSet:
         """Hold these candidates, the lowest BIC first."""
         return replace(self, candidates=_ranked(candidates))
 

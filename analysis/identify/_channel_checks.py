@@ -18,7 +18,7 @@ from rigd.beam import Damping, transfer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._data import Measurement
     from analysis.identify._problem import Comparison
 
@@ -174,7 +174,7 @@ _BEYOND_CHANCE: Final = 10.0
 """Scatter of the means over what noise alone makes of them."""
 
 
-def drift_of_zero(field: Field) -> float:
+def drift_of_zero(field: CandidateSet) -> float:
     """Range of the means over parts of the record in N·m; 0 if noise alone may make it."""
     comparison = field.comparison
     torque, _ = comparison.prediction.torque(field.best.fit.plant)

@@ -21,7 +21,7 @@ from analysis.statistics import NORMAL_95, chi_square_deviate
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
     from analysis.identify._residual_tests import Harmonic, InputRelation, Whiteness
@@ -32,7 +32,7 @@ _MODES_TO_JUDGE: Final = 2
 
 
 def findings(
-    field: Field,
+    field: CandidateSet,
     forces: tuple[NonlinearForce, ...],
     multiples: tuple[Harmonic, ...],
     visible: tuple[int, ...],
@@ -41,7 +41,7 @@ def findings(
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     forces : tuple of NonlinearForce
         Those the record calls for.
     multiples : tuple of Harmonic
@@ -75,7 +75,7 @@ _BEAM_OFF: Final = 0.003
 """Deviation of stiffness or density, relative to the file's, worth a word."""
 
 
-def at_edges(field: Field) -> Iterator[Finding]:
+def at_edges(field: CandidateSet) -> Iterator[Finding]:
     """Find settings that the search took as far as it goes; no rig is so far from its file."""
     fit = field.best.fit
     for name, words, factor, unit in (
@@ -101,7 +101,7 @@ def at_edges(field: Field) -> Iterator[Finding]:
             )
 
 
-def of_settings(field: Field) -> Iterator[Finding]:
+def of_settings(field: CandidateSet) -> Iterator[Finding]:
     """Find what of delay, inertia, beam and start is not as the file states it."""
     differing = {name for name in field.free if _apart(field, name) and not _as_stated(field, name)}
     yield from _of_instruments(field, differing)
@@ -111,7 +111,7 @@ def of_settings(field: Field) -> Iterator[Finding]:
         yield from _of_start(field)
 
 
-def _of_instruments(field: Field, differing: set[Setting]) -> Iterator[Finding]:
+def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
     """Find a delay and an inertia that the file does not state."""
     fit = field.best.fit
     if "delay_s" in differing:
@@ -147,7 +147,7 @@ def _of_instruments(field: Field, differing: set[Setting]) -> Iterator[Finding]:
         )
 
 
-def _of_beam(field: Field, differing: set[Setting]) -> Iterator[Finding]:
+def _of_beam(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
     """Find density and stiffness that are not the file's."""
     beam: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
@@ -171,7 +171,7 @@ def _of_beam(field: Field, differing: set[Setting]) -> Iterator[Finding]:
         )
 
 
-def _or_else(field: Field, name: Setting) -> str:
+def _or_else(field: CandidateSet, name: Setting) -> str:
     """Name what does to the torque just what such a deviation does; the sentence's end."""
     if name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
@@ -187,7 +187,7 @@ def _or_else(field: Field, name: Setting) -> str:
     return f", or the beam carries {mass_g:.2g} g at its tip"
 
 
-def _of_start(field: Field) -> Iterator[Finding]:
+def _of_start(field: CandidateSet) -> Iterator[Finding]:
     """Say that the beam rang when the record began."""
     loudest = max(field.best.fit.ringing.amplitude_nm)
     yield Finding(
@@ -202,7 +202,7 @@ def _of_start(field: Field) -> Iterator[Finding]:
     )
 
 
-def _rings(field: Field) -> bool:
+def _rings(field: CandidateSet) -> bool:
     """Whether the beam rang at the start, whatever structure it has."""
     loudest = max(field.best.fit.ringing.amplitude_nm, default=0.0)
     # A hum begins and ends with the record, which looks a little like a decay.
@@ -214,7 +214,7 @@ def _rings(field: Field) -> bool:
     )
 
 
-def _stated(field: Field, name: Setting) -> float:
+def _stated(field: CandidateSet, name: Setting) -> float:
     """Give the value of a setting in the file."""
     measurement = field.comparison.measurement
     return {
@@ -225,7 +225,7 @@ def _stated(field: Field, name: Setting) -> float:
     }[name]
 
 
-def _apart(field: Field, name: Setting) -> bool:
+def _apart(field: CandidateSet, name: Setting) -> bool:
     """Whether a setting differs from what the file states by more than chance allows.
 
     So it must in every structure that the data cannot tell from the best.
@@ -241,7 +241,7 @@ def _apart(field: Field, name: Setting) -> bool:
     return True
 
 
-def _as_stated(field: Field, name: Setting) -> bool:
+def _as_stated(field: CandidateSet, name: Setting) -> bool:
     """Whether any structure explains the record about as well with a setting as the file has it.
 
     A standard deviation tells what is close to the minimum. This tells whether all else, other
@@ -257,7 +257,7 @@ def _as_stated(field: Field, name: Setting) -> bool:
     return False
 
 
-def _difference(field: Field, name: Setting) -> tuple[float, float, float]:
+def _difference(field: CandidateSet, name: Setting) -> tuple[float, float, float]:
     """By how much a setting differs from what the file states, with the ends of its interval."""
     best, stated = field.best.fit, _stated(field, name)
     low, high = best.interval[name] or (stated, stated)
@@ -336,7 +336,7 @@ def unexplained(
     )
 
 
-def _hum(field: Field) -> Iterator[Finding]:
+def _hum(field: CandidateSet) -> Iterator[Finding]:
     comparison = field.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
     drift_nm = drift_of_zero(field)
@@ -384,7 +384,7 @@ def _drift(size_nm: float) -> Finding:
     )
 
 
-def _air(field: Field) -> Iterator[Finding]:
+def _air(field: CandidateSet) -> Iterator[Finding]:
     drag = field.drag
     if drag is None:
         return

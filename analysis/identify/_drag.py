@@ -33,7 +33,7 @@ from rigd.beam import mode_shape
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._noise import Noise
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
@@ -109,7 +109,7 @@ class DragEstimate:
     covariance: tuple[tuple[float, ...], ...]
 
 
-def with_air_drag(field: Field) -> Field:
+def with_air_drag(field: CandidateSet) -> CandidateSet:
     """Fit all candidates anew with the air's drag, if that explains the record better.
 
     To first order a column of known shape tells what drag could save beside each of a few
@@ -117,12 +117,12 @@ def with_air_drag(field: Field) -> Field:
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
         Without drag.
 
     Returns
     -------
-    Field
+    CandidateSet
         The one given, if there is no drag; else with `drag`, the lowest BIC first.
     """
     if not _promising(field):
@@ -165,7 +165,7 @@ class _Point:
         return cls(refit.plant, structure, _law_at(refit), refit.noise, two)
 
 
-def _without_extras(field: Field) -> tuple[Candidate, ...]:
+def _without_extras(field: CandidateSet) -> tuple[Candidate, ...]:
     """Candidates beside which drag may stand.
 
     What has extras is compared with those, and goes with the drag: drag is computed for a bare beam
@@ -174,7 +174,7 @@ def _without_extras(field: Field) -> tuple[Candidate, ...]:
     return tuple(candidate for candidate in field.candidates if not candidate.extras)
 
 
-def _promising(field: Field) -> bool:
+def _promising(field: CandidateSet) -> bool:
     """Whether some structure with drag could be better than the best without."""
     best = field.best
     for candidate in _without_extras(field):
@@ -222,7 +222,7 @@ def _last_amplitude(refit: Refit) -> tuple[float, float, float]:
     return -along / square, along**2 / square, projected.cost
 
 
-def _start(field: Field, lead: Candidate) -> _Point | None:
+def _start(field: CandidateSet, lead: Candidate) -> _Point | None:
     """First order of the drag beside a fit without it; None if the air would have to push."""
     plant, structure = lead.fit.plant, lead.structure
     columns = np.concatenate([field.columns, _first_order(field.comparison, plant)])
@@ -235,7 +235,7 @@ def _start(field: Field, lead: Candidate) -> _Point | None:
 
 
 def _settled(
-    field: Field,
+    field: CandidateSet,
     point: _Point,
     structure: Structure,
     *,
@@ -246,7 +246,7 @@ def _settled(
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
         Without drag.
     point : _Point
         Where to start.
@@ -302,7 +302,7 @@ def _law_at(refit: Refit) -> DragLaw:
     return DragLaw(expansion.law.constant_m + step[0], slowing)
 
 
-def _all(field: Field, settled: Refit) -> Field:
+def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
     """Fit all candidates without extras with the drag settled in one, and say how large it is."""
     other = replace(
         field,
@@ -326,7 +326,7 @@ def _all(field: Field, settled: Refit) -> Field:
     return replace(found, drag=_estimate(found))
 
 
-def _estimate(field: Field) -> DragEstimate:
+def _estimate(field: CandidateSet) -> DragEstimate:
     """Drag with its deviation, beside all the damping that the best beam may have."""
     best = field.best
     freest = max(
@@ -387,12 +387,12 @@ class DampingAt:
     std: float
 
 
-def damping_with_amplitude(field: Field) -> tuple[DampingAt, ...]:
+def damping_with_amplitude(field: CandidateSet) -> tuple[DampingAt, ...]:
     """Damping of the first modes that show at several amplitudes; nothing without drag.
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     """
     drag = field.drag
     if drag is None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
 
     from analysis.identify._candidate import Candidate
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
     from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
     from analysis.identify._verdict import OrderVerdict
@@ -251,7 +251,7 @@ class Headline(Numbers):
 
 
 def headline(
-    field: Field,
+    field: CandidateSet,
     orders: tuple[OrderVerdict, OrderVerdict],
     visible: tuple[int, ...],
     *,
@@ -261,7 +261,7 @@ def headline(
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     orders : tuple of OrderVerdict
         Alpha's and lambda's, judged in the freest structure.
     visible : tuple of int
@@ -353,7 +353,9 @@ def of_fit(
     )
 
 
-def structures(field: Field, fractional: frozenset[str]) -> tuple[tuple[str, StructureStatus], ...]:
+def structures(
+    field: CandidateSet, fractional: frozenset[str]
+) -> tuple[tuple[str, StructureStatus], ...]:
     """Say which structures a record excludes, and which would do.
 
     A special case of the freest structure on the same beam is excluded by the likelihood ratio;
@@ -363,7 +365,7 @@ def structures(field: Field, fractional: frozenset[str]) -> tuple[tuple[str, Str
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
         With the candidates ranked.
     fractional : frozenset of str
         Orders of which 1 is excluded.
@@ -371,7 +373,9 @@ def structures(field: Field, fractional: frozenset[str]) -> tuple[tuple[str, Str
     return tuple((each.name, _status(field, each, fractional)) for each in field.candidates)
 
 
-def _status(field: Field, candidate: Candidate, fractional: frozenset[str]) -> StructureStatus:
+def _status(
+    field: CandidateSet, candidate: Candidate, fractional: frozenset[str]
+) -> StructureStatus:
     freest = field.freest
     if candidate is freest:
         return "selected"
@@ -390,7 +394,7 @@ def _status(field: Field, candidate: Candidate, fractional: frozenset[str]) -> S
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
-def _simpler(field: Field, fractional: frozenset[str]) -> Simpler | None:
+def _simpler(field: CandidateSet, fractional: frozenset[str]) -> Simpler | None:
     """Find the simplest structure that would do: of those compatible on the same beam."""
     freest = field.freest
     would_do = [

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
 
@@ -196,8 +196,8 @@ class NonlinearForce:
 
 
 def nonlinear_forces(
-    field: Field, modes: tuple[int, ...]
-) -> tuple[Field, tuple[NonlinearForce, ...]]:
+    field: CandidateSet, modes: tuple[int, ...]
+) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add forces one by one while each saves far more than chance would; fit all anew with them.
 
     A mode whose stiffness rises looks much like one that lies elsewhere, or like a fractional
@@ -206,14 +206,14 @@ def nonlinear_forces(
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
         Without such forces.
     modes : tuple of int
         Modes that the record shows.
 
     Returns
     -------
-    field : Field
+    field : CandidateSet
         The one given, if there is nothing.
     forces : tuple of NonlinearForce
     """
@@ -228,7 +228,7 @@ def nonlinear_forces(
     return field, ()
 
 
-def _leads(field: Field) -> tuple[Candidate, ...]:
+def _leads(field: CandidateSet) -> tuple[Candidate, ...]:
     """Candidates to start from: the best, and before it those that are simpler."""
     best = field.best
     if best.uniform and "alpha" not in best.structure.free:
@@ -242,8 +242,8 @@ def _leads(field: Field) -> tuple[Candidate, ...]:
 
 
 def _added(
-    field: Field, lead: Candidate, modes: tuple[int, ...]
-) -> tuple[Field, tuple[NonlinearForce, ...]]:
+    field: CandidateSet, lead: Candidate, modes: tuple[int, ...]
+) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add forces to one candidate, then to all."""
     terms: list[Term] = []
     sizes = std = np.zeros(0)
@@ -272,7 +272,7 @@ def _gain(candidate: Candidate, before: float, after: float) -> float:
 
 
 def _most_wanted(
-    field: Field, refit: Refit, modes: tuple[int, ...], taken: list[Term]
+    field: CandidateSet, refit: Refit, modes: tuple[int, ...], taken: list[Term]
 ) -> tuple[Term | None, float]:
     """Find the term that to first order saves most, and the cost with it."""
     forces = ModalForces(field.comparison, refit.plant)
@@ -288,7 +288,7 @@ def _most_wanted(
 
 
 def _with_terms(
-    field: Field, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
+    field: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit with the columns of these terms, at the sizes that they turn out to have.
 
@@ -311,7 +311,7 @@ def _with_terms(
     return refit, sizes, std
 
 
-def _explain(without: Field, within: Field) -> bool:
+def _explain(without: CandidateSet, within: CandidateSet) -> bool:
     """Whether the forces explain what the linear beam left, or at least half of it."""
     power = np.abs(without.best.fit.residual) ** 2
     before = without.best.fit.cost - without.best.fit.degrees_of_freedom

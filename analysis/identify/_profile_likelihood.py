@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._plant import Plant
 
 
@@ -129,7 +129,7 @@ class Profiled:
     cost: float
 
 
-def profile(field: Field, candidate: Candidate, order: Order) -> Profiled:
+def profile(field: CandidateSet, candidate: Candidate, order: Order) -> Profiled:
     """Walk away from the minimum both ways until the record excludes what lies beyond.
 
     Each refit starts on the tangent of the last, and each step goes to where the deviance, were it
@@ -138,7 +138,7 @@ def profile(field: Field, candidate: Candidate, order: Order) -> Profiled:
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     candidate : Candidate
         In whose structure the order is freed, if it is not free.
     order : str
@@ -176,7 +176,7 @@ _ORDERS: Final[tuple[Order, Order]] = ("alpha", "lambda")
 _ROUNDS: Final = 3
 
 
-def profiled(field: Field, *, walk: bool = True) -> tuple[Field, Profile, Profile]:
+def profiled(field: CandidateSet, *, walk: bool = True) -> tuple[CandidateSet, Profile, Profile]:
     """Profile alpha and lambda in the freest structure on the best beam.
 
     What a walk finds lower than the candidates are, or in another valley, is where all of them
@@ -184,13 +184,13 @@ def profiled(field: Field, *, walk: bool = True) -> tuple[Field, Profile, Profil
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     walk : bool
         Whether the orders can be told at all.
 
     Returns
     -------
-    field : Field
+    field : CandidateSet
         With the candidates ranked anew.
     alpha, lambda_ : Profile
     """
@@ -218,7 +218,7 @@ def profiled(field: Field, *, walk: bool = True) -> tuple[Field, Profile, Profil
     return field, of_alpha, of_lambda
 
 
-def _news(field: Field, found: Profiled) -> bool:
+def _news(field: CandidateSet, found: Profiled) -> bool:
     """Whether a candidate may be elsewhere than its lowest minimum."""
     if len(found.plants) > 1:
         return True
@@ -271,7 +271,7 @@ def with_order(structure: Structure, order: Order) -> Structure:
 class Walk:
     """Refits with one order held, and what they cost."""
 
-    def __init__(self, field: Field, candidate: Candidate, order: Order) -> None:
+    def __init__(self, field: CandidateSet, candidate: Candidate, order: Order) -> None:
         self.order = order
         self.structure = with_order(candidate.structure, order)
         self._field, self._values = field, candidate.values

@@ -13,17 +13,17 @@ from analysis.statistics import NORMAL_95
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
 
 
 _MODES_FREE: Final = "modes free"
 
 
-def of_rig(field: Field) -> Iterator[Finding]:
+def of_rig(field: CandidateSet) -> Iterator[Finding]:
     """Find what shifts the modes, or the torque against the angle, as nothing uniform does.
 
-    Kinds of rig are compared as `Field.freest` does it: with every order free. What explains the
-    record equally well is named in one sentence, without intervals.
+    Kinds of rig are compared as `CandidateSet.freest` does it: with every order free. What explains
+    the record equally well is named in one sentence, without intervals.
     """
     freest = field.freest
     others = field.other_kinds(STRONG)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from analysis.identify._candidate import Candidate
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._refit import Refit
 
 _STRUCTURES: Final = tuple(STRUCTURES[name] for name in ("VI", "VII", "III"))
@@ -50,7 +50,7 @@ _QUIETER: Final = 0.98
 """Share of the sum of squares left by an extra, below which the noise is estimated anew."""
 
 
-def with_extras(field: Field) -> Field:
+def with_extras(field: CandidateSet) -> CandidateSet:
     """Add the candidates that explain more than the same structure does without an extra."""
     bare = {
         c.structure.name: c
@@ -76,7 +76,7 @@ def with_extras(field: Field) -> Field:
     return freed.cross_checked()
 
 
-def _promising(field: Field, lead: Candidate) -> list[Refit]:
+def _promising(field: CandidateSet, lead: Candidate) -> list[Refit]:
     """Begin a search with each of the extras; give those that promise something, the best first."""
     values, cost = lead.values, lead.fit.cost
     needed = cost * math.exp(-_PROMISING / values)
@@ -117,7 +117,7 @@ def _tip_share(offset: float) -> float:
     return (low + high) / 2
 
 
-def _begun(field: Field, lead: Candidate, name: str, size: float) -> Refit:
+def _begun(field: CandidateSet, lead: Candidate, name: str, size: float) -> Refit:
     """Look from a start."""
     unknowns = field.unknowns(STRUCTURES["VI"], uniform=True, extras=(name,))
     x = unknowns.vector(lead.fit.plant)
@@ -125,7 +125,7 @@ def _begun(field: Field, lead: Candidate, name: str, size: float) -> Refit:
     return field.descent(unknowns, x, 1)
 
 
-def _fitted(field: Field, start: Refit, bare: dict[str, Candidate]) -> Iterator[Candidate]:
+def _fitted(field: CandidateSet, start: Refit, bare: dict[str, Candidate]) -> Iterator[Candidate]:
     """Candidates of one extra that are better than their structures are without it."""
     unknowns = start.objective.unknowns
     values = field.best.values

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._candidates import Field
+from analysis.identify._candidates import CandidateSet
 from analysis.identify._diagnostics import findings, unexplained
 from analysis.identify._drag import damping_with_amplitude, with_air_drag
 from analysis.identify._finding import doubted
@@ -120,7 +120,7 @@ def select(
     ValueError
         There is no such setting.
     """
-    linear = Field.of(measurement, tuple(fixed), band_hz)
+    linear = CandidateSet.of(measurement, tuple(fixed), band_hz)
     visible = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     field, forces = (
         (linear, ()) if linear.misread else nonlinear_forces(with_air_drag(linear), visible)
@@ -226,7 +226,7 @@ def _as_sure(
 
 
 def _tests(
-    field: Field, band_hz: tuple[float, float]
+    field: CandidateSet, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
     """Test what the first candidate leaves."""
     comparison, residual = field.comparison, field.best.fit.residual
@@ -239,7 +239,7 @@ def _tests(
     )
 
 
-def _table(field: Field) -> tuple[Row, ...]:
+def _table(field: CandidateSet) -> tuple[Row, ...]:
     best, least_aic = field.best, min(c.aic for c in field.candidates)
     return tuple(
         Row(
@@ -423,7 +423,7 @@ _ORDINALS: Final = {1: "first", 2: "second"}
 
 
 def experiments(
-    field: Field,
+    field: CandidateSet,
     orders: tuple[OrderVerdict, ...],
     visible: tuple[int, ...],
     found: tuple[Finding, ...],
@@ -449,7 +449,7 @@ def experiments(
     return advice
 
 
-def _for_two_modes(field: Field, visible: tuple[int, ...]) -> str:
+def _for_two_modes(field: CandidateSet, visible: tuple[int, ...]) -> str:
     """Say how both of the first two modes would show."""
     modes = {mode.number: mode.frequency_hz for mode in field.best.fit.modes}
     first_hz = modes.get(1, 0.0)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Kind
     from analysis.identify._plant import Plant
     from analysis.identify._problem import Comparison
@@ -90,16 +90,16 @@ class Change:
         return self.behind < -STRONG
 
 
-def along_time(field: Field) -> tuple[Field, tuple[Change, ...]]:
+def along_time(field: CandidateSet) -> tuple[CandidateSet, tuple[Change, ...]]:
     """Find what changes along the record; fit all anew beside it if nothing explains it as well.
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
 
     Returns
     -------
-    field : Field
+    field : CandidateSet
         The one given, unless something changes for certain.
     changes : tuple of Change
         What explains the record best of all, or as well as the best candidate.
@@ -136,7 +136,7 @@ def _possible(change: Change) -> bool:
     return change.size > 0 if change.what == "play" else abs(change.size) < 1
 
 
-def _leads(field: Field) -> Iterator[Candidate]:
+def _leads(field: CandidateSet) -> Iterator[Candidate]:
     """Give the best candidate, and the simple ones that something may stand beside instead."""
     yield field.best
     for candidate in field.candidates[1:]:
@@ -145,7 +145,7 @@ def _leads(field: Field) -> Iterator[Candidate]:
 
 
 def _promising(
-    field: Field, lead: Candidate, lag: NDArray[np.float64]
+    field: CandidateSet, lead: Candidate, lag: NDArray[np.float64]
 ) -> Iterator[tuple[What, float]]:
     """Columns that to first order would make a candidate the best, with the BIC they promise."""
     refit = field.refit(lead, 1)
@@ -160,7 +160,7 @@ def _promising(
 
 
 def _fitted(
-    field: Field, lead: Candidate, what: What, lag: NDArray[np.float64]
+    field: CandidateSet, lead: Candidate, what: What, lag: NDArray[np.float64]
 ) -> tuple[Refit, float]:
     """Fit a candidate with one column beside it; give its BIC as well."""
     refit = field.refit(lead, 1)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.identify._candidate import Candidate
-    from analysis.identify._candidates import Field
+    from analysis.identify._candidates import CandidateSet
     from analysis.identify._drag import DampingAt
     from analysis.identify._finding import Finding
     from analysis.identify._profile_likelihood import Order, Profile
@@ -73,13 +73,13 @@ class OrderVerdict:
 
 
 def order_verdict(
-    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+    field: CandidateSet, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
 ) -> OrderVerdict:
     """Judge one order.
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     profile : Profile
         Profile of the order, in the freest structure on the beam selected.
     visible : tuple of int
@@ -99,12 +99,12 @@ def order_verdict(
     )
 
 
-def untold_reason(field: Field, visible: tuple[int, ...]) -> str | None:
+def untold_reason(field: CandidateSet, visible: tuple[int, ...]) -> str | None:
     """Say why no order can be told from a record, whatever its likelihood says; None if it may.
 
     Parameters
     ----------
-    field : Field
+    field : CandidateSet
     visible : tuple of int
         Modes that the record shows.
     """
@@ -130,7 +130,7 @@ def deviance_of_one(profile: Profile) -> float:
 
 
 def _judged(
-    field: Field, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
+    field: CandidateSet, profile: Profile, visible: tuple[int, ...], *, doubt: str | None
 ) -> tuple[Status, str | None]:
     freest, order = field.freest, profile.order
     untold = untold_reason(field, visible)
@@ -256,7 +256,7 @@ class Verdict:
         return plain
 
 
-def rivals(field: Field, within: float) -> tuple[Candidate, ...]:
+def rivals(field: CandidateSet, within: float) -> tuple[Candidate, ...]:
     """Candidates whose BIC is less than so much above that of the first, without the first."""
     limit = field.best.bic + within
     return tuple(c for c in field.candidates[1:] if c.bic < limit)

@@ -18,7 +18,7 @@ from rigd.engine import Finished, Phase, SessionJob, Stop, Word, put_reference
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
-from rigd.runner import Crew, Order, Rig, SessionProgress
+from rigd.runner import Order, ProcessGroup, Rig, SessionProgress
 from rigd.runtime import StopRequest
 from rigd.session import decode_samples, read_session
 
@@ -87,7 +87,7 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
 
 
 @contextmanager
-def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Crew]]:
+def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, ProcessGroup]]:
     """Start the processes of a rig and end them.
 
     Raises
@@ -96,7 +96,7 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Cr
         If they do not start.
     """
     try:
-        with Crew(live=live) as crew, ExitStack() as connection:
+        with ProcessGroup(live=live) as crew, ExitStack() as connection:
             rig = Rig(profile, crew=crew)
             rig.connect()
             # It also gives back the precedence that supervision has, of which what is measured

@@ -17,8 +17,8 @@ from rigd.checks._rows import Row, Verdict, grade, name_of, value_of
 from rigd.devices import (
     DeviceError,
     Devices,
-    Reality,
     RigParameters,
+    WhatMoves,
     find_simulator,
     open_devices,
     reality,
@@ -234,7 +234,7 @@ _MANY_MISSING = 0.2
 _GROUP = "exchange"
 
 
-def exchange_rows(profile: Profile, devices: Devices, moves: Reality) -> Iterator[Row]:
+def exchange_rows(profile: Profile, devices: Devices, moves: WhatMoves) -> Iterator[Row]:
     """Run some ticks without a torque, and judge how quickly and how surely the replies come.
 
     Parameters
@@ -300,14 +300,14 @@ def exchange_rows(profile: Profile, devices: Devices, moves: Reality) -> Iterato
     )
 
 
-def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: Reality) -> Row:
+def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: WhatMoves) -> Row:
     acquisition = profile.rig.acquisition
     median, late = np.percentile(waited_ms, [50, 99]).tolist()
     found = f"median {median:.2f} ms, 99 % within {late:.2f} ms"
     what = "both replies after"
     if acquisition is None or acquisition.mode == "previous_tick":
         return Row(_GROUP, what, "a tick takes those of the tick before", "", Verdict.SKIPPED)
-    if moves is Reality.LOCK_STEP:
+    if moves is WhatMoves.LOCK_STEP:
         return Row(_GROUP, what, found, "any time (lock-step)", Verdict.OK)
     limit_ms = acquisition.deadline_us * 1e-3
     verdict = grade(fail=median >= limit_ms, warn=late >= limit_ms)
@@ -336,7 +336,7 @@ def inspect_devices(profile: Profile) -> list[Row]:
     return rows
 
 
-def _ask(profile: Profile, devices: Devices, moves: Reality, rows: list[Row]) -> None:
+def _ask(profile: Profile, devices: Devices, moves: WhatMoves, rows: list[Row]) -> None:
     rig, drive, sensor = profile.rig, devices.drive, devices.sensor
 
     def about_drive() -> Iterator[Row]:
@@ -359,7 +359,7 @@ def _ask(profile: Profile, devices: Devices, moves: Reality, rows: list[Row]) ->
     # The drive last: once it is operational it expects a SYNC every period.
     sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)
     drive_answers = _try("drive", about_drive(), rows)
-    if moves is Reality.SIMULATED:
+    if moves is WhatMoves.SIMULATED:
         rows.append(Row("exchange", "ticks", "simulated in this process", "", Verdict.SKIPPED))
     elif drive_answers and sensor_answers:
         _try("exchange", exchange_rows(profile, devices, moves), rows)
@@ -378,11 +378,11 @@ def _try(group: str, found: Iterable[Row], rows: list[Row]) -> bool:
     return True
 
 
-def _answer(moves: Reality) -> str:
-    return "simulated in this process" if moves is Reality.SIMULATED else "it answers"
+def _answer(moves: WhatMoves) -> str:
+    return "simulated in this process" if moves is WhatMoves.SIMULATED else "it answers"
 
 
-def _link_rows(rig: RigParameters, moves: Reality) -> Iterator[Row]:
+def _link_rows(rig: RigParameters, moves: WhatMoves) -> Iterator[Row]:
     simulator = find_simulator(rig.name)
     if simulator is not None:
         where = f"{moves.value} (process {simulator.pid})"

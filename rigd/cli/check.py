@@ -165,10 +165,10 @@ def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) 
     from rich.status import Status
 
     from rigd.bench import Bench
-    from rigd.devices import Reality, reality
+    from rigd.devices import WhatMoves, reality
     from rigd.runtime import RigLock
 
-    hardware = reality(profile.rig) is Reality.HARDWARE
+    hardware = reality(profile.rig) is WhatMoves.HARDWARE
     console = Console(stderr=True)
     # Beside a session of this rig, the loops of both would be late.
     with (

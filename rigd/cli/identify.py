@@ -18,7 +18,7 @@ from rigd.cli.options import (
     Seed,
     profile_named,
 )
-from rigd.cli.start import CrewGroup, start_crew
+from rigd.cli.start import SessionCommands, start_processes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Prepare = Callable[[Profile], Profile]
 
 identify_app = typer.Typer(
-    cls=CrewGroup,
+    cls=SessionCommands,
     help="Measure parameters of the rig for its profile.",
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -122,7 +122,7 @@ def _run_sessions(
 
     Returns the files of the two: the trial's controller is too slow for its passes to count.
     """
-    stop, crew = start_crew(live=False)
+    stop, crew = start_processes(live=False)
     from rigd.identification import (
         cautious,
         multisine_session,
@@ -130,10 +130,10 @@ def _run_sessions(
         trial_session,
         tuned,
     )
-    from rigd.runner import Crew, run_in_foreground
+    from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore
 
-    def run(session: "Session", prepare: "Prepare", number: int, crew: Crew) -> Path:
+    def run(session: "Session", prepare: "Prepare", number: int, crew: ProcessGroup) -> Path:
         def build(profile: "Profile") -> "Excitation":
             return session(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
 
@@ -168,7 +168,7 @@ def _run_sessions(
             return tuned(profile, estimate)
 
         return [
-            run(session, tune, number, Crew(live=False))
+            run(session, tune, number, ProcessGroup(live=False))
             for number, session in enumerate((multisine_session, speeds_session), start=1)
         ]
     finally:

@@ -31,7 +31,7 @@ from rigd.cli.options import (
     fail,
     session_notes,
 )
-from rigd.cli.start import CrewGroup, start_crew, start_sessions
+from rigd.cli.start import SessionCommands, start_processes, start_sessions
 
 if TYPE_CHECKING:
     from rigd.excitation import Value
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 run_app = typer.Typer(
     name="run",
-    cls=CrewGroup,
+    cls=SessionCommands,
     help="Run one or more sessions in the foreground; Ctrl-C stops safely.\n\n"
     "Example: rigd run chirp --profile sim --fast",
     no_args_is_help=True,
@@ -111,7 +111,7 @@ def run_sessions(
 ) -> None:
     """Run sessions one after the other and report how they ended."""
     notes = session_notes(operator, specimen, note)
-    stop, crew = start_crew(live=live)
+    stop, crew = start_processes(live=live)
     from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore
 

@@ -30,17 +30,17 @@ from rigd.cli.options import (
 if TYPE_CHECKING:
     from rigd.daemon import Client
     from rigd.excitation import Value
-    from rigd.runner import Crew
+    from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 
 
 _POLL_S = 0.2
 
 
-class CrewGroup(TyperGroup):
+class SessionCommands(TyperGroup):
     """Commands that run sessions; Ctrl-C before they catch it themselves is told of.
 
-    From :func:`start_crew` on it is a stop of the session, which says so.
+    From :func:`start_processes` on it is a stop of the session, which says so.
     """
 
     # Typer's click is its own in some versions and the package of that name in others.
@@ -54,18 +54,18 @@ class CrewGroup(TyperGroup):
             raise
 
 
-def start_crew(*, live: bool) -> "tuple[StopRequest, Crew]":
+def start_processes(*, live: bool) -> "tuple[StopRequest, ProcessGroup]":
     """Catch the operator's stop, and start the processes of the first session.
 
     They import what they need while the command line imports the rest, and while it plans.
     """
-    from rigd.runner import Crew
+    from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 
     stop = StopRequest()
     stop.catch()
     try:
-        return stop, Crew(live=live)
+        return stop, ProcessGroup(live=live)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); look at the limits "

@@ -15,7 +15,7 @@ from rigd.daemon._log import NAME, Log
 from rigd.daemon._server import Server
 from rigd.daemon._service import Service
 from rigd.daemon._states import look_up_user
-from rigd.devices import Reality, reality, simulated_differently, what_moves
+from rigd.devices import WhatMoves, reality, simulated_differently, what_moves
 from rigd.profile import Profile
 from rigd.runner import Rig
 from rigd.runtime import RigLock
@@ -58,7 +58,7 @@ def run_daemon(
         ending.enter_context(Log())
         look_up_user(os.getuid())
         ending.enter_context(
-            RigLock(profile.name, "rigd serve", hardware=moving is Reality.HARDWARE)
+            RigLock(profile.name, "rigd serve", hardware=moving is WhatMoves.HARDWARE)
         )
         path = socket_path(profile.name, None if group is None else COMMON)
         listener = ending.enter_context(bind(path, group))

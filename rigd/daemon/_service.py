@@ -31,7 +31,7 @@ from rigd.daemon._states import (
     rig_document,
     transition_document,
 )
-from rigd.devices import Reality, what_moves
+from rigd.devices import WhatMoves, what_moves
 from rigd.engine import Event
 from rigd.errors import RigdError, UserError
 from rigd.profile import Profile
@@ -77,7 +77,7 @@ class RigControl(SessionRig, Protocol):
     connected: bool
     zero_lost: bool
 
-    def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
+    def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Connect the devices."""
 
     def tare(self) -> dict[str, Any]:
@@ -173,7 +173,7 @@ class Service:
         folder: Path,
         worker: Executor,
         publish: Publish,
-        moving: Callable[[], Reality],
+        moving: Callable[[], WhatMoves],
         *,
         fast: bool = False,
         live: bool = False,
@@ -281,7 +281,7 @@ class Service:
                 self._profile.name,
                 str(self._folder),
                 moving=self._began_moving.value,
-                hardware=self._began_moving is Reality.HARDWARE,
+                hardware=self._began_moving is WhatMoves.HARDWARE,
                 told=what_moves(self._profile.rig, self._began_moving),
                 fast=self._fast,
                 live=self._live,

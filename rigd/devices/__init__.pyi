@@ -2,8 +2,8 @@ from ._eds import Eds as Eds
 from ._eds import EdsEntry as EdsEntry
 from ._eds import EdsError as EdsError
 from ._eds import read_eds as read_eds
-from ._registry import Reality as Reality
 from ._registry import UnknownDeviceError as UnknownDeviceError
+from ._registry import WhatMoves as WhatMoves
 from ._registry import check_selection as check_selection
 from ._registry import objections as objections
 from ._registry import open_devices as open_devices

@@ -24,7 +24,7 @@ class UnknownDeviceError(UserError, ValueError):
     """A profile names drivers that do not exist or do not belong together."""
 
 
-class Reality(Enum):
+class WhatMoves(Enum):
     """What moves when a rig is opened now."""
 
     HARDWARE = "the hardware"
@@ -36,7 +36,7 @@ class Reality(Enum):
     @property
     def any_clock(self) -> bool:
         """Whether time may be skipped."""
-        return self in (Reality.SIMULATED, Reality.LOCK_STEP)
+        return self in (WhatMoves.SIMULATED, WhatMoves.LOCK_STEP)
 
 
 def check_selection(selection: Selection, source: Path | None = None) -> None:
@@ -63,17 +63,17 @@ def check_selection(selection: Selection, source: Path | None = None) -> None:
         )
 
 
-def reality(rig: RigParameters) -> Reality:
+def reality(rig: RigParameters) -> WhatMoves:
     """Return what would move if the devices of a rig were opened now."""
     if rig.devices.drive == "sim":
-        return Reality.SIMULATED
+        return WhatMoves.SIMULATED
     simulator = find_simulator(rig.name)
     if simulator is None:
-        return Reality.HARDWARE
-    return Reality.LOCK_STEP if simulator.lock_step else Reality.SIMULATOR
+        return WhatMoves.HARDWARE
+    return WhatMoves.LOCK_STEP if simulator.lock_step else WhatMoves.SIMULATOR
 
 
-def what_moves(rig: RigParameters, moving: Reality) -> str:
+def what_moves(rig: RigParameters, moving: WhatMoves) -> str:
     """Say what will move, the hardware or its simulation.
 
     Parameters
@@ -83,8 +83,8 @@ def what_moves(rig: RigParameters, moving: Reality) -> str:
     moving
         What `reality` found.
     """
-    if moving is not Reality.HARDWARE:
-        how = "in this process" if moving is Reality.SIMULATED else moving.value
+    if moving is not WhatMoves.HARDWARE:
+        how = "in this process" if moving is WhatMoves.SIMULATED else moving.value
         return f"No hardware: {rig.name} is simulated ({how})."
     assert rig.can is not None
     assert rig.cia402 is not None
@@ -122,7 +122,7 @@ def simulator() -> ModuleType:
     return importlib.import_module("rigd.sim.wire")
 
 
-def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:
+def open_devices(rig: RigParameters, moving: WhatMoves | None = None) -> Devices:
     """Make the drivers that a profile names; nothing is connected yet.
 
     Parameters
@@ -145,8 +145,8 @@ def open_devices(rig: RigParameters, moving: Reality | None = None) -> Devices:
         "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
     )
     devices = opener(rig)
-    if moving is not None and devices.simulated is (moving is Reality.HARDWARE):
-        found = "a simulated rig" if devices.simulated else Reality.HARDWARE.value
+    if moving is not None and devices.simulated is (moving is WhatMoves.HARDWARE):
+        found = "a simulated rig" if devices.simulated else WhatMoves.HARDWARE.value
         raise DeviceError(
             f"{moving.value.capitalize()} was to move, and now it would be {found}: rigd simulate "
             "was started or ended in between. Nothing was sent; start again."

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from rigd.devices._registry import Reality, objections, open_devices
+from rigd.devices._registry import WhatMoves, objections, open_devices
 from rigd.devices._simulator import SimulatorAddress, find_simulator
 from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
@@ -86,7 +86,7 @@ class ResettableDrive(Protocol):
         """
 
 
-def reset_drive(rig: RigParameters, moving: Reality | None = None) -> str:
+def reset_drive(rig: RigParameters, moving: WhatMoves | None = None) -> str:
     """Reset the drive of a rig, and let go of it.
 
     Parameters

@@ -1,8 +1,9 @@
 """The control process and the recorder process, and the shared memory between them.
 
-Offers the memory (`Channels`, `Board`, `Ring`), the processes' table and messages (`PROCESSES`,
-`Child`, `Parent`), one tick (`Cycle`), clocks and real-time settings (`obtain`). The programs are
-`control_process`, which alone talks to the devices and switches the torque off, and `recorder`.
+Offers the memory (`Channels`, `SharedState`, `Ring`), the processes' table and messages
+(`PROCESSES`, `Child`, `Parent`), one tick (`Cycle`), clocks and real-time settings (`obtain`). The
+programs are `control_process`, which alone talks to the devices and switches the torque off, and
+`recorder`.
 `PROCESSES` says what follows when a process dies; `rigd.runner` watches them and asks for the stop.
 """
 

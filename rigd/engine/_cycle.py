@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rigd.control import PidController
 from rigd.devices import DeviceError, Devices, Wrench
-from rigd.engine._timing import Metronome
+from rigd.engine._timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime import runtime_folder
 from rigd.safety import LimitWatch, Violation
@@ -432,7 +432,7 @@ class Rest:
 
 def observe_rest(
     cycle: Cycle,
-    metronome: Metronome,
+    metronome: TickScheduler,
     *,
     rate_hz: float,
     duration_s: float,

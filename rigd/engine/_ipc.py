@@ -1,8 +1,8 @@
 """The processes of a rig: their table, how they are started, and both ends of their pipes.
 
 One table, `PROCESSES`, says how each process is started, watched, and ended. Every process counts
-up its word on the `Board` several times a second. A dead process is noticed at once, a hung one by
-its heartbeat; the table says what happens then.
+up its word in the `SharedState` several times a second. A dead process is noticed at once, a hung
+one by its heartbeat; the table says what happens then.
 
 A child is ``python -m MODULE``. Its standard input brings its job and then messages; the end of it
 means that the supervisor is gone. Its standard output brings its answers (`_messages`).

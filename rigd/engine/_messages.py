@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:  # children start before the supervisor has imported any of these
-    from rigd.devices import Reality
+    from rigd.devices import WhatMoves
     from rigd.engine._ring import ReferenceSpec
     from rigd.engine._topics import ChannelSpecs
     from rigd.profile import Profile, RealtimeSettings
@@ -45,7 +45,7 @@ class ControlJob:
 
     profile: "Profile"
     """Profile whose devices are connected."""
-    moving: "Reality | None"
+    moving: "WhatMoves | None"
     """What the operator was told would move, and nothing else may; None: nothing was told."""
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""

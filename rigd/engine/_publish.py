@@ -8,8 +8,8 @@ from rigd.devices import Devices, LineHealth
 from rigd.engine._cycle import Cycle
 from rigd.engine._ipc import Pulse
 from rigd.engine._ring import Ring
-from rigd.engine._shared_state import UNKNOWN, Board, Word
-from rigd.engine._timing import Clock, Metronome
+from rigd.engine._shared_state import UNKNOWN, SharedState, Word
+from rigd.engine._timing import Clock, TickScheduler
 from rigd.engine._topics import CONTROL, Channels
 from rigd.session import Status, pack_control_into, pack_sample_into, pack_timing_into
 
@@ -20,7 +20,7 @@ class Display:
     Parameters
     ----------
     board
-        Board to write to.
+        SharedState to write to.
     devices
         Devices whose line health it reports.
 
@@ -30,7 +30,7 @@ class Display:
         About the age of the readings, as of the last call of `show`, for the operator.
     """
 
-    def __init__(self, board: Board, devices: Devices) -> None:
+    def __init__(self, board: SharedState, devices: Devices) -> None:
         self._board = board
         self._devices = devices
         self.doubts: list[str] = []
@@ -132,7 +132,7 @@ class SampleLog:
     def __init__(
         self,
         cycle: Cycle,
-        metronome: Metronome,
+        metronome: TickScheduler,
         clock: Clock,
         channels: Channels,
         late_ns: int,

@@ -17,7 +17,7 @@ from rigd.engine._ipc import Parent
 from rigd.engine._publish import Display, SampleLog
 from rigd.engine._realtime import page_faults
 from rigd.engine._shared_state import Event, Level, Phase, Stop, Word, write_event
-from rigd.engine._timing import SUSPENDED_S, Clock, Metronome, SuspendWatch
+from rigd.engine._timing import SUSPENDED_S, Clock, SuspendWatch, TickScheduler
 from rigd.engine._topics import Channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -56,7 +56,7 @@ class SessionEnd(Exception):
         self.device_failed = device_failed
 
 
-class Procedure:
+class SessionSequence:
     """One session on connected devices.
 
     Parameters
@@ -85,7 +85,7 @@ class Procedure:
         reference_rad: Sequence[float],
         cycle: Cycle,
         clock: Clock,
-        metronome: Metronome,
+        metronome: TickScheduler,
         standstill: Standstill,
         channels: Channels,
         display: Display,
@@ -225,7 +225,7 @@ class Procedure:
                 )
             if self._clock.virtual:
                 self._display.show(self._cycle, self._metronome.due_ns)
-                self._check_stop()
+                self._switch_off_if_stopped()
                 time.sleep(_GO_POLL_S)
             else:
                 self._tick(self._start_angle_rad)
@@ -276,7 +276,7 @@ class Procedure:
             if end is None:
                 end = self._step(start_rad + reference[tick])
             else:
-                self._observe_switched_off()
+                self._switch_off_and_observe()
             wait = virtual or end is not None
             log.write(tick, start_rad + reference[tick], missed, wait=wait)
             scheduled[0] = tick + 1
@@ -332,7 +332,7 @@ class Procedure:
                 "limits.missed_ticks_in_a_row = "
                 f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED}",
             )
-        self._check_stop()
+        self._switch_off_if_stopped()
         end = self._step(reference_rad)
         if end is not None:
             raise end
@@ -360,7 +360,7 @@ class Procedure:
             rig.motor.inertia_kg_m2, rig.rate_hz, rig.encoder.resolution_rad
         )
 
-    def _observe_switched_off(self) -> None:
+    def _switch_off_and_observe(self) -> None:
         """Switch off, and read once more for the last sample if the devices still answer."""
         self._cycle.torque_off()
         try:
@@ -380,7 +380,7 @@ class Procedure:
         )
 
     def _check_reading(self) -> None:
-        self._check_stop()
+        self._switch_off_if_stopped()
         self._cycle.check_encoder(self._standstill, self._metronome.due_ns)
         silent = self._cycle.check_stale()
         if silent is not None:
@@ -449,7 +449,7 @@ class Procedure:
                 )
         return self._stop_reason()
 
-    def _check_stop(self) -> None:
+    def _switch_off_if_stopped(self) -> None:
         looking = self._metronome.tick % LOOK_EVERY == 0
         end = self._look() if looking else self._stop_reason()
         if end is not None:

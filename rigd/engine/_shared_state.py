@@ -1,9 +1,9 @@
 """Shared state of a rig's processes: words that tell where each of them is, and events.
 
 Words
-    `Board` holds a few words by which processes tell each other where they are. Each word has one
-    writer. Access takes a fraction of a microsecond and never blocks, so the control loop may use
-    them.
+    `SharedState` holds a few words by which processes tell each other where they are. Each word has
+    one writer. Access takes a fraction of a microsecond and never blocks, so the control loop may
+    use them.
 Events
     What the control process has to say, as fixed-size records in a ring of their own. The loop must
     not wait for a listener, so it writes to shared memory instead of a pipe; the recorder puts each
@@ -64,7 +64,7 @@ class Stop(IntEnum):
 
 
 class Word(IntEnum):
-    """Index of each word of the :class:`Board`."""
+    """Index of each word of the :class:`SharedState`."""
 
     # Written by the supervisor
     STOP = 0
@@ -109,7 +109,7 @@ UNKNOWN = -1
 """Value for a line that does not exist, or does not report."""
 
 
-class Board:
+class SharedState:
     """Array of signed 64-bit words, indexed by :class:`Word`.
 
     Parameters

@@ -1,7 +1,7 @@
 """Clocks of the cycle, real and virtual, and the schedule of its ticks.
 
 Both clocks count nanoseconds of monotonic time and answer the same two questions, so the cycle is
-the same code under either. `Metronome` says when a tick is due and how many were missed,
+the same code under either. `TickScheduler` says when a tick is due and how many were missed,
 `SuspendWatch` whether the computer was suspended.
 """
 
@@ -118,7 +118,7 @@ def _clock_since_boot() -> Callable[[], int]:
     return partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
 
 
-class Metronome:
+class TickScheduler:
     """Absolute deadlines, one a period; a missed tick is skipped, never made up in a burst.
 
     Parameters
@@ -141,8 +141,8 @@ class Metronome:
 
     Examples
     --------
-    >>> from rigd.engine import Metronome, VirtualClock
-    >>> metronome = Metronome(VirtualClock(), rate_hz=1000)
+    >>> from rigd.engine import TickScheduler, VirtualClock
+    >>> metronome = TickScheduler(VirtualClock(), rate_hz=1000)
     >>> metronome.restart()
     >>> [metronome.wait() for _ in range(3)], metronome.t_ns
     ([0, 0, 0], 2000000)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
-from rigd.engine._shared_state import EVENT_SIZE, Board, Stop, Word
+from rigd.engine._shared_state import EVENT_SIZE, SharedState, Stop, Word
 from rigd.safety import BUFFERED_S
 from rigd.session import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
@@ -84,7 +84,7 @@ class Channels:
     """Ages of the readings."""
     samples: Ring
     """Samples."""
-    board: Board
+    board: SharedState
     """State that every process can read."""
     reference_fd: int = -1
     """Where the supervisor places the reference of a session."""
@@ -133,14 +133,14 @@ def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFF
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
         for topic, fd in zip(TOPICS, for_rings, strict=True)
     ]
-    return _together(rings, Board.create(for_board), for_reference)
+    return _together(rings, SharedState.create(for_board), for_reference)
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
     """Attach in a child process to what the supervisor made."""
-    return _together([Ring(spec) for spec in specs.rings], Board(specs.board_fd))
+    return _together([Ring(spec) for spec in specs.rings], SharedState(specs.board_fd))
 
 
-def _together(rings: Sequence[Ring], board: Board, reference_fd: int = -1) -> Channels:
+def _together(rings: Sequence[Ring], board: SharedState, reference_fd: int = -1) -> Channels:
     events, controls, timings, samples = rings
     return Channels(events, controls, timings, samples, board, reference_fd)

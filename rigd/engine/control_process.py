@@ -38,9 +38,9 @@ from rigd.engine._messages import (
 from rigd.engine._publish import Display
 from rigd.engine._realtime import REFUSED, collect_no_garbage, obtain
 from rigd.engine._ring import map_reference
-from rigd.engine._session_sequence import Procedure, SessionEnd
+from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine._shared_state import Event, Phase, Word, write_event
-from rigd.engine._timing import Clock, Metronome, RealClock, VirtualClock
+from rigd.engine._timing import Clock, RealClock, TickScheduler, VirtualClock
 from rigd.engine._topics import Channels, attach_channels
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -94,7 +94,7 @@ def attend(
     devices
         Not yet connected.
     clock, channels, parent, stop
-        As for :class:`rigd.engine._session_sequence.Procedure`.
+        As for :class:`rigd.engine._session_sequence.SessionSequence`.
     obtained
         The real-time settings that were granted, for the file.
     """
@@ -142,7 +142,7 @@ class _Attendance:
         self._profile = profile
         self._devices = devices
         self._clock = clock
-        self._metronome = Metronome(clock, profile.rig.rate_hz)
+        self._metronome = TickScheduler(clock, profile.rig.rate_hz)
         self._channels = channels
         self._board = channels.board
         self._parent = parent
@@ -260,7 +260,7 @@ class _Attendance:
             board[word] = 0
         self._warn_of_refusals(job)
         cycle = self._cycle = self._make_cycle(job.profile)
-        procedure = Procedure(
+        procedure = SessionSequence(
             job.profile,
             map_reference(job.reference),
             cycle,

@@ -16,7 +16,7 @@ from pathlib import Path
 from rigd.engine._ipc import Parent
 from rigd.engine._messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
 from rigd.engine._realtime import Precedence
-from rigd.engine._shared_state import Board, Phase, Word, read_events
+from rigd.engine._shared_state import Phase, SharedState, Word, read_events
 from rigd.engine._topics import (
     CONTROL,
     EVENT,
@@ -104,7 +104,7 @@ def _record(parent: Parent, channels: Channels, writer: SessionWriter, folder: P
                 return
 
 
-def _show_free_space(board: Board, folder: Path) -> None:
+def _show_free_space(board: SharedState, folder: Path) -> None:
     """Let the loop know; a folder that has gone is told by the next write."""
     with contextlib.suppress(OSError):
         board[Word.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))

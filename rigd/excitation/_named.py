@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rigd.excitation._from_file import from_csv
-from rigd.excitation._narrow_sweeps import Foresight, modes
+from rigd.excitation._narrow_sweeps import LoopPreview, modes
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 
 Value = float | int | str | Path
@@ -25,7 +25,7 @@ FROM_THE_RIG = frozenset({"rate_hz", "rig"})
 
 
 def make_excitation(
-    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: Foresight | None = None
+    kind: str, parameters: Mapping[str, Value], rate_hz: float, rig: LoopPreview | None = None
 ) -> Excitation:
     """Make one for a rig's rate.
 

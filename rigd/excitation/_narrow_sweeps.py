@@ -199,7 +199,7 @@ _RIDGE: Final = 1e-12
 """Relative ridge on the information: few bands leave some parameter combinations undetermined."""
 
 
-class Foresight(Protocol):
+class LoopPreview(Protocol):
     """Loop preview: what is known of the rig before it moves."""
 
     @property
@@ -237,7 +237,9 @@ class Band:
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
-def shares_of_time(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: Foresight) -> Real:
+def shares_of_time(
+    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview
+) -> Real:
     """Split the time over bands so that the damping comes out most precisely.
 
     The geometric mean of the standard deviations of the damping's parameters is minimised, with all
@@ -289,7 +291,7 @@ def damping_of(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 
 
 def _information_rates(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: Foresight, damping: Damping
+    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: LoopPreview, damping: Damping
 ) -> tuple[Real, int]:
     """Information in a second of each band, (bands, k, k); the damping's parameters come first.
 
@@ -340,7 +342,7 @@ def modes(
     rest_s: float = 1.0,
     ring_down_s: float = 15.0,
     taper_s: float = 1.0,
-    rig: Foresight | None = None,
+    rig: LoopPreview | None = None,
 ) -> Excitation:
     """Linear sweeps through narrow bands round modes, one after the other.
 
@@ -429,7 +431,7 @@ def _bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Ba
     return bands
 
 
-def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: Foresight) -> list[float]:
+def _within_limits(sweeps: Sequence[Real], amplitude_rad: float, rig: LoopPreview) -> list[float]:
     """Return for each sweep the amplitude, or the largest that leaves the rig within its limits.
 
     One after the other, since a mode still rings while the next is swept.

@@ -16,7 +16,7 @@ from rigd.engine import (
     read_events,
 )
 from rigd.session import decode_samples, decode_timings
-from rigd.view import Note, Picture, Subject
+from rigd.view import Note, Scene, Subject
 
 if TYPE_CHECKING:
     from rigd.view import Drawing
@@ -139,7 +139,7 @@ class Intake:
     """
 
     def __init__(self, session: LiveSession, channels: Channels, seen: int = 0) -> None:
-        self.picture = Picture(session.subject)
+        self.picture = Scene(session.subject)
         self.t_ns = 0
         self.took_s = 0.0
         self._rate_hz = session.subject.rate_hz

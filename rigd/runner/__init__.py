@@ -1,9 +1,9 @@
 """The supervisor: plans sessions, starts the processes of a rig, has them run, and ends them.
 
-Offers planning (`plan_session`, `Foresight`), a request and its file (`Order`, `load_rig`), the
-processes (`Crew`), the rig on which sessions are run (`Rig`), sessions that follow each other
-(`Series`) and those in the foreground (`run_in_foreground`). It moves nothing itself: a dead or
-hung process is noticed in `_session`, which asks the control process to stop; that switches the
+Offers planning (`plan_session`, `LoopPreview`), a request and its file (`Order`, `load_rig`), the
+processes (`ProcessGroup`), the rig on which sessions are run (`Rig`), sessions that follow each
+other (`Series`) and those in the foreground (`run_in_foreground`). It moves nothing itself: a dead
+or hung process is noticed in `_session`, which asks the control process to stop; that switches the
 torque off (`rigd.engine.control_process`).
 """
 

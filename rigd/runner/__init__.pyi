@@ -3,11 +3,11 @@ from ._console import plan_lines as plan_lines
 from ._console import result_line as result_line
 from ._foreground import SeriesFailedError as SeriesFailedError
 from ._foreground import run_in_foreground as run_in_foreground
-from ._planning import Foresight as Foresight
+from ._planning import LoopPreview as LoopPreview
 from ._planning import RefusedError as RefusedError
 from ._planning import excitation_for as excitation_for
 from ._planning import plan_session as plan_session
-from ._process_group import Crew as Crew
+from ._process_group import ProcessGroup as ProcessGroup
 from ._request import NoRoomError as NoRoomError
 from ._request import Order as Order
 from ._request import load_rig as load_rig

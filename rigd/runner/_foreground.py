@@ -8,13 +8,13 @@ from typing import Self
 
 import typer
 
-from rigd.devices import Reality, simulated_differently, what_moves
+from rigd.devices import WhatMoves, simulated_differently, what_moves
 from rigd.engine import Event
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
 from rigd.profile import Profile
 from rigd.runner._console import ProgressLine, plan_lines, result_line
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import load_rig, what_is_kept
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
@@ -47,7 +47,7 @@ class SeriesFailedError(FailureError):
 
 def run_in_foreground(
     build: Callable[[Profile], Excitation],
-    crew: Crew,
+    crew: ProcessGroup,
     stop: StopRequest,
     *,
     profile_name: str,
@@ -102,8 +102,8 @@ def run_in_foreground(
             _tell(what_moves(profile.rig, moving), err=True)
             for difference in simulated_differently(profile.rig):
                 tell(f"Warning: the simulated rig has {difference}.")
-            alone = not (fast and moving is Reality.SIMULATED)
-            shared = moving is Reality.HARDWARE
+            alone = not (fast and moving is WhatMoves.SIMULATED)
+            shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
             series = Series(
                 profile, build(profile), folder, repeat=repeat, notes=notes, force=force

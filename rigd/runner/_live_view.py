@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from rigd.engine import LIVE, ChildError, Event, Failed, Level, Pulse, Word
 from rigd.live import LiveAddress, LiveEnd, LiveJob, LiveSession, LiveShown
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runtime import StopRequest
 from rigd.view import Subject
@@ -36,7 +36,7 @@ class LiveView:
         Address of the view, as far as it is known.
     """
 
-    def __init__(self, crew: Crew, rig: str) -> None:
+    def __init__(self, crew: ProcessGroup, rig: str) -> None:
         self.address: LiveAddress | None = None
         self._crew = crew
         self._job = LiveJob(rig, crew.channels.specs)

@@ -50,7 +50,7 @@ class Plan:
     """What the free end will do, and whether the linear model holds there."""
 
 
-class Foresight:
+class LoopPreview:
     """Loop preview: what an excitation made for one rig may know of it.
 
     Parameters
@@ -98,7 +98,7 @@ def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value])
     kind, parameters
         Name and options of the excitation.
     """
-    return make_excitation(kind, parameters, profile.rig.rate_hz, Foresight(profile))
+    return make_excitation(kind, parameters, profile.rig.rate_hz, LoopPreview(profile))
 
 
 def plan_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _DESCRIPTORS = 6
 
 
-class Crew:
+class ProcessGroup:
     """Control, recorder and, if wanted, live publisher of a rig.
 
     Leaving the context ends them all, the one with the torque first.

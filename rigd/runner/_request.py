@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rigd import __version__
 from rigd.devices import (
-    Reality,
+    WhatMoves,
     check_selection,
     objections,
     reality,
@@ -58,7 +58,7 @@ class Order:
 
 def load_rig(
     name: str, *, fast: bool = False, seed: int | None = None, hardware: bool = False
-) -> tuple[Profile, Reality]:
+) -> tuple[Profile, WhatMoves]:
     """Load a profile and see what would move.
 
     Parameters
@@ -86,21 +86,21 @@ def load_rig(
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
     moving = reality(profile.rig)
-    if hardware and moving is not Reality.HARDWARE:
+    if hardware and moving is not WhatMoves.HARDWARE:
         raise RefusedError(
             f"--hardware: {what_moves(profile.rig, moving)} Leave the option out, or end what "
             "stands in for the hardware."
         )
-    if moving is Reality.HARDWARE and not hardware:
+    if moving is WhatMoves.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
     if fast and not moving.any_clock:
         raise RefusedError(
             f"--fast: {moving.value} of {profile.path} moves in real time, which cannot be "
             "skipped; leave the option out."
-            + (" Or start rigd simulate with --lock-step." if moving is Reality.SIMULATOR else "")
+            + (" Or start rigd simulate with --lock-step." if moving is WhatMoves.SIMULATOR else "")
         )
     if seed is not None:
-        if moving is not Reality.SIMULATED:
+        if moving is not WhatMoves.SIMULATED:
             raise RefusedError(
                 f"--seed: the noise of {moving.value} of {profile.path} is not made here; leave "
                 "the option out."

@@ -8,11 +8,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rigd.devices import DeviceError, Reality, reset_drive
+from rigd.devices import DeviceError, WhatMoves, reset_drive
 from rigd.engine import (
     CONTROL,
     LIVE,
-    Board,
     ChildError,
     Connected,
     ControlJob,
@@ -21,6 +20,7 @@ from rigd.engine import (
     Precedence,
     Pulse,
     Refused,
+    SharedState,
     Stop,
     Tare,
     Word,
@@ -29,7 +29,7 @@ from rigd.engine import (
 from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runner._session import Session, SessionFailedError, SessionResult, Watcher, always
 from rigd.runner._status import RigStatus, StatusWatch
@@ -70,7 +70,12 @@ class Rig:
     """
 
     def __init__(
-        self, profile: Profile, *, fast: bool = False, live: bool = False, crew: Crew | None = None
+        self,
+        profile: Profile,
+        *,
+        fast: bool = False,
+        live: bool = False,
+        crew: ProcessGroup | None = None,
     ) -> None:
         self._profile = profile
         self._fast = fast
@@ -91,7 +96,7 @@ class Rig:
         """Whether no motor moves; known once connected."""
         return self._told is not None and self._told.simulated
 
-    def connect(self, moving: Reality | None = None, *, reset_fault: bool = False) -> None:
+    def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
 
         Parameters
@@ -109,7 +114,7 @@ class Rig:
         if self.connected:
             self.disconnect()
         try:
-            crew = self._crew = self._crew or Crew(live=self._live)
+            crew = self._crew = self._crew or ProcessGroup(live=self._live)
             granted = self._take_precedence(crew)
             if reset_fault:
                 self._reset_fault(moving)
@@ -283,7 +288,7 @@ class Rig:
             self._precedence.release()
             self._precedence = None
 
-    def _take_precedence(self, crew: Crew) -> dict[str, str]:
+    def _take_precedence(self, crew: ProcessGroup) -> dict[str, str]:
         """Put this process before the ordinary ones; say what was granted."""
         if self._fast:
             return {}
@@ -292,13 +297,13 @@ class Rig:
         crew.cores = self._precedence.cores_before
         return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
 
-    def _reset_fault(self, moving: Reality | None) -> None:
+    def _reset_fault(self, moving: WhatMoves | None) -> None:
         try:
             reset_drive(self._profile.rig, moving)
         except (DeviceError, OSError) as error:
             raise RigError(str(error)) from None
 
-    def _require(self) -> Crew:
+    def _require(self) -> ProcessGroup:
         if self._crew is None or not self.connected:
             raise RigError("The rig is not connected.")
         return self._crew
@@ -346,14 +351,14 @@ class Rig:
         self.disconnect()
 
 
-def _wipe(board: Board) -> None:
+def _wipe(board: SharedState) -> None:
     """Clear the words of the board that belong to one session."""
     board[Word.STOP] = Stop.NO
     board[Word.GO] = 0
     board[Word.LIVE_DROPPED] = 0
 
 
-def _lay_out(crew: Crew, rate_hz: float, *, fast: bool) -> None:
+def _lay_out(crew: ProcessGroup, rate_hz: float, *, fast: bool) -> None:
     try:
         crew.lay_out(rate_hz, fast=fast)
     except OSError as error:

@@ -39,7 +39,7 @@ from rigd.engine import (
 )
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order, another_path, file_header, part_of
 from rigd.runtime import StopRequest
 
@@ -212,7 +212,7 @@ class Session:
     def __init__(
         self,
         order: Order,
-        crew: Crew,
+        crew: ProcessGroup,
         connected: Connected,
         live: LiveView | None,
         watcher: Watcher,

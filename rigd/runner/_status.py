@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from rigd.engine import PROCESSES, SUPERVISOR, TOPICS, Observer, Phase, Pulse, Ring, Word
 from rigd.live import LiveAddress
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.session import decode_samples
 
 _WINDOW_S: Final = 1.0
@@ -187,7 +187,7 @@ class StatusWatch:
         self._written: tuple[float, tuple[int, ...]] | None = None
         self._signals = SignalWatch(rate_hz)
 
-    def look(self, crew: Crew) -> RigStatus:
+    def look(self, crew: ProcessGroup) -> RigStatus:
         """Return the status now."""
         board = crew.channels.board
         load_ppm = board.known(Word.BUS_LOAD_PPM)
@@ -210,7 +210,7 @@ class StatusWatch:
             topics=tuple(self._topics(crew)),
         )
 
-    def _topics(self, crew: Crew) -> Iterator[TopicStatus]:
+    def _topics(self, crew: ProcessGroup) -> Iterator[TopicStatus]:
         rings, now_s = crew.channels.rings, time.monotonic()
         written = tuple(ring.written for ring in rings)
         before_s, before = self._written or (now_s, written)
@@ -222,7 +222,7 @@ class StatusWatch:
             expected_hz = topic.expected_hz(self._rate_hz)
             yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
 
-    def _processes(self, crew: Crew) -> Iterator[ProcessStatus]:
+    def _processes(self, crew: ProcessGroup) -> Iterator[ProcessStatus]:
         board, now_s = crew.channels.board, time.monotonic()
         for process in PROCESSES:
             still_s = self._pulses[process].look(board[process.beat], now_s)

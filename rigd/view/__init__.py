@@ -1,6 +1,6 @@
 """What Rerun shows of a session: its layout, and the drawing of samples, events and health.
 
-Offers the scene of a session (`Picture`), which turns records into drawings, recorded sessions and
+Offers the scene of a session (`Scene`), which turns records into drawings, recorded sessions and
 Rerun's files (`draw_session`, `new_rrd_file`), and charts over frequency (`Chart`). Rerun takes
 half a second to import, so it is imported by the functions that need it. Viewers, servers and
 processes are in `rigd.live`.

@@ -30,7 +30,7 @@ from ._rrd_file import new_rrd_file as new_rrd_file
 from ._rrd_file import settle_sdk as settle_sdk
 from ._rrd_file import without_settings as without_settings
 from ._scene import Drawing as Drawing
-from ._scene import Picture as Picture
+from ._scene import Scene as Scene
 from ._session_info import Health as Health
 from ._session_info import Note as Note
 from ._session_info import Subject as Subject

@@ -12,7 +12,7 @@ from rigd.session import Session, SessionError, Status
 from rigd.units import unit_of
 from rigd.view._layout import blueprint
 from rigd.view._plots import TIMELINE
-from rigd.view._scene import Picture
+from rigd.view._scene import Scene
 from rigd.view._session_info import Health, Note, Subject, outcome_note
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def draw_session(
         As `subject_of_session` does.
     """
     subject = subject_of_session(session)
-    picture = Picture(subject, lambda: layout or recorded_blueprint())
+    picture = Scene(subject, lambda: layout or recorded_blueprint())
     # The time at which it is drawn is not to be shown.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)

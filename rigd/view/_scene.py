@@ -43,7 +43,7 @@ _MOST_NOTES: Final = 200
 """Lines of the log that a new connection is given again."""
 
 
-class Picture:
+class Scene:
     """Keeps what must be computed along, and turns what comes into drawings.
 
     It sends nothing itself, so nothing that stalls can disturb what is computed.

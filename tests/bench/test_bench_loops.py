@@ -47,7 +47,7 @@ def test_a_loop_that_fails_is_told(profile, monkeypatch):
     def no_memory(**_):
         raise OSError("no shared memory")
 
-    monkeypatch.setattr("rigd.bench._loops.Crew", no_memory)
+    monkeypatch.setattr("rigd.bench._loops.ProcessGroup", no_memory)
     with pytest.raises(loops.LoopError, match="no shared memory"):
         loops.run_alone("alone", profile, SECONDS, lambda: None)
 

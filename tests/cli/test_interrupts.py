@@ -104,7 +104,7 @@ def interrupt(**_):
 
 @pytest.mark.parametrize("command", [("run", "hold"), ("identify", "motor")])
 def test_before_a_session_s_processes_are_started_it_says_so(rigd_here, monkeypatch, command):
-    monkeypatch.setattr(f"rigd.cli.{command[0]}.start_crew", interrupt)
+    monkeypatch.setattr(f"rigd.cli.{command[0]}.start_processes", interrupt)
     done = rigd_here(*command)
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr == "Stopped before anything began.\n"
@@ -117,7 +117,7 @@ def stopped_early(monkeypatch, rigd_here):
     stop.requested = True
     for command in ("run", "identify"):
         monkeypatch.setattr(
-            f"rigd.cli.{command}.start_crew", lambda **_: (stop, contextlib.nullcontext())
+            f"rigd.cli.{command}.start_processes", lambda **_: (stop, contextlib.nullcontext())
         )
     return rigd_here
 

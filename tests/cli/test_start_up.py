@@ -60,7 +60,7 @@ def test_help_needs_no_arrays():
 
 
 def test_the_processes_of_a_rig_are_started_before_numpy_is_imported():
-    code = "import sys; from rigd.runner import Crew; print('numpy' in sys.modules)"
+    code = "import sys; from rigd.runner import ProcessGroup; print('numpy' in sys.modules)"
 
     told = subprocess.check_output([sys.executable, "-c", code], text=True)
 

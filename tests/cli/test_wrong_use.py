@@ -138,7 +138,9 @@ def test_predicted_peaks_of_a_tiny_motion_are_numbers(rigd_here, monkeypatch):
 
     stop = StopRequest()
     stop.requested = True  # told is what is planned, and nothing is run
-    monkeypatch.setattr("rigd.cli.run.start_crew", lambda **_: (stop, contextlib.nullcontext()))
+    monkeypatch.setattr(
+        "rigd.cli.run.start_processes", lambda **_: (stop, contextlib.nullcontext())
+    )
     options = ("--amplitude", "1e-6", "--stop-hz", "1", "--duration", "5", "--ring-down", "0")
     told = rigd_here("run", "chirp", "--fast", *options).stdout
     angle, speed, torque = map(float, re.findall(r"(?:angle|speed|torque) (\S+) of", told))

@@ -11,14 +11,14 @@ import pytest
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._service import CommandError, Service
 from rigd.daemon._states import Peer, State
-from rigd.devices._registry import Reality, open_devices
+from rigd.devices._registry import WhatMoves, open_devices
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.engine import control_process as control
 from rigd.engine import recorder
 from rigd.engine._ipc import CONTROL, ChildError
 from rigd.profile import load_profile
 from rigd.runner import _rig as rig_module
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.runner._rig import Rig
 from rigd.runtime._signals import StopRequest
 from rigd.session import SessionError, SessionWriter
@@ -240,7 +240,7 @@ def open_watched(rig, moving):
     return ThreadCrew.world.open_devices(rig)
 
 
-class ThreadCrew(Crew):
+class ThreadCrew(ProcessGroup):
     """Control and recorder as threads of this process."""
 
     world = None
@@ -266,7 +266,7 @@ class Operated:
         self.worker = ThreadPoolExecutor(1)
         self.events = []
         self.rig = Rig(profile, fast=True)
-        self.moving = Reality.SIMULATED
+        self.moving = WhatMoves.SIMULATED
         self.service = self.world.service = Service(
             self.rig,
             profile,
@@ -339,7 +339,7 @@ def operate(profile, tmp_path, monkeypatch):
     monkeypatch.setattr(control, "StopRequest", QuietStop)
     monkeypatch.setattr(control, "collect_no_garbage", lambda: "off")
     monkeypatch.setattr(control, "open_devices", open_watched)
-    monkeypatch.setattr(rig_module, "Crew", ThreadCrew)
+    monkeypatch.setattr(rig_module, "ProcessGroup", ThreadCrew)
     made = []
 
     def make():

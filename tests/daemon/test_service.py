@@ -7,7 +7,7 @@ import pytest
 from rigd.daemon import _protocol as protocol
 from rigd.daemon._service import CommandError
 from rigd.daemon._states import Peer, State
-from rigd.devices._registry import Reality
+from rigd.devices._registry import WhatMoves
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine._ipc import ChildError
 from rigd.engine._shared_state import Word
@@ -209,7 +209,7 @@ def test_a_rig_that_cannot_be_connected_is_a_fault_until_it_can(operate):
 def test_the_hardware_does_not_take_the_place_of_a_simulation(operated):
     operated.world.countdown, operated.world.then = 1200, fail
     operated.ask("start", **SHORT)
-    operated.moving = Reality.HARDWARE
+    operated.moving = WhatMoves.HARDWARE
     assert "start it anew" in str(operated.ask("reset"))
     assert operated.state is State.FAULT
     assert len(operated.world.drives) == 1

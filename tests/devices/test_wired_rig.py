@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from rigd.devices import _wired_rig as wired_rig
-from rigd.devices._registry import Reality, open_devices, reality, simulated_differently
+from rigd.devices._registry import WhatMoves, open_devices, reality, simulated_differently
 from rigd.devices._simulator import SimulatorAddress, announce, described
 from rigd.devices.contracts import DeviceError
 from rigd.profile import load_profile
@@ -29,28 +29,31 @@ def stand_in(runtime_folder):
 
 
 def test_what_would_move(rig, stand_in):
-    assert reality(load_profile("sim").rig) is Reality.SIMULATED
-    assert reality(rig) is Reality.HARDWARE
+    assert reality(load_profile("sim").rig) is WhatMoves.SIMULATED
+    assert reality(rig) is WhatMoves.HARDWARE
     stand_in("another_rig")
-    assert reality(rig) is Reality.HARDWARE
+    assert reality(rig) is WhatMoves.HARDWARE
     stand_in(rig.name)
-    assert reality(rig) is Reality.SIMULATOR
+    assert reality(rig) is WhatMoves.SIMULATOR
     stand_in(rig.name, lock_step=True)
-    assert reality(rig) is Reality.LOCK_STEP
+    assert reality(rig) is WhatMoves.LOCK_STEP
 
 
 def test_only_where_nothing_waits_for_the_clock_may_time_be_skipped():
-    assert {each for each in Reality if each.any_clock} == {Reality.SIMULATED, Reality.LOCK_STEP}
+    assert {each for each in WhatMoves if each.any_clock} == {
+        WhatMoves.SIMULATED,
+        WhatMoves.LOCK_STEP,
+    }
 
 
 def test_what_moves_is_what_was_said_to_move(rig, stand_in):
-    assert not open_devices(rig, Reality.HARDWARE).simulated
+    assert not open_devices(rig, WhatMoves.HARDWARE).simulated
     with pytest.raises(DeviceError, match="was to move, and now it would be the hardware"):
-        open_devices(rig, Reality.SIMULATOR)
+        open_devices(rig, WhatMoves.SIMULATOR)
     stand_in(rig.name, can_socket="/nowhere")
-    assert open_devices(rig, Reality.SIMULATOR).simulated
+    assert open_devices(rig, WhatMoves.SIMULATOR).simulated
     with pytest.raises(DeviceError, match="hardware was to move"):
-        open_devices(rig, Reality.HARDWARE)
+        open_devices(rig, WhatMoves.HARDWARE)
 
 
 def test_devices_say_whether_they_are_simulated(rig, stand_in):

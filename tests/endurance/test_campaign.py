@@ -12,7 +12,7 @@ import pytest
 from rigd.engine._ipc import CONTROL
 from rigd.excitation import hold
 from rigd.profile import load_profile
-from rigd.runner._process_group import Crew
+from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runner._rig import Rig
 from rigd.runtime._signals import StopRequest
@@ -34,7 +34,7 @@ def campaign():
 def test_sessions_on_one_connection_leave_nothing_behind(campaign, tmp_path):
     profile = load_profile("sim")
     excitation = hold(rate_hz=profile.rig.rate_hz, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
-    crew = Crew(live=False)
+    crew = ProcessGroup(live=False)
     control = crew[CONTROL].pid
     rig = Rig(profile, fast=True, crew=crew)
     looks = []

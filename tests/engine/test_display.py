@@ -8,7 +8,7 @@ import pytest
 from rigd.devices.contracts import LineHealth
 from rigd.engine._publish import Display
 from rigd.engine._ring import shared_memory_fd
-from rigd.engine._shared_state import Board, Word
+from rigd.engine._shared_state import SharedState, Word
 
 CYCLE = SimpleNamespace(angle_rad=0.1, coupling_torque_nm=float("nan"), torque_command_nm=-0.2)
 
@@ -24,7 +24,7 @@ class Line:
 @pytest.fixture
 def board():
     fd = shared_memory_fd()
-    yield Board.create(fd)
+    yield SharedState.create(fd)
     os.close(fd)
 
 

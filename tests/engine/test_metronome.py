@@ -5,7 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.engine._timing import SUSPENDED_S, Metronome, RealClock, SuspendWatch, VirtualClock
+from rigd.engine._timing import SUSPENDED_S, RealClock, SuspendWatch, TickScheduler, VirtualClock
 
 
 class LateClock:
@@ -31,7 +31,7 @@ class LateClock:
 )
 def test_every_tick_is_run_once_or_counted_as_missed(rate_hz, delays):
     period_ns = 1e9 / rate_hz
-    metronome = Metronome(LateClock([int(d * period_ns) for d in delays]), rate_hz)
+    metronome = TickScheduler(LateClock([int(d * period_ns) for d in delays]), rate_hz)
     start_ns = metronome.start_ns
     metronome.restart()
     before = -1
@@ -46,7 +46,7 @@ def test_every_tick_is_run_once_or_counted_as_missed(rate_hz, delays):
 
 
 def test_a_burst_of_missed_ticks_is_not_made_up():
-    metronome = Metronome(LateClock([0, 7_300_000, 0, 0]), 1000.0)
+    metronome = TickScheduler(LateClock([0, 7_300_000, 0, 0]), 1000.0)
     assert metronome.wait() == 0
     assert metronome.wait() == 7
     assert (metronome.tick, metronome.lateness_ns) == (9, 300_000)
@@ -55,7 +55,7 @@ def test_a_burst_of_missed_ticks_is_not_made_up():
 
 
 def test_due_times_go_on_evenly_through_a_restart():
-    metronome = Metronome(VirtualClock(), 1000.0)
+    metronome = TickScheduler(VirtualClock(), 1000.0)
     due = []
     for tick in range(6):
         if tick == 3:
@@ -67,7 +67,7 @@ def test_due_times_go_on_evenly_through_a_restart():
 
 
 def test_real_deadlines_do_not_drift_with_the_work():
-    metronome = Metronome(RealClock(), 500.0)
+    metronome = TickScheduler(RealClock(), 500.0)
     start_ns = metronome.start_ns
     missed, behind_ns = 0, []
     for _ in range(50):

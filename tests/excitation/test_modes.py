@@ -13,7 +13,7 @@ from rigd.cli import run
 from rigd.excitation import ExcitationError
 from rigd.excitation._named import FROM_THE_RIG, KINDS, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, damping_of, shares_of_time
-from rigd.runner._planning import Foresight, excitation_for, plan_session
+from rigd.runner._planning import LoopPreview, excitation_for, plan_session
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 
@@ -229,6 +229,6 @@ def test_without_a_rig_the_bands_get_equal_times_and_the_full_amplitude(document
 def test_foresight_agrees_with_the_plan(document, profile):
     made = excitation_for(profile, "modes", {"path": document(), "duration_s": 30.0})
     predicted = plan_session(profile, made).prediction
-    assert Foresight(profile).share_of_limits(made.reference_rad) == pytest.approx(
+    assert LoopPreview(profile).share_of_limits(made.reference_rad) == pytest.approx(
         predicted.peak_torque_nm / profile.rig.motor.peak_torque_nm
     )

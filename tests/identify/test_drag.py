@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from analysis.identify import select
-from analysis.identify._candidates import Field
+from analysis.identify._candidates import CandidateSet
 from analysis.identify._drag import with_air_drag
 
 NOISE_NM = 5e-3
@@ -58,7 +58,7 @@ def test_the_beam_beside_the_drag_is_that_without_air(selection, plants, link):
 
 def test_without_drag_nothing_is_fitted_for_it(sessions):
     measured = sessions("VI").measured(noise_nm=NOISE_NM, seed=62)
-    field = Field.of(measured, (), (0.0, 50.0))
+    field = CandidateSet.of(measured, (), (0.0, 50.0))
     assert with_air_drag(field) is field
     assert field.drag is None
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import Measurement, select
-from analysis.identify._candidates import Field
+from analysis.identify._candidates import CandidateSet
 from analysis.identify._channel_checks import clipping, stops, wrong_scale
 from analysis.identify._headline import MISREAD
 from analysis.identify._leakage import repeats_after_s
@@ -79,7 +79,7 @@ def test_a_rig_that_is_otherwise_is_named_with_its_size(more, kind, true):
 
 
 def test_a_tip_mass_is_named_beside_what_explains_it_as_well():
-    field = Field.of(record(tip_mass_kg=1.5e-4), (), (0.0, 50.0))
+    field = CandidateSet.of(record(tip_mass_kg=1.5e-4), (), (0.0, 50.0))
     assert field.best.extras == ("tip_mass_kg",)
     assert field.best.fit.parameters["tip_mass_kg"] == pytest.approx(1.5e-4, rel=0.02)
     assert all(mode.damping_ratio_std > 0 for mode in field.best.fit.modes)
@@ -87,7 +87,7 @@ def test_a_tip_mass_is_named_beside_what_explains_it_as_well():
 
 
 def test_a_plain_rig_carries_nothing():
-    field = Field.of(record(), (), (0.0, 50.0))
+    field = CandidateSet.of(record(), (), (0.0, 50.0))
     assert all(not candidate.extras for candidate in field.candidates)
     assert not any(wrong_scale(field.comparison))
 

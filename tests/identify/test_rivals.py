@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify._candidates import Field
+from analysis.identify._candidates import CandidateSet
 from analysis.identify._headline import structures
 from analysis.identify._profile_likelihood import Profile
 from analysis.identify._rig_findings import of_rig
@@ -47,7 +47,7 @@ class Fitted:
 
 def field_of(*fitted):
     ranked = tuple(sorted(fitted, key=lambda each: each.bic))
-    return Field(comparison=None, noise=None, free=(), candidates=ranked, columns=())
+    return CandidateSet(comparison=None, noise=None, free=(), candidates=ranked, columns=())
 
 
 def fitted(name, bic, deviance, **more):

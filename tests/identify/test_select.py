@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.identify import SETTINGS, headline_json, select
-from analysis.identify._candidates import Field
+from analysis.identify._candidates import CandidateSet
 from analysis.identify._free_decay import mode_poles
 from analysis.identify._problem import Comparison
 from analysis.identify._profile_likelihood import CHI_SQUARE_95
@@ -231,7 +231,7 @@ def test_hum_and_a_stiffness_that_rises_become_neither_mode_nor_order(sessions, 
 @pytest.fixture(scope="module")
 def field(sessions):
     made = sessions("III", offsets=(0.006, -0.013))
-    return Field.of(made.measured(noise_nm=NOISE_NM, seed=46), (), (0.0, 50.0))
+    return CandidateSet.of(made.measured(noise_nm=NOISE_NM, seed=46), (), (0.0, 50.0))
 
 
 def test_a_beam_that_is_not_uniform_is_no_fractional_order(field):
@@ -283,7 +283,7 @@ def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sess
     profile, analysis = type_iii.verdict.alpha.profile, type_iii.analysis
     comparison = Comparison.of(sessions("III").measured(noise_nm=NOISE_NM, seed=41), (0.0, 50.0))
     nothing = np.zeros((0, comparison.frequency_hz.size), dtype=complex)
-    field = Field(comparison, analysis.noise, SETTINGS, type_iii.candidates, nothing)
+    field = CandidateSet(comparison, analysis.noise, SETTINGS, type_iii.candidates, nothing)
     costs = []
     for value in (profile.estimate, *profile.interval):
         held = Structure("VI", ("zeta", "gamma", "lambda"), {"alpha": value})

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.identify._candidates import Field
+from analysis.identify._candidates import CandidateSet
 from analysis.identify._diagnostics import of_settings
 from analysis.identify._profile_likelihood import Profile
 from analysis.identify._select import order as order_sentence
@@ -16,7 +16,7 @@ BAND_HZ = (0.0, 50.0)
 @pytest.fixture(scope="module")
 def without_delay(steps):
     """Candidates on a step that the beam still rings from, loudly, when the record ends."""
-    return Field.of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8), (), BAND_HZ)
+    return CandidateSet.of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8), (), BAND_HZ)
 
 
 def kinds(field):
@@ -28,7 +28,9 @@ def test_a_step_without_a_delay_names_nothing(without_delay):
 
 
 def test_a_delay_that_is_there_is_named_in_a_step(steps):
-    field = Field.of(steps("III", 0.3, delay_s=2e-3).measured(noise_nm=0.01, seed=5), (), BAND_HZ)
+    field = CandidateSet.of(
+        steps("III", 0.3, delay_s=2e-3).measured(noise_nm=0.01, seed=5), (), BAND_HZ
+    )
     (found,) = of_settings(field)
     assert found.kind == "delay"
     assert found.value == pytest.approx(2e-3, abs=3e-4)

@@ -16,7 +16,7 @@ from processes import children, eventually, state_of
 from rigd.beam import Beam, Damping
 from rigd.engine._messages import Failed, MessageReader, encode
 from rigd.engine._ring import Ring, shared_memory_fd
-from rigd.engine._shared_state import Board, Event, Word, write_event
+from rigd.engine._shared_state import Event, SharedState, Word, write_event
 from rigd.engine._topics import DESCRIPTORS, TOPICS, Channels
 from rigd.live._address import LiveAddress
 from rigd.live._ring_reader import LiveEnd, LiveJob, LiveSession, LiveShown
@@ -43,7 +43,7 @@ class Producer(threading.Thread):
             Ring.create(topic.record_size, capacity if topic.every else 256, fd)
             for topic, fd in zip(TOPICS, for_rings, strict=True)
         ]
-        self.channels = Channels(*rings, Board.create(for_board))
+        self.channels = Channels(*rings, SharedState.create(for_board))
         self.channels.board[Word.GO] = 1
         self.written = [0] * len(rings)
         self.tick = 0

@@ -11,13 +11,13 @@ from types import CodeType, FunctionType, ModuleType
 import pytest
 
 STARTS = {
-    "subprocess", "fork", "Rig", "Crew", "Child", "run_in_foreground", "run_session", "run_alone",
-    "process_pool", "LocalCluster", "Scene", "play", "busy", "attend",
+    "subprocess", "fork", "Rig", "ProcessGroup", "Child", "run_in_foreground", "run_session",
+    "run_alone", "process_pool", "LocalCluster", "Scene", "play", "busy", "attend",
 }  # fmt: skip
 """Names by which processes are started, or all that one does is run in the test's."""
 FITS = {
-    "select", "fit_record", "fit_frf", "analyse", "analyse_session", "campaign", "Field", "Refit",
-    "Comparison", "identify", "estimate_motor", "analyze_here", "judged",
+    "select", "fit_record", "fit_frf", "analyse", "analyse_session", "campaign", "CandidateSet",
+    "Refit", "Comparison", "identify", "estimate_motor", "analyze_here", "judged",
 }  # fmt: skip
 """Names by which models are fitted."""
 

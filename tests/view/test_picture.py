@@ -14,7 +14,7 @@ from rigd.beam import Damping
 from rigd.session import Status, read_session
 from rigd.session._format import TIMING_DTYPE
 from rigd.view._frequency_charts import MAGNITUDE, SweepResponse
-from rigd.view._scene import Picture
+from rigd.view._scene import Scene
 from rigd.view._session_info import Health, Note, Subject
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -87,7 +87,7 @@ def test_missing_and_held_values_are_made_up_for_as_the_analyser_does(path, reco
 
 
 def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, shown):
-    picture = Picture(subject_of(record))
+    picture = Scene(subject_of(record))
     for block in blocks(read_session(path).samples):
         picture.samples(block)
     drawings = picture.finish()
@@ -111,7 +111,7 @@ def test_final_response_that_is_shown_is_that_of_the_analyser(path, record, show
 
 
 def test_everything_has_its_place(subject, make_samples, shown):
-    picture = Picture(subject)
+    picture = Scene(subject)
     frame = picture.frame()
     t_s = np.arange(3000) / 1000.0
     samples = make_samples(3000, angle_rad=0.01 * np.sin(t_s), coupling_torque_nm=0.1)
@@ -147,7 +147,7 @@ def test_everything_has_its_place(subject, make_samples, shown):
 
 
 def test_a_new_connection_is_shown_what_is_known_already(path, record, shown):
-    picture = Picture(subject_of(record))
+    picture = Scene(subject_of(record))
     for block in blocks(read_session(path).samples[:30_000], 1000):
         picture.samples(block)
     picture.events([Note(1_000_000, "info", "The record begins.")])
@@ -168,7 +168,7 @@ def test_a_new_connection_is_shown_what_is_known_already(path, record, shown):
     ],
 )
 def test_any_session_can_be_shown(subject, make_samples, shown, changes):
-    picture = Picture(replace(subject, **changes))
+    picture = Scene(replace(subject, **changes))
     drawings = [*picture.frame(), *picture.samples(make_samples(0))]
     for samples in blocks(make_samples(3000, angle_rad=np.nan, coupling_torque_nm=np.nan), 700):
         drawings += picture.samples(samples)

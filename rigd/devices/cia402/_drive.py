@@ -10,7 +10,7 @@ from math import isnan
 
 from rigd.devices import DeviceError, LineHealth, RigParameters
 from rigd.devices.canbus import CanExchange, CanLink
-from rigd.devices.cia402._node import Inbox, Node
+from rigd.devices.cia402._node import Node, ReceivedFrames
 from rigd.devices.cia402._objects import ACTUAL_TORQUE, HEARTBEAT_CONSUMER, HEARTBEAT_PRODUCER_MS
 from rigd.devices.cia402._protocol import (
     DISABLE_VOLTAGE,
@@ -73,7 +73,7 @@ class Cia402Drive:
         self._name = f"Drive (CANopen node {settings.node_id})"
         self._frames = NodeFrames(settings.node_id, settings.host_node_id)
         self._idle = self._frames.rpdo(DISABLE_VOLTAGE, 0)
-        self._inbox = Inbox(self._name, settings.sto_error_code)
+        self._inbox = ReceivedFrames(self._name, settings.sto_error_code)
         self._same_tick = rig.acquisition.mode == "same_tick"
         self._silence_ns = round(settings.drive_heartbeat_timeout_s * 1e9)
         self._rad_per_count = rig.encoder.resolution_rad * settings.direction

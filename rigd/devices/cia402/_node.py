@@ -29,7 +29,7 @@ _TOGGLE_BIT = 0x80
 # What has come
 
 
-class Inbox:
+class ReceivedFrames:
     """The drive's last words. A frame of the wrong length changes nothing but counts.
 
     Parameters
@@ -216,7 +216,7 @@ class Node:
     """
 
     def __init__(
-        self, rig: RigParameters, exchange: CanExchange, frames: NodeFrames, inbox: Inbox
+        self, rig: RigParameters, exchange: CanExchange, frames: NodeFrames, inbox: ReceivedFrames
     ) -> None:
         assert rig.cia402 is not None
         assert rig.acquisition is not None

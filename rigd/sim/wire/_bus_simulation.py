@@ -1,7 +1,7 @@
 """Bus simulation: the rig between its lines, with nodes, clock and faults, but no input or output.
 
 Whatever comes in is handed over with the time it came; what the nodes say goes out through two
-callables. So the same `World` runs behind sockets and in a test.
+callables. So the same `BusSimulation` runs behind sockets and in a test.
 """
 
 import heapq
@@ -193,7 +193,7 @@ class _Standing:
     normal: object
 
 
-class World:
+class BusSimulation:
     """Moves the rig on, and carries frames between host and nodes.
 
     Parameters

@@ -311,7 +311,7 @@ class EventLog:
     Attributes
     ----------
     time_s : float
-        Simulated time; `World` sets it.
+        Simulated time; `BusSimulation` sets it.
 
     Raises
     ------

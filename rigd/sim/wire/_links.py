@@ -1,8 +1,8 @@
 """Links of the simulated rig: its end of the CAN bus, and a pseudo-terminal for the serial line.
 
-The bus is a Unix socket (`Hub`) or a virtual interface of the kernel (`VirtualCan`). Both carry the
-16 bytes of ``struct can_frame``. On the Unix socket every client hears every other one, as on a
-bus. Nothing here blocks: who does not read loses frames, as a slow CAN controller does.
+The bus is a Unix socket (`VirtualBus`) or a virtual interface of the kernel (`VirtualCan`). Both
+carry the 16 bytes of ``struct can_frame``. On the Unix socket every client hears every other one,
+as on a bus. Nothing here blocks: who does not read loses frames, as a slow CAN controller does.
 """
 
 import os
@@ -81,7 +81,7 @@ class _Client:
         self.unsent = b""
 
 
-class Hub:
+class VirtualBus:
     """A CAN bus on a Unix socket.
 
     Parameters
@@ -197,7 +197,7 @@ class VirtualCan:
     channel
         Name of the interface.
     handlers, on_frames
-        As for :class:`Hub`.
+        As for :class:`VirtualBus`.
 
     Raises
     ------

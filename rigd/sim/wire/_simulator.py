@@ -25,12 +25,12 @@ from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import RigParameters
 from rigd.runtime import runtime_folder
 from rigd.sim import SimulatedRig
-from rigd.sim.wire._bus_simulation import World
+from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog, Fault, FaultError, WrongUseError, parse_fault
 from rigd.sim.wire._links import (
     Handlers,
-    Hub,
     PtyLine,
+    VirtualBus,
     VirtualCan,
     is_virtual,
     listen,
@@ -343,13 +343,15 @@ class _Process:
 
             self._file = read_device(eds, rig.cia402.node_id)
         folder = stack.enter_context(socket_folder(rig.name))
-        self._bus: Hub | VirtualCan
+        self._bus: VirtualBus | VirtualCan
         can_socket = ""
         if rig.can.interface == "socketcan" and is_virtual(rig.can.channel):
             self._bus = VirtualCan(rig.can.channel, self._handlers, self._on_frames)
         else:
             can_socket = str(folder / f"{rig.name}.can")
-            self._bus = Hub(Path(can_socket), self._handlers, self._on_frames, self._on_clients)
+            self._bus = VirtualBus(
+                Path(can_socket), self._handlers, self._on_frames, self._on_clients
+            )
         stack.callback(self._bus.close)
         self._line: PtyLine | None = None
         if rig.ati_serial is not None:
@@ -415,14 +417,14 @@ class _Process:
                     line.look()
         self._log("simulator", "ended")
 
-    def _make_world(self) -> World:
+    def _make_world(self) -> BusSimulation:
         # Late: a process that only injects a fault needs none of it.
         from rigd.sim.wire._drive_node import DriveNode
 
         rig = self._rig
         simulated = SimulatedRig(without_transport(rig))
         line = self._line
-        world = World(
+        world = BusSimulation(
             rig,
             simulated,
             lock_step=self._options.lock_step,

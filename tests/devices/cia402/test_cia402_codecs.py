@@ -15,7 +15,7 @@ import rigd.devices.cia402 as package
 from rigd.devices.canbus import unpack_frame
 from rigd.devices.cia402 import _objects as objects
 from rigd.devices.cia402 import _protocol as states
-from rigd.devices.cia402._node import Inbox
+from rigd.devices.cia402._node import ReceivedFrames
 from rigd.devices.cia402._protocol import (
     DriveState,
     NodeFrames,
@@ -228,7 +228,7 @@ def test_the_mapping_of_the_pdos():
 @settings(max_examples=300)
 @given(st.binary(max_size=8), st.sampled_from(["tpdo", "emergency", "heartbeat", "reply"]))
 def test_handlers_take_anything(data, kind):
-    inbox = Inbox("Drive")
+    inbox = ReceivedFrames("Drive")
     inbox.watching = True
     getattr(inbox, f"take_{kind}")(data)
     valid = {"tpdo": len(data) == 8, "emergency": len(data) >= 3, "heartbeat": len(data) >= 1}
@@ -238,7 +238,7 @@ def test_handlers_take_anything(data, kind):
 
 
 def test_the_first_alarm_stays():
-    inbox = Inbox("Drive")
+    inbox = ReceivedFrames("Drive")
     inbox.watching = True
     inbox.take_emergency(struct.pack("<HB5x", 0x8130, 0x11))
     first = inbox.alarm
@@ -249,7 +249,7 @@ def test_the_first_alarm_stays():
 
 
 def test_a_toggle_bit_and_an_unknown_state_in_a_heartbeat():
-    inbox = Inbox("Drive")
+    inbox = ReceivedFrames("Drive")
     inbox.watching = True
     inbox.take_heartbeat(b"\x85")
     assert not inbox.alarm

@@ -6,7 +6,7 @@ import pytest
 
 from rigd.profile import load_profile
 from rigd.sim._devices import SimulatedRig
-from rigd.sim.wire._bus_simulation import World
+from rigd.sim.wire._bus_simulation import BusSimulation
 from rigd.sim.wire._faults import EventLog
 
 PERIOD_NS = 1_000_000
@@ -117,7 +117,7 @@ class Recording:
         self.log = log
         simulated = SimulatedRig(rig)
         self.simulated = simulated
-        self.world = World(
+        self.world = BusSimulation(
             rig,
             simulated,
             lock_step=lock_step,

@@ -8,7 +8,14 @@ import struct
 import pytest
 
 from rigd.devices.contracts import DeviceError
-from rigd.sim.wire._links import Hub, VirtualCan, interface_kind, is_virtual, kind_in_reply, listen
+from rigd.sim.wire._links import (
+    VirtualBus,
+    VirtualCan,
+    interface_kind,
+    is_virtual,
+    kind_in_reply,
+    listen,
+)
 
 
 def frame(n):
@@ -23,7 +30,7 @@ class Bench:
         self.handlers = {}
         self.heard = []
         self.told = []
-        self.hub = Hub(path, self.handlers, self._hear, lambda *told: self.told.append(told))
+        self.hub = VirtualBus(path, self.handlers, self._hear, lambda *told: self.told.append(told))
         self.links = []
 
     def _hear(self, frames, origin):
