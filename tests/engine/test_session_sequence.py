@@ -248,7 +248,7 @@ def test_two_of_three_angles_may_not_be_old(make_session):
     session.assert_safe()
     finished = session.finished
     assert finished.outcome == "fault"
-    assert "part of ticks without a new angle of 1.01 %" in finished.reason
+    assert "share of ticks without a new angle of 1.01 %" in finished.reason
     assert "acquisition.deadline_us" in finished.reason
     counts, samples = finished.counts, session.samples
     assert counts["stale_angles"] in (101, 102), "one may come with the last sample"
