@@ -108,7 +108,7 @@ def _show(defect: str, judged: list[Judged]) -> None:
         for kind in dict.fromkeys(f.kind for f in one.selection.verdict.findings)
     )
     names = ", ".join(f"{kind} {count}" for kind, count in named.most_common()) or "nothing"
-    sure = sum("nothing in the record" in " ".join(o.selection.verdict.sentences) for o in judged)
+    sure = sum("no unmodelled effect" in " ".join(o.selection.verdict.sentences) for o in judged)
     worst, what = max(one.worst for one in judged)
     cpu_s = max(one.cpu_s for one in judged)
     print(
