@@ -21,15 +21,14 @@ import pytest
 from hypothesis import settings
 
 from rigd import testing
+from rigd.runtime import use_one_thread
 
 pytest_plugins = [
     "kinds_of_tests", "paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions",
 ]  # fmt: skip
 
-# Threads gain nothing on small matrices, and fight each other where tests run in parallel.
-os.environ.update(
-    dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-)
+# As in the commands; threads would fight each other where tests run in parallel.
+use_one_thread()
 
 # A shell that starts a command in the background has it, and all that it starts, ignore these.
 for _number, _default in (

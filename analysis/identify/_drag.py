@@ -318,11 +318,8 @@ def _all(field: CandidateSet, settled: Refit) -> CandidateSet:
         refit = other.descent(unknowns, unknowns.vector(plant), _FEW)
         if refit.promised_cost < least * math.exp(_HOPELESS / before.values):
             refit = other.descent(unknowns, refit.x, _MANY)
-        candidates.append(
-            Candidate(before.structure, before.uniform, refit.fit(), len(other.columns))
-        )
-    ranked = tuple(sorted(candidates, key=lambda candidate: candidate.bic))
-    found = replace(other, candidates=ranked).cross_checked()
+        candidates.append(refit.candidate())
+    found = other.ranked(candidates).cross_checked()
     return replace(found, drag=_estimate(found))
 
 
