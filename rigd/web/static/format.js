@@ -16,6 +16,7 @@ export const unitOf = (name) => UNITS[suffixOf(name)] ?? "";
 
 /** A name as words: `start_hz` is the start frequency. */
 export function wordsOf(name) {
+  if (name === "ring_down_s") return "Ring-down";
   const suffix = suffixOf(name);
   let words = (suffix ? name.slice(0, -suffix.length) : name).replaceAll("_", " ");
   if (suffix === "_hz" && /^(start|stop)$/.test(words)) words += " frequency";
@@ -31,6 +32,9 @@ export function digits(value, count = 3) {
   const decimals = Math.max(0, count - 1 - Math.floor(Math.log10(size)));
   return value.toFixed(Math.min(decimals, 8));
 }
+
+/** A level that somebody chose, without the zeros that digits would add. */
+export const level = (value) => String(Number(value.toPrecision(4)));
 
 /** A number with its unit. */
 export function withUnit(value, unit, count = 3) {
@@ -82,19 +86,21 @@ export function age(utcNs, nowMs = Date.now()) {
 /** Size of a file. */
 export const megabytes = (bytes) => `${digits(bytes / 1e6, 2)} MB`;
 
-/** Decimals by which a value is shown to the second digit of its uncertainty. */
-const decimalsOf = (std) => Math.min(8, Math.max(1 - Math.floor(Math.log10(std)), 0));
+/** Decimals by which a value is shown to the first or second digit of its uncertainty. */
+const decimalsOf = (std, digit) =>
+  Math.min(8, Math.max(digit - 1 - Math.floor(Math.log10(std)), 0));
 
 /**
  * An estimate with its 95 % interval.
  * @param {{value: number, std: number|null, interval_95: number[]|null}} found
  * @param {number} factor - such as 100 for per cent
+ * @param {number} digit - of the uncertainty, up to which the value is shown
  */
-export function estimate(found, factor = 1) {
+export function estimate(found, factor = 1, digit = 2) {
   if (!found || !Number.isFinite(found.value)) return { value: NOTHING, interval: "" };
   const known = Number.isFinite(found.std) && found.std > 0;
   const text = (value) => (known
-    ? (value * factor).toFixed(decimalsOf(found.std * factor)) : digits(value * factor));
+    ? (value * factor).toFixed(decimalsOf(found.std * factor, digit)) : digits(value * factor));
   const ends = found.interval_95;
   return {
     value: text(found.value),

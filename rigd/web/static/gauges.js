@@ -8,9 +8,9 @@ const NEAR = 0.8;
 
 const SIGNALS = {
   angle: "Angle", velocity: "Speed", tracking_error: "Tracking error",
-  torque_command: "Torque command", i2t: "i²t (rms torque)",
+  torque_command: "Torque command", i2t: "Motor load (i²t)",
 };
-const AXES = { fx: "Sensor fx", fy: "fy", fz: "fz", tx: "tx", ty: "ty", tz: "tz" };
+const AXES = ["fx", "fy", "fz", "tx", "ty", "tz"];
 
 /** Class of a share of a limit. */
 export const toneOf = (fraction) => (fraction >= 1 ? "over" : fraction >= NEAR ? "near" : "");
@@ -20,10 +20,11 @@ export class Gauges {
 
   constructor(link) {
     const place = byId("gauges");
-    for (const [name, title] of Object.entries(SIGNALS)) place.append(this.#row(name, title));
+    const signals = make("div", {});
+    for (const [name, title] of Object.entries(SIGNALS)) signals.append(this.#row(name, title));
     const axes = make("div", { class: "split" });
-    for (const [name, title] of Object.entries(AXES)) axes.append(this.#row(name, title));
-    place.append(axes, make("p", { class: "note" }, "% of the limit; amber from 80 %"));
+    for (const name of AXES) axes.append(this.#row(name, name));
+    place.append(signals, axes, make("p", { class: "note" }, "Per cent of the limit; fx to tz: axes of the sensor."));
     link.on("gauges", ({ gauges }) => this.#update(gauges ?? {}));
     for (const gone of ["closed", "lost"]) link.on(gone, () => this.#update({}));
     link.on("status", (status) => this.#count(status));

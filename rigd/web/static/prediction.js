@@ -1,7 +1,7 @@
 // A predicted session: peaks against their limits, and the largest amplitude that passes.
 
 import { byId, make } from "./dom.js";
-import { digits, withUnit } from "./format.js";
+import { digits, level, withUnit } from "./format.js";
 import { toneOf } from "./gauges.js";
 
 /**
@@ -14,7 +14,7 @@ import { toneOf } from "./gauges.js";
 function peakBar(name, value, limit, unit) {
   const limited = Number.isFinite(limit) && limit > 0;
   const fraction = limited ? value / limit : 0;
-  const text = limited ? `${digits(value)} of ${withUnit(limit, unit)}` : withUnit(value, unit);
+  const text = limited ? `${digits(value)} of ${level(limit)} ${unit}` : withUnit(value, unit);
   const fill = make("div", { class: "fill" });
   fill.style.transform = `scaleX(${Math.min(fraction, 1)})`;
   return make("div", { class: `bar-row ${toneOf(fraction)}` },
@@ -74,6 +74,6 @@ export class Prediction {
     const button = make("button", { type: "button", class: "small", id: "take-largest" }, "Use it");
     button.addEventListener("click", () => this.take(rounded));
     return make("div", { class: "largest" },
-      make("span", {}, `Largest allowed amplitude: ${withUnit(rounded, "rad")}`), button);
+      make("span", {}, `Largest allowed: ${withUnit(rounded, "rad")}`), button);
   }
 }

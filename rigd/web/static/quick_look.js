@@ -9,7 +9,7 @@ export function modesInShort(modes) {
     const flagged = frequency?.flag || damping?.flag;
     return make("span", { class: "line", title: [frequency?.flag, damping?.flag]
       .filter(Boolean).join(" ") },
-    `${estimate(frequency).value} Hz, ${estimate(damping, 100).value} %${flagged ? " (flagged)" : ""}`);
+    `${estimate(frequency, 1, 1).value} Hz, ${estimate(damping, 100, 1).value} %${flagged ? " (flagged)" : ""}`);
   });
 }
 

@@ -139,8 +139,8 @@ export class ResponsePlot {
     }
     surface.text("Hz", right, bottom + 26, "right");
     surface.text("upper: dB re 1 N·m/rad, lower: phase in degrees", LEFT, bottom + 26);
-    const step = roundStep(high - low, 5);
-    for (const tick of roundTicks(low, high, 5)) {
+    const step = roundStep(high - low, 7);
+    for (const tick of roundTicks(low, high, 7)) {
       const y = magnitude.top + (magnitude.height * (high - tick)) / (high - low);
       surface.line(LEFT, y, right, y, "grid");
       surface.text(tickText(tick, step), LEFT - 6, y, "right");

@@ -80,7 +80,7 @@ const RESULTS = {
   check: ({ rows, verdict }) => [
     make("p", {}, make("b", {}, `${at()}${verdict}`)),
     make("ul", { class: "check-rows" }, ...rows.map((row) => make("li", { class: row.status },
-      make("b", {}, row.status), `${row.what}: ${row.text}`,
+      make("b", {}, row.status), ` ${row.what}: ${row.text}`,
       row.remedy && row.status !== "ok" ? make("div", {}, row.remedy) : null)))],
 };
 

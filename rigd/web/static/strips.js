@@ -10,6 +10,7 @@ const LEAST = { angle: 0.002, torque: 0.02 };
 const LEFT = 52;
 const BOTTOM = 18;
 const TOP = 6;
+const HALVES = [1, 1.5, 2, 3, 4, 6, 8, 10];
 const SPOKEN_MS = 1000;
 
 class Strip {
@@ -42,7 +43,8 @@ class Strip {
     const now = performance.now();
     if (wanted > 0.6 * this.#half) this.#small = now;
     if (wanted > this.#half || now - this.#small > 3000) {
-      this.#half = roundStep(wanted, 1);
+      const power = 10 ** Math.floor(Math.log10(wanted));
+      this.#half = power * HALVES.find((half) => half * power >= wanted);
       this.#small = now;
     }
     return this.#half;
@@ -71,43 +73,47 @@ class Strip {
       surface.text(ago ? `−${ago} s` : "now", at, height - 7, align);
     }
     surface.within(LEFT, TOP, inner.width, inner.height, (context) => {
-      this.#drawBand(context, x, y);
       for (const curve of this.curves) this.#drawCurve(context, x, y, curve);
+      this.#drawBand(context, x, y);
     });
     this.#speak();
+  }
+
+  /** Runs of bins without a gap, as centres in time and values of a column. */
+  #runs(column) {
+    const runs = [[]];
+    for (const { t, dt, values } of this.bins) {
+      if (Number.isFinite(values[column])) runs.at(-1).push([t + dt / 2, values[column]]);
+      else if (runs.at(-1).length) runs.push([]);
+    }
+    return runs.filter((run) => run.length);
   }
 
   #drawBand(context, x, y) {
     const { low, high, colour } = this.band;
     context.fillStyle = this.#surface.colour(colour);
     context.strokeStyle = this.#surface.colour(colour);
-    context.lineWidth = 1.5;
-    context.beginPath();
-    for (const { t, dt, values } of this.bins) {
-      if (!Number.isFinite(values[low]) || !Number.isFinite(values[high])) continue;
-      const top = y(values[high]) - 0.75;
-      const bottom = y(values[low]) + 0.75;
-      context.rect(x(t), top, x(t + dt) - x(t) + 0.5, bottom - top);
-    }
-    context.fill();
+    context.lineWidth = 1.4;
+    const lows = this.#runs(low);
+    this.#runs(high).forEach((upper, k) => {
+      context.beginPath();
+      for (const [t, value] of [...upper, ...[...lows[k]].reverse()]) context.lineTo(x(t), y(value));
+      context.closePath();
+      context.fill();
+      context.stroke();
+    });
   }
 
+  /** A curve behind the band: a halo where both agree, a line where they do not. */
   #drawCurve(context, x, y, { index, colour }) {
     context.strokeStyle = this.#surface.colour(colour);
-    context.lineWidth = 1.5;
-    context.setLineDash([]);
-    context.beginPath();
-    let broken = true;
-    for (const { t, dt, values } of this.bins) {
-      const value = values[index];
-      if (!Number.isFinite(value)) {
-        broken = true;
-        continue;
-      }
-      context[broken ? "moveTo" : "lineTo"](x(t + dt / 2), y(value));
-      broken = false;
+    context.lineWidth = 3.5;
+    context.lineJoin = "round";
+    for (const run of this.#runs(index)) {
+      context.beginPath();
+      for (const [t, value] of run) context.lineTo(x(t), y(value));
+      context.stroke();
     }
-    context.stroke();
   }
 
   /** Tell the extremes to those who do not see the strip, once a second. */

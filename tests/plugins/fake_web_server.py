@@ -221,8 +221,9 @@ class FakeWebServer:
         asyncio.run_coroutine_threadsafe(self._hang_up(), self._loop).result(30.0)
 
     def close(self):
-        self._loop.call_soon_threadsafe(self._ending.set)
-        self._thread.join(30.0)
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._ending.set)
+            self._thread.join(30.0)
 
     async def _tell(self, messages):
         for page in list(self._pages):
