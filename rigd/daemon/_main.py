@@ -97,6 +97,8 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     server.serve(service)
     opening = asyncio.create_task(service.open())
     attending = asyncio.create_task(service.attend())
+    telling = asyncio.create_task(service.tell_signals())
+    telling.add_done_callback(_note_end)
     # Attending ends only by a mistake in the program, which must not leave a rig unattended.
     attending.add_done_callback(lambda _: end(signal.SIGABRT))
     await asked
@@ -104,9 +106,16 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     _log.info("%s and ends", why)
     await service.close(why)
     attending.cancel()
-    await asyncio.gather(opening, attending, return_exceptions=True)
+    telling.cancel()
+    await asyncio.gather(opening, attending, telling, return_exceptions=True)
     await server.close()
     return asked.result()
+
+
+def _note_end(telling: "asyncio.Task[None]") -> None:
+    """Log why no signals are told any more; the rig does not depend on them."""
+    if not telling.cancelled():
+        _log.error("the signals are not told any more", exc_info=telling.exception())
 
 
 def _stop(service: Service) -> None:

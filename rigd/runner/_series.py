@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rigd.engine import Event
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
 from rigd.runner._planning import plan_document, plan_session
 from rigd.runner._request import Order, choose_path, make_room
@@ -128,6 +128,10 @@ class Series:
     def ticks(self) -> int:
         """Ticks of each session's record."""
         return int(self._excitation.reference_rad.size)
+
+    def frequency_hz(self, tick: int) -> float | None:
+        """Return the frequency of the excitation at a tick, where it has one."""
+        return present_frequency_hz(self._excitation, tick)
 
     def plan_document(self) -> dict[str, Any]:
         """Return the plan as JSON documents have it."""
