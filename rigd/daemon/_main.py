@@ -26,7 +26,14 @@ _log = logging.getLogger(NAME)
 
 
 def run_daemon(
-    profile: Profile, folder: Path, *, group: str | None, live: bool, fast: bool
+    profile: Profile,
+    folder: Path,
+    *,
+    group: str | None,
+    live: bool,
+    fast: bool,
+    page: bool = False,
+    page_port: int | None = None,
 ) -> signal.Signals:
     """Own a rig until a signal asks for the end.
 
@@ -40,6 +47,10 @@ def run_daemon(
         Group whose members may command it, as well as this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
+    page
+        Serve the operator's page.
+    page_port
+        Port of the page on loopback; None: 8720, or another one if that is taken.
 
     Returns
     -------
@@ -78,6 +89,11 @@ def run_daemon(
         _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):
             _log.warning("the simulated rig has %s", difference)
+        if page:
+            from rigd.daemon._page import PageProcess
+
+            serving = PageProcess(profile, folder, path, page_port, service.set_page)
+            ending.callback(serving.close)
         return asyncio.run(_run(server, service))
 
 

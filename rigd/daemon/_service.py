@@ -180,8 +180,6 @@ class Service:
     ----------
     controller
         The client that holds control.
-    page
-        Address of the operator's page, without its token.
     """
 
     def __init__(
@@ -222,7 +220,7 @@ class Service:
         self._predicting = asyncio.Lock()
         self._last_check: Document | None = None
         self.controller: Peer | None = None
-        self.page: str | None = None
+        self._page: str | None = None
 
     @property
     def state(self) -> State:
@@ -275,6 +273,10 @@ class Service:
         await self._call(self._rig.disconnect)
         if self.state is State.READY:
             self._states.move(State.IDLE, reason)
+
+    def set_page(self, address: str | None) -> None:
+        """Take note of where the operator's page is, without its token; from any thread."""
+        self._page = address
 
     def release(self, peer: Peer) -> None:
         """Take control from a client that is gone; what it started goes on."""
@@ -336,7 +338,7 @@ class Service:
                 told=what_moves(self._profile.rig, self._began_moving),
                 fast=self._fast,
                 live=self._live,
-                web=self.page,
+                web=self._page,
                 calibration=self._rig.calibration,
                 began_utc_ns=self._began_utc_ns,
             ),

@@ -41,11 +41,19 @@ class PredictionJob:
 
     def perform(self) -> dict[str, Any]:
         """Return the prediction as the reply has it."""
-        from rigd.runner import excitation_for, plan_document, predict_session
+        from rigd.runner import (
+            excitation_for,
+            largest_amplitude,
+            plan_document,
+            predict_session,
+        )
 
         excitation = excitation_for(self.profile, self.excitation, self.parameters)
         plan = predict_session(self.profile, excitation, force=self.force)
-        return {"plan": plan_document(self.profile, excitation, plan)}
+        return {
+            "plan": plan_document(self.profile, excitation, plan),
+            "largest_amplitude_rad": largest_amplitude(self.profile, excitation, force=self.force),
+        }
 
 
 @dataclass(frozen=True, slots=True)
