@@ -196,10 +196,10 @@ class Connections:
         Makes the protocol of a connection that is served.
     """
 
-    serve: "Callable[[], RequestHandler[web.Request]]"
+    serve: "Callable[[], RequestHandler]"
 
     def __init__(self) -> None:
-        self._begun: dict[RequestHandler[web.Request], float] = {}
+        self._begun: dict[RequestHandler, float] = {}
         """Served connections, and until when each has to make a request."""
 
     def begin(self) -> None:

@@ -101,7 +101,7 @@ class Jobs:
             self._waiting.put_nowait(job)
         except asyncio.QueueFull:
             raise JobError(f"{MOST_JOBS} jobs are waiting already; try again later.") from None
-        self._tell(job.document())
+        self._say(job)
         return job
 
     async def run(self) -> None:
@@ -111,13 +111,18 @@ class Jobs:
             while self.paused:
                 await asyncio.sleep(_LOOK_S)
             job.state = "running"
-            self._tell(job.document())
+            self._say(job)
             try:
                 await self._perform(job)
                 job.state = "done"
             except (JobError, OSError) as error:
                 job.state, job.error = "failed", str(error)
             job.done.set()
+            self._say(job)
+
+    def _say(self, job: Job) -> None:
+        """Tell how a job stands; who waits for an export is answered."""
+        if job.kind != "export":
             self._tell(job.document())
 
     async def _perform(self, job: Job) -> None:

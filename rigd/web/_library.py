@@ -138,7 +138,7 @@ class Library:
         path = self._session(request)
         ending = request.match_info["ending"]
         if ending == "mcap":
-            return _download(path)
+            return web.FileResponse(path, headers=_download_headers(path.name))
         if ending not in _EXPORTS:
             return refused(404, "There are .mcap, .mat and .uff.")
         if self._jobs.paused:
@@ -154,10 +154,8 @@ class Library:
                 await job.done.wait()
                 if job.error:
                     return refused(409, job.error)
-                # Sent before the folder goes.
-                response = _download(out)
-                await response.prepare(request)
-                return response
+                # It is open, and may be sent after the folder has gone.
+                return web.Response(body=out.open("rb"), headers=_download_headers(out.name))
 
     # Reports
 
@@ -268,16 +266,13 @@ def _row_of(folder: Path, name: str) -> SessionRow | None:
     return next((row for row in list_sessions(folder) if row.id == name), None)
 
 
-def _download(path: Path) -> web.FileResponse:
+def _download_headers(name: str) -> dict[str, str]:
     # A session's name may hold anything that a file's name may.
-    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", path.name)
-    return web.FileResponse(
-        path,
-        headers={
-            "Content-Disposition": f'attachment; filename="{plain}"',
-            "Content-Type": "application/octet-stream",
-        },
-    )
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+    return {
+        "Content-Disposition": f'attachment; filename="{plain}"',
+        "Content-Type": "application/octet-stream",
+    }
 
 
 def _whole(text: str, name: str) -> int:

@@ -325,14 +325,13 @@ async def _run(job: Document) -> None:
         return
     running = asyncio.create_task(server.run())
     gone = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
-    done, _ = await asyncio.wait((running, gone), return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait((running, gone), return_when=asyncio.FIRST_COMPLETED)
+    if running.done():
+        running.result()
     # The daemon has ended, however: its successor may want the port.
     listening.close()
     server.end("The daemon has ended; start it with rigd serve.")
     await asyncio.sleep(_GRACE_S)
-    running.cancel()
-    with suppress(asyncio.CancelledError):
-        await running
     os._exit(0)  # whoever still reads would be waited for
 
 
