@@ -5,14 +5,13 @@
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
 from rigd.engine import Event
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._planning import plan_session
+from rigd.runner._planning import plan_document, plan_session
 from rigd.runner._request import Order, choose_path, make_room
 from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
 from rigd.runtime import StopRequest
@@ -130,22 +129,13 @@ class Series:
         """Ticks of each session's record."""
         return int(self._excitation.reference_rad.size)
 
+    def frequency_hz(self, tick: int) -> float | None:
+        """Return the frequency of the excitation at a tick, where it has one."""
+        return present_frequency_hz(self._excitation, tick)
+
     def plan_document(self) -> dict[str, Any]:
         """Return the plan as JSON documents have it."""
-        profile = self._profile
-        return {
-            "excitation": self._excitation.kind,
-            "profile": profile.name,
-            "record_s": self.ticks / profile.rig.rate_hz,
-            **asdict(self.plan.prediction),
-            "limits": {
-                "angle_rad": profile.limits.angle_rad,
-                "velocity_rad_s": profile.limits.velocity_rad_s,
-                "torque_nm": profile.rig.motor.peak_torque_nm,
-            },
-            "tip_in_words": self.plan.tip_in_words,
-            "warnings": list(self.plan.warnings),
-        }
+        return plan_document(self._profile, self._excitation, self.plan)
 
     def run(
         self,
