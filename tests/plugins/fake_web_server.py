@@ -45,7 +45,7 @@ def status(state="ready", **members):
             "pid": 4711, "version": "0.1.0", "profile": "sim", "moving": "simulated",
             "hardware": False, "what_moves": "Nothing moves: the rig sim is simulated.",
             "output": "/data/sessions", "fast": False, "live": True, "since_utc_ns": UTC_NS,
-            "calibration": {"serial": "FT12345", "utc_ns": UTC_NS - 90 * 86_400 * 10**9},
+            "calibration": {"serial": "FT12345", "age": "2026-08-20"},
         },
         "state": state, "since_utc_ns": UTC_NS, "reason": "the simulated rig is connected",
         "doing": "", "zero_lost": False,
@@ -86,7 +86,7 @@ def gauges(share=0.4, frequency_hz=12.3):
     shares[0] = share
     return {
         "type": "gauges", "frequency_hz": frequency_hz,
-        "gauges": {
+        **{
             name: {"value": part * limit, "limit": limit, "unit": unit, "fraction": part}
             for (name, (limit, unit)), part in zip(limits.items(), shares, strict=True)
         },
@@ -154,6 +154,13 @@ def session(number, **members):
         "reason": "", "duration_s": 136.0, "scheduled": 136_000, "missed": 0, "late": 3,
         "lost": 0, "size_bytes": 8_400_000, "modes": MODES, "report": None,
         "meta": {"temperature_c": 21.4}, **members,
+    }  # fmt: skip
+
+
+def job(state, **members):
+    return {
+        "type": "job", "number": 1, "kind": "report", "id": "", "state": state, "error": "",
+        "address": "", **members,
     }  # fmt: skip
 
 
@@ -297,7 +304,8 @@ class FakeWebServer:
 
     async def _job(self, request):
         self.asked.append((request.path, "Authorization" in request.headers))
-        return web.json_response({"ok": True}, status=202)
+        await self._tell([job("running", kind=request.path.split("/")[-1])])
+        return web.json_response({"ok": True, "job": 1}, status=202)
 
     async def _frf(self, request):
         return web.json_response({

@@ -25,7 +25,7 @@ export class Gauges {
     const axes = make("div", { class: "split" });
     for (const name of AXES) axes.append(this.#row(name, name));
     place.append(signals, axes, make("p", { class: "note" }, "Per cent of the limit; fx to tz: axes of the sensor."));
-    link.on("gauges", ({ gauges }) => this.#update(gauges ?? {}));
+    link.on("gauges", (gauges) => this.#update(gauges));
     for (const gone of ["closed", "lost"]) link.on(gone, () => this.#update({}));
     link.on("status", (status) => this.#count(status));
     link.on("progress", (progress) => this.#ticks(progress));

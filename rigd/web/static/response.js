@@ -55,7 +55,9 @@ export class ResponsePlot {
   #label() {
     const entries = this.#curves.map(({ name, colour }) => [colour, name]);
     const first = this.#curves[0]?.response;
-    if (first?.coherence) entries.push(["shade", `coherence below ${LOW_COHERENCE}`]);
+    if (first && "coherence" in first) {
+      entries.push(["shade", `not reached, or coherence below ${LOW_COHERENCE}`]);
+    }
     const texts = JSON.stringify(entries);
     if (this.keys.dataset.shown !== texts) {
       this.keys.dataset.shown = texts;
@@ -155,14 +157,14 @@ export class ResponsePlot {
   /** Grey what the sweep has not reached, and where the coherence is low. */
   #shade(panel, x, inner) {
     const response = this.#curves[0]?.response;
-    if (!response?.coherence) return;
+    if (!response) return;
     const surface = this.#surface;
     surface.within(LEFT, panel.top, inner, panel.height, (context) => {
       context.fillStyle = surface.colour("shade");
       const { frequency_hz: at, coherence, reached_hz: reached } = response;
       for (let k = 0; k + 1 < at.length; k += 1) {
         const beyond = known(reached) && at[k] >= reached;
-        if (!beyond && known(coherence[k]) && coherence[k] < LOW_COHERENCE) {
+        if (!beyond && known(coherence?.[k]) && coherence[k] < LOW_COHERENCE) {
           const from = x(k ? Math.sqrt(at[k - 1] * at[k]) : at[k]);
           context.fillRect(from, panel.top, x(Math.sqrt(at[k] * at[k + 1])) - from, panel.height);
         }

@@ -1,7 +1,7 @@
 // Zero, Tare, Check and Reset with their results; last check, and age of the calibration.
 
 import { byId, make, setText, show } from "./dom.js";
-import { age, clock, dateTime, digits, withUnit } from "./format.js";
+import { age, clock, withUnit } from "./format.js";
 
 const NEEDED = { zero: ["ready"], tare: ["ready"], check: ["ready", "idle"], reset: ["fault"] };
 const BUSY = { zero: "Setting the zero", tare: "Taring", check: "Checking", reset: "Resetting" };
@@ -84,13 +84,11 @@ const RESULTS = {
       row.remedy && row.status !== "ok" ? make("div", {}, row.remedy) : null)))],
 };
 
-/** What is known of the calibration: serial number, date and age; not every sensor says it. */
+/** Serial number of the sensor, date and age of its calibration; not every sensor tells them. */
 function calibrationText(calibration) {
   if (!calibration) return "not read yet";
-  const { serial, utc_ns: made, age: said } = calibration;
-  const parts = [];
-  if (serial) parts.push(serial);
-  if (Number.isFinite(made)) parts.push(`${dateTime(made).slice(0, 10)}, ${age(made)}`);
-  else if (said) parts.push(said);
-  return parts.join(", ") || digits(NaN);
+  const { serial, age: made } = calibration;
+  const date = Date.parse(made);  // some sensors tell a date, others whatever was typed in
+  const old = Number.isFinite(date) ? ` (${age(date * 1e6)})` : "";
+  return [serial, made && `${made}${old}`].filter(Boolean).join(", ") || "not told by the sensor";
 }

@@ -1,7 +1,7 @@
 // The library of sessions: filters, quick looks, reports, downloads, campaigns and comparisons.
 
 import { byId, make, setText, show } from "./dom.js";
-import { clock, date, digits, megabytes, whole, wordsOf, unitOf } from "./format.js";
+import { clock, date, megabytes, unitOf, whole, withUnit, wordsOf } from "./format.js";
 import { ResponsePlot } from "./response.js";
 import { lookElements, modesInShort } from "./quick_look.js";
 
@@ -77,7 +77,8 @@ export class Sessions {
 
   #rows(session) {
     const { id } = session;
-    const began = `${date(session.start_utc_ns)} ${clock(session.start_utc_ns)}`;
+    const at = session.start_utc_ns;
+    const began = Number.isFinite(at) ? `${date(at)} ${clock(at)}` : id;
     const tick = make("input", {
       type: "checkbox", checked: this.#ticked.has(id), "aria-label": `Compare ${began}`,
     });
@@ -137,11 +138,9 @@ export class Sessions {
     const at = `/api/sessions/${encodeURIComponent(session.id)}`;
     const look = await this.#link.get(`${at}/look`);
     const facts = [
-      ["Samples", `${whole(session.scheduled - session.missed - (session.lost ?? 0))} of `
-        + `${whole(session.scheduled)}, ${whole(session.missed)} missed, `
-        + `${whole(session.late)} late, ${whole(session.lost)} lost`],
-      ["Duration", `${digits(session.duration_s)} s`],
-      ["Reason", session.reason], ["Note", session.note], ["Profile", session.profile],
+      ["Samples", Number.isFinite(session.scheduled) && samples(session)],
+      ["Duration", Number.isFinite(session.duration_s) && withUnit(session.duration_s, "s")],
+      ["Problem", session.problem], ["Reason", session.reason], ["Note", session.note], ["Profile", session.profile],
       ...Object.entries(session.meta ?? {}).map(([name, value]) =>
         [wordsOf(name), `${value} ${unitOf(name)}`.trim()]),
       ["File", `${session.path} (${megabytes(session.size_bytes)})`],
@@ -188,29 +187,34 @@ export class Sessions {
 
   async #makeReport(id, button) {
     button.disabled = true;
-    setText(button, "Report is made …");
     const reply = await this.#link.post(`/api/sessions/${encodeURIComponent(id)}/report`);
     if (!reply.ok) {
       this.#say(reply.error);
       button.disabled = false;
-      setText(button, "Make report");
     }
   }
 
   async #makeCampaign() {
-    this.#say("The campaign is analysed …");
     const reply = await this.#link.post("/api/campaign", { ids: [...this.#ticked.keys()] });
     if (!reply.ok) this.#say(reply.error);
   }
 
-  /** What became of a report or a campaign. */
-  #job({ state, kind, error, address }) {
-    if (state === "running" || state === "waiting") return;
-    this.load();
+  /** How a report or a campaign stands. */
+  async #job({ state, kind, id, error, address }) {
+    const what = kind === "campaign" ? "Campaign" : `Report of ${id}`;
+    if (state === "waiting" || state === "running") {
+      this.#say(`${what}: ${state}; a job waits while a session runs.`);
+      return;
+    }
+    await this.load();
     if (error) this.#say(error);
     else if (address) {
-      this.#say(make("p", {}, make("a", { href: address, target: "_blank", rel: "noopener" },
-        kind === "campaign" ? "Open the campaign's report" : "Open the report")));
+      this.#say(make("p", {}, `${what}: `,
+        make("a", { href: address, target: "_blank", rel: "noopener" }, "open the report")));
     }
   }
 }
+
+const samples = ({ scheduled, missed, late, lost }) =>
+  `${whole(scheduled - missed - (lost ?? 0))} of ${whole(scheduled)}, `
+  + `${whole(missed)} missed, ${whole(late)} late, ${whole(lost)} lost`;

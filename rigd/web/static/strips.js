@@ -17,7 +17,7 @@ class Strip {
   #surface;
   #half;
   #small = 0;
-  #spoken = 0;
+  #spoken = -Infinity;
 
   constructor(canvas, { name, unit, least, band, curves }) {
     this.canvas = canvas;
