@@ -18,6 +18,7 @@ from rigd.cli.options import (
     AsJson,
     Fast,
     Hardware,
+    NoLook,
     Output,
     ProfileName,
     fail,
@@ -47,6 +48,7 @@ def serve(
     ] = False,
     fast: Fast = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
 ) -> None:
     """Run the rig daemon; Ctrl-C or SIGTERM ends it safely.
 
@@ -59,7 +61,9 @@ def serve(
 
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
-    number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
+    number = run_daemon(
+        rig_profile, output.absolute(), group=group, live=live, fast=fast, look=not no_look
+    )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
 

@@ -26,7 +26,7 @@ _log = logging.getLogger(NAME)
 
 
 def run_daemon(
-    profile: Profile, folder: Path, *, group: str | None, live: bool, fast: bool
+    profile: Profile, folder: Path, *, group: str | None, live: bool, fast: bool, look: bool
 ) -> signal.Signals:
     """Own a rig until a signal asks for the end.
 
@@ -40,6 +40,8 @@ def run_daemon(
         Group whose members may command it, as well as this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
+    look
+        Take a quick look at each session.
 
     Returns
     -------
@@ -74,6 +76,7 @@ def run_daemon(
             partial(reality, profile.rig),
             fast=fast,
             live=live,
+            look=look,
         )
         _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):

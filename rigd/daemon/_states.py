@@ -283,6 +283,7 @@ def daemon_document(
     told: str,
     fast: bool,
     live: bool,
+    quick_looks: bool,
     began_utc_ns: int,
 ) -> Document:
     """Tell which daemon this is."""
@@ -298,6 +299,7 @@ def daemon_document(
         "output": output,
         "fast": fast,
         "live": live,
+        "quick_looks": quick_looks,
         "since_utc_ns": began_utc_ns,
     }
 
