@@ -44,6 +44,8 @@ _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 # Nor a profile of the user's own that hides a shipped one.
 os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
+# No session pays for a quick look but where that is tested.
+os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 # The same examples each time, and however long they take: what fails is a change's fault. Others

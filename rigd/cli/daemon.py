@@ -18,6 +18,7 @@ from rigd.cli.options import (
     AsJson,
     Fast,
     Hardware,
+    NoLook,
     Output,
     ProfileName,
     fail,
@@ -59,6 +60,7 @@ def serve(
     ] = None,
     fast: Fast = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
 ) -> None:
     """Run the rig daemon; Ctrl-C or SIGTERM ends it safely.
 
@@ -79,6 +81,7 @@ def serve(
         fast=fast,
         page=web or web_port is not None,
         page_port=web_port,
+        look=not no_look,
     )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)

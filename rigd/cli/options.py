@@ -111,6 +111,14 @@ Force = Annotated[
 ]
 
 
+NoLook = Annotated[
+    bool,
+    typer.Option(
+        "--no-look", envvar="RIGD_NO_LOOK", help="Make no quick look at a session after its end."
+    ),
+]
+
+
 def session_notes(operator: str, specimen: str, note: str) -> dict[str, str]:
     """Return what is to go into the file; a text that cannot ends the command."""
     notes = {"operator": operator, "specimen": specimen, "note": note}

@@ -21,6 +21,7 @@ from rigd.cli.options import (
     Fast,
     Force,
     Hardware,
+    NoLook,
     Note,
     Operator,
     Output,
@@ -107,6 +108,7 @@ def run_sessions(
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
@@ -130,6 +132,7 @@ def run_sessions(
             force=force,
             quiet_stdout=as_json,
             hardware=hardware,
+            look=not no_look,
         )
     except SeriesFailedError as error:
         if as_json:

@@ -32,6 +32,7 @@ def run_daemon(
     group: str | None,
     live: bool,
     fast: bool,
+    look: bool,
     page: bool = False,
     page_port: int | None = None,
 ) -> signal.Signals:
@@ -47,6 +48,8 @@ def run_daemon(
         Group whose members may command it, as well as this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
+    look
+        Take a quick look at each session.
     page
         Serve the operator's page.
     page_port
@@ -85,6 +88,7 @@ def run_daemon(
             partial(reality, profile.rig),
             fast=fast,
             live=live,
+            look=look,
         )
         _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):

@@ -39,6 +39,8 @@ from rigd.errors import RigdError, UserError
 from rigd.profile import Profile
 from rigd.runner import (
     NoRoomError,
+    QuickLook,
+    QuickLooks,
     RigError,
     RigStatus,
     Series,
@@ -175,6 +177,8 @@ class Service:
         Says what would move if the rig were connected now.
     fast, live
         Options with which the rig was made.
+    look
+        Take a quick look at each session.
 
     Attributes
     ----------
@@ -193,6 +197,7 @@ class Service:
         *,
         fast: bool = False,
         live: bool = False,
+        look: bool = False,
     ) -> None:
         self._rig = rig
         self._profile = profile
@@ -210,6 +215,8 @@ class Service:
         self._doing = ""
         self._closing = False
         self._series: ServedSeries | None = None
+        self._looks = QuickLooks(self._tell_look) if look else None
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._count = 0
         self._listened_s = inf
@@ -230,6 +237,7 @@ class Service:
     async def open(self) -> None:
         """Connect the rig; a failure leaves a fault, which an operator may reset."""
         self._doing = "connecting"
+        self._loop = asyncio.get_running_loop()
         try:
             await self._connect(reset_fault=False)
         except CommandError:
@@ -243,6 +251,8 @@ class Service:
             await asyncio.sleep(LOOK_S)
             self._listened_s = time.monotonic()
             self.look()
+            if self._looks is not None:
+                self._looks.attend()
             # Not waited for: another look is due while the second thread is busy.
             await self.watch()
 
@@ -270,6 +280,8 @@ class Service:
         self.stop(reason)
         if self._task is not None:
             await asyncio.wait([self._task])
+        if self._looks is not None:
+            self._looks.close()
         await self._call(self._rig.disconnect)
         if self.state is State.READY:
             self._states.move(State.IDLE, reason)
@@ -340,6 +352,7 @@ class Service:
                 live=self._live,
                 web=self._page,
                 calibration=self._rig.calibration,
+                quick_looks=self._looks is not None,
                 began_utc_ns=self._began_utc_ns,
             ),
             "state": self.state.value,
@@ -604,7 +617,14 @@ class Service:
 
         told = _Told(series, publish, self._listens)
         try:
-            planned.run(self._rig, series.stop, told, live=self._live, listens=self._listens)
+            planned.run(
+                self._rig,
+                series.stop,
+                told,
+                live=self._live,
+                listens=self._listens,
+                looks=self._looks,
+            )
         except SessionFailedError as error:
             told.ended(error.result())
             raise
@@ -644,6 +664,17 @@ class Service:
             level, "state: %s -> %s: %s", transition.before, transition.after, transition.reason
         )
         self._publish({"event": "state", **transition_document(transition)})
+
+    def _tell_look(self, look: QuickLook) -> None:
+        """Tell of a quick look; called in either thread."""
+        if self._series is not None:
+            look.note(self._series.results)
+        for line in look.lines:
+            _log.info("%s", line)
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(
+                self._publish, {"event": "quick_look", **look.as_dict()}
+            )
 
     async def _call(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)

@@ -321,6 +321,7 @@ def daemon_document(
     live: bool,
     web: str | None,
     calibration: Mapping[str, Any] | None,
+    quick_looks: bool,
     began_utc_ns: int,
 ) -> Document:
     """Tell which daemon this is."""
@@ -343,6 +344,7 @@ def daemon_document(
             "serial": str(calibration.get("serial_number", "")),
             "age": str(calibration.get("calibration_date", "")),
         },
+        "quick_looks": quick_looks,
         "since_utc_ns": began_utc_ns,
     }
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 Document = dict[str, Any]
+_Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 _STATUS_S: Final = 0.4
 """Time from one question for the status to the next."""
@@ -18,6 +19,7 @@ _CONNECT_S: Final = 5.0
 _ANSWER_S: Final = 90.0
 _LONGEST_LINE: Final = 1 << 20
 _CROWD_TRIES: Final = 20
+_CROWD_PAUSE_S: Final = 0.1
 
 
 class DaemonError(Exception):
@@ -44,7 +46,8 @@ class DaemonLink:
         self._on_message = on_message
         self._on_lost = on_lost
         self._asking = asyncio.Event()
-        self._held: asyncio.StreamWriter | None = None
+        self._held: _Connection | None = None
+        self._commanding = asyncio.Lock()
 
     async def run(self) -> None:
         """Follow the daemon, until cancelled."""
@@ -61,10 +64,10 @@ class DaemonLink:
         self._asking.set()
 
     async def ask(self, request: Document) -> Document:
-        """Pass a request on, over a connection of its own, and return the reply.
+        """Pass a request on and return the reply.
 
-        The connection of a session that was started stays until its series ends, and with it the
-        control.
+        A session that was started keeps its connection until its series ends, and with it the
+        control; further requests that need it take the same one.
 
         Parameters
         ----------
@@ -76,34 +79,36 @@ class DaemonLink:
         DaemonError
             If there is no reply.
         """
-        for _ in range(_CROWD_TRIES):
-            reply = await self._ask_once(request)
+        if request.get("command") == "predict":
+            return await self._ask_anew(request)
+        async with self._commanding:
+            if self._held is not None:
+                with suppress(DaemonError):
+                    return await _exchange(self._held, request)
+                self._let_go()
+            return await self._ask_anew(request)
+
+    async def _ask_anew(self, request: Document) -> Document:
+        """Ask over a new connection; a daemon that has too many clients is asked again."""
+        for attempt in range(_CROWD_TRIES):
+            if attempt:
+                await asyncio.sleep(_CROWD_PAUSE_S)
+            try:
+                link = await self._connect()
+            except (OSError, TimeoutError):
+                raise DaemonError(_GONE) from None
+            try:
+                reply = await _exchange(link, request)
+                if request.get("command") == "start" and reply.get("ok"):
+                    self._held = link
+            finally:
+                if self._held is not link:
+                    link[1].close()
             if not reply.get("crowded"):
-                return reply
-            await asyncio.sleep(0.1)
+                break
         return reply
 
-    async def _ask_once(self, request: Document) -> Document:
-        try:
-            reader, writer = await self._connect()
-        except OSError:
-            raise DaemonError(_GONE) from None
-        try:
-            writer.write(json.dumps(request).encode() + b"\n")
-            line = await asyncio.wait_for(reader.readline(), _ANSWER_S)
-            reply = json.loads(line)
-        except (OSError, ValueError, TimeoutError):
-            raise DaemonError("The daemon gave no answer.") from None
-        else:
-            if request.get("command") == "start" and reply.get("ok"):
-                self._let_go()
-                self._held = writer
-            return dict(reply)
-        finally:
-            if self._held is not writer:
-                writer.close()
-
-    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    async def _connect(self) -> _Connection:
         opening = asyncio.open_unix_connection(self._path, limit=_LONGEST_LINE)
         return await asyncio.wait_for(opening, _CONNECT_S)
 
@@ -152,7 +157,18 @@ class DaemonLink:
         """Give control back."""
         held, self._held = self._held, None
         if held is not None:
-            held.close()
+            held[1].close()
+
+
+async def _exchange(link: _Connection, request: Document) -> Document:
+    """Send a request and wait for its reply."""
+    reader, writer = link
+    try:
+        writer.write(json.dumps(request).encode() + b"\n")
+        line = await asyncio.wait_for(reader.readline(), _ANSWER_S)
+        return dict(json.loads(line))
+    except (OSError, ValueError, TimeoutError):
+        raise DaemonError("The daemon gave no answer.") from None
 
 
 _GONE: Final = "The daemon is not running, or cannot be reached; start it with rigd serve."
