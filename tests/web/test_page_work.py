@@ -137,7 +137,7 @@ def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(ser
 
 
 def test_zero_tare_and_check_tell_their_results(server, page):
-    axes = ("fx", "fy", "fz", "tx", "ty", "tz")
+    axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
     server.replies |= {
         "zero": {"moved_rad": 0.001},
         "tare": {
@@ -198,7 +198,7 @@ def test_gauges_are_per_cent_of_limits_and_coloured_near_them(server, page):
 def test_strips_show_the_last_ten_seconds(server, page):
     before = drawn(page, "#strip-angle")
     server.tell(strip(0.0, 300))
-    label = re.compile("^Angle, last 10 s: -0.02[45].* to 0.02[45].* rad$")
+    label = re.compile("^Angle, last 10 s: −0.02[45].* to 0.02[45].* rad$")
     expect(page.locator("#strip-angle")).to_have_attribute("aria-label", label)
     assert drawn(page, "#strip-angle") > 2 * before
     # Gaps are none of its business, and a new record begins anew.

@@ -1,5 +1,7 @@
 // A plain canvas of the right resolution, with axes whose ticks are round numbers.
 
+import { minus } from "./format.js";
+
 const FONT = '12px system-ui, "Liberation Sans", Arial, sans-serif';
 
 /** Round step that divides a span into about so many parts. */
@@ -19,11 +21,10 @@ export function roundTicks(first, last, parts) {
   return ticks;
 }
 
-/** A tick as text, with the decimals of its step; a minus is a minus. */
+/** A tick as text, with the decimals of its step. */
 export function tickText(value, step) {
   const decimals = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
-  const text = (Math.abs(value) < step / 1e6 ? 0 : value).toFixed(Math.min(decimals, 8));
-  return text.replace("-", "−");
+  return minus((Math.abs(value) < step / 1e6 ? 0 : value).toFixed(Math.min(decimals, 8)));
 }
 
 export class Surface {

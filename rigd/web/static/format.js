@@ -2,6 +2,9 @@
 
 const NOTHING = "–";
 
+/** A minus is no hyphen. */
+export const minus = (text) => text.replaceAll("-", "−");
+
 /** Endings of names and the units they stand for, the longer endings first (rigd/units.py). */
 const UNITS = {
   _nm_s_per_rad: "N·m·s/rad", _nm_per_rad: "N·m/rad", _kg_per_m: "kg/m", _kg_m2: "kg·m²",
@@ -28,9 +31,9 @@ export function digits(value, count = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return NOTHING;
   if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size < 1e-4 || size >= 1e6) return value.toExponential(count - 1).replace("e+", "e");
+  if (size < 1e-4 || size >= 1e6) return minus(value.toExponential(count - 1).replace("e+", "e"));
   const decimals = Math.max(0, count - 1 - Math.floor(Math.log10(size)));
-  return value.toFixed(Math.min(decimals, 8));
+  return minus(value.toFixed(Math.min(decimals, 8)));
 }
 
 /** A level that somebody chose, without the zeros that digits would add. */
@@ -100,7 +103,7 @@ export function estimate(found, factor = 1, digit = 2) {
   if (!found || !Number.isFinite(found.value)) return { value: NOTHING, interval: "" };
   const known = Number.isFinite(found.std) && found.std > 0;
   const text = (value) => (known
-    ? (value * factor).toFixed(decimalsOf(found.std * factor, digit)) : digits(value * factor));
+    ? minus((value * factor).toFixed(decimalsOf(found.std * factor, digit))) : digits(value * factor));
   const ends = found.interval_95;
   return {
     value: text(found.value),

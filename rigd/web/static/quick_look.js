@@ -28,7 +28,7 @@ function modeTable(modes) {
 
 /** What has changed since the last session of the same specimen. */
 function changes({ file, sentence, modes = [] }) {
-  const signed = (value) => (value > 0 ? "+" : "") + digits(value).replace("-", "−");
+  const signed = (value) => (value > 0 ? "+" : "") + digits(value);
   const lines = modes.map((mode, k) => {
     const known = Number.isFinite(mode.frequency_hz_change);
     return known ? make("li", {},

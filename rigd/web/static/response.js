@@ -2,7 +2,7 @@
 
 import { byId, make, setText } from "./dom.js";
 import { Surface, roundStep, roundTicks, tickText } from "./canvas.js";
-import { digits } from "./format.js";
+import { digits, minus } from "./format.js";
 
 const FIRST_HZ = 0.5;  // below it the antenna's torque is lost in the sensor's noise
 const LAST_HZ = 60;
@@ -215,8 +215,8 @@ export class ResponsePlot {
     const k = nearest(response.frequency_hz, frequency);
     const parts = [`${digits(response.frequency_hz[k])} Hz`];
     if (known(response.magnitude[k]) && response.magnitude[k] > 0) {
-      parts.push(`${decibels(response.magnitude[k]).toFixed(1).replace("-", "−")} dB`);
-      parts.push(`${degrees(response.phase_rad[k]).toFixed(0).replace("-", "−")}°`);
+      parts.push(`${minus(decibels(response.magnitude[k]).toFixed(1))} dB`);
+      parts.push(`${minus(degrees(response.phase_rad[k]).toFixed(0))}°`);
     }
     if (known(response.coherence?.[k])) parts.push(`coherence ${response.coherence[k].toFixed(3)}`);
     setText(this.readout, parts.join(", "));

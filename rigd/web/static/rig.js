@@ -1,11 +1,10 @@
 // Zero, Tare, Check and Reset with their results; last check, and age of the calibration.
 
 import { byId, make, setText, show } from "./dom.js";
-import { age, clock, withUnit } from "./format.js";
+import { age, clock, unitOf, withUnit, wordsOf } from "./format.js";
 
 const NEEDED = { zero: ["ready"], tare: ["ready"], check: ["ready", "idle"], reset: ["fault"] };
 const BUSY = { zero: "Setting the zero", tare: "Taring", check: "Checking", reset: "Resetting" };
-const UNITS = { f: "N", t: "N·m" };
 
 export class Rig {
   #link;
@@ -75,8 +74,8 @@ const RESULTS = {
     make("table", {}, make("thead", {}, make("tr", {}, ...["Axis", "Mean", "S.d."].map((text) =>
       make("th", { scope: "col" }, text)))),
     make("tbody", {}, ...Object.keys(mean).map((axis) => make("tr", {},
-      make("td", {}, axis), make("td", {}, withUnit(mean[axis], UNITS[axis[0]])),
-      make("td", {}, withUnit(std[axis], UNITS[axis[0]], 2))))))],
+      make("td", {}, wordsOf(axis)), make("td", {}, withUnit(mean[axis], unitOf(axis))),
+      make("td", {}, withUnit(std[axis], unitOf(axis), 2))))))],
   check: ({ rows, verdict }) => [
     make("p", {}, make("b", {}, `${at()}${verdict}`)),
     make("ul", { class: "check-rows" }, ...rows.map((row) => make("li", { class: row.status },

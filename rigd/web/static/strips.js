@@ -9,7 +9,7 @@ const SHOWN_S = 10;
 const LEAST = { angle: 0.002, torque: 0.02 };
 const LEFT = 52;
 const BOTTOM = 18;
-const TOP = 6;
+const TOP = 8;
 const HALVES = [1, 1.5, 2, 3, 4, 6, 8, 10];
 const SPOKEN_MS = 1000;
 
