@@ -89,6 +89,32 @@ def list_sessions(
         typer.echo("\n".join(_lines(rows)))
 
 
+def specimens() -> None:
+    """List the specimens that have a file of their own.
+
+    A file NAME.toml has the section [beam] of a profile and may have [beam.damping] and a text
+    note. It is looked for in specimens of the working folder, then in the per-user folder
+    ($XDG_CONFIG_HOME/rigd/specimens, by default ~/.config/rigd/specimens). Sessions with --specimen
+    NAME use its beam instead of the profile's.
+
+    Example: rigd specimens
+    """
+    from rigd.profile import ProfileError, load_specimen, specimen_files
+
+    for name, path in specimen_files().items():
+        try:
+            found = load_specimen(path)
+        except ProfileError as error:
+            told = f"cannot be used: {str(error).splitlines()[0]}"
+        else:
+            beam = found.beam
+            told = (
+                f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
+                f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
+            )
+        typer.echo(printable(f"{name}: {told}"))
+
+
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
     """Return the sessions with modes; those of several specimens have no trend."""
     found = [row for row in rows if row.modes]
