@@ -36,7 +36,7 @@ from rigd.daemon._states import (
 from rigd.devices import WhatMoves, what_moves
 from rigd.engine import Event
 from rigd.errors import RigdError, UserError
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
 from rigd.runner import (
     NoRoomError,
     QuickLook,
@@ -147,7 +147,7 @@ class ServedSeries:
             "excitation": self.request.excitation,
             "session": self.session,
             "repeat": self.request.repeat,
-            "notes": dict(self.request.notes),
+            "notes": self.request.notes.model_dump(exclude_defaults=True),
             "plan": None if self.planned is None else self.planned.plan_document(),
             "path": None if self.path is None else str(self.path),
             "running": self.running,
@@ -431,7 +431,11 @@ class Service:
         if self._predictions >= _MOST_PREDICTIONS:
             raise CommandError("Several predictions are being made; try again in a moment.")
         job = aside.PredictionJob(
-            self._profile, request.excitation, request.parameters, request.force
+            self._profile,
+            request.excitation,
+            request.parameters,
+            request.force,
+            request.notes.specimen,
         )
         self._predictions += 1
         try:
@@ -554,14 +558,15 @@ class Service:
 
     def _plan(self, request: protocol.Start) -> Series:
         """Make the excitation and see that it may be run; in the second thread."""
-        profile = self._profile
+        notes = request.notes.as_metadata()
         try:
+            profile = with_specimen(self._profile, notes.get("specimen", ""))
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters),
                 self._folder,
                 repeat=request.repeat,
-                notes={str(name): text for name, text in request.notes.items()},
+                notes=notes,
                 force=request.force,
             )
         except NoRoomError as error:  # the same request may succeed later

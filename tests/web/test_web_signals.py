@@ -33,9 +33,9 @@ def test_a_block_is_what_the_event_tells():
 @pytest.mark.parametrize("pieces", [1, 7, 51, 400])
 def test_strips_are_the_extremes_of_each_point_in_whatever_pieces_they_come(pieces):
     angle = np.sin(np.arange(400) / 30.0)
-    strips, told = Strips(), []
-    for first in range(0, 400, pieces):
-        told.append(strips.feed(block(first, angle[first : first + pieces])))
+    strips = Strips()
+    firsts = range(0, 400, pieces)
+    told = [strips.feed(block(first, angle[first : first + pieces])) for first in firsts]
     told = [each for each in told if each]
     assert [told[0]["t0_s"], told[0]["dt_s"]] == [0.0, 0.05]
     least = np.concatenate([each["angle_min"] for each in told])
