@@ -48,7 +48,15 @@ class QuickLook:
 
     @classmethod
     def failed(cls, session: Path, error: str) -> "QuickLook":
-        """Return that there is none, and why."""
+        """Return that there is none.
+
+        Parameters
+        ----------
+        session
+            Path of the session file.
+        error
+            Why, a sentence.
+        """
         return cls(session, None, None, error)
 
     @classmethod
