@@ -601,7 +601,9 @@ class _Told:
 
     def begins(self, number: int, path: Path) -> None:
         if not self._listens():
-            raise RigError("The daemon hears nobody: no further session is begun.")
+            raise RigError(
+                "The daemon does not respond to requests: no further session is started."
+            )
         self._series.session, self._series.path = number, path
 
     def shown(self, where: str) -> None:

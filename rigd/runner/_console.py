@@ -28,11 +28,11 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     limits = plan.get("limits", {})
 
     def peak(name: str, unit: str) -> str:
-        limit = f" of {limits[name]:g}" if name in limits else ""
-        return f"{plan[f'peak_{name}']:.3g}{limit} {unit}"
+        limit = f" (limit {limits[name]:g})" if name in limits else ""
+        return f"{plan[f'peak_{name}']:.3g} {unit}{limit}"
 
-    what = f"{plan['excitation']} on {plan['profile']}: " if "profile" in plan else ""
-    yield f"{what}{plan['record_s']:g} s of record."
+    what = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
+    yield f"{what}record of {plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
