@@ -196,9 +196,7 @@ class _Operator:
         self._tell(result_line(result.as_dict()))
         if result.path is not None:
             if result.live_dropped:
-                self._tell(
-                    f"The live view missed {result.live_dropped} samples; the file has them."
-                )
+                self._tell(f"The viewer dropped {result.live_dropped} samples; the file has them.")
             self._tell(str(result.path))
 
     def _close(self) -> None:
@@ -238,4 +236,4 @@ def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""
-    _tell(f"stopped: no record{after}. Stopped by the operator before the session began.", err=True)
+    _tell(f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True)
