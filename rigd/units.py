@@ -18,6 +18,9 @@ UNITS: Final = MappingProxyType(
         "_rad_s2": "rad/s²",
         "_rad_s": "rad/s",
         "_rad": "rad",
+        "_hpa": "hPa",
+        "_kg": "kg",
+        "_mm": "mm",
         "_nm": "N·m",
         "_mb": "MB",
         "_hz": "Hz",
@@ -26,6 +29,7 @@ UNITS: Final = MappingProxyType(
         "_m": "m",
         "_n": "N",
         "_s": "s",
+        "_c": "°C",
     }
 )
 """Ending of a key → its unit, the longer endings first: the first that fits is the key's."""

@@ -24,7 +24,8 @@ from rigd import testing
 from rigd.runtime import use_one_thread
 
 pytest_plugins = [
-    "kinds_of_tests", "paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions",
+    "kinds_of_tests", "library_folders", "paper_sweeps", "shipped_profile", "standstill",
+    "synthetic_sessions",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.

@@ -34,7 +34,7 @@ from rigd.daemon._states import (
 from rigd.devices import WhatMoves, what_moves
 from rigd.engine import Event
 from rigd.errors import RigdError, UserError
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
 from rigd.runner import (
     NoRoomError,
     RigError,
@@ -467,14 +467,15 @@ class Service:
 
     def _plan(self, request: protocol.Start) -> Series:
         """Make the excitation and see that it may be run; in the second thread."""
-        profile = self._profile
+        notes = request.notes.as_metadata()
         try:
+            profile = with_specimen(self._profile, notes.get("specimen", ""))
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters),
                 self._folder,
                 repeat=request.repeat,
-                notes={str(name): text for name, text in request.notes.items()},
+                notes=notes,
                 force=request.force,
             )
         except NoRoomError as error:  # the same request may succeed later

@@ -36,8 +36,9 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
     )
-    if words := plan.get("tip_in_words"):
-        yield words
+    for words in ("specimen_in_words", "tip_in_words"):
+        if plan.get(words):
+            yield plan[words]
     for warning in plan["warnings"]:
         yield f"Warning: {warning}"
 

@@ -167,6 +167,29 @@ def _peaks(reference_rad: Real, response: LoopResponse, tip: TipMotion | None = 
     )
 
 
+def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str]:
+    """Return the predicted peaks and their limits as a session's file has them.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig, with its limits.
+    predicted
+        What the session is predicted to do.
+
+    Returns
+    -------
+    dict of str to str
+        ``predicted_peak_…`` and ``limit_…``, their units in the names.
+    """
+    firm, forcible = _limited(profile, predicted)
+    metadata = {}
+    for peak in (*firm, *forcible):
+        metadata[f"predicted_peak_{_KEYS[peak.name]}"] = repr(peak.value)
+        metadata[f"limit_{_KEYS[peak.name]}"] = repr(peak.limit)
+    return metadata
+
+
 def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
     tip = predicted.tip
     if tip is None:
@@ -186,6 +209,16 @@ def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
         f"out up to {100 * tip.slope_rad**2 / 3:.2g} % of what bends and moves, and air drag may "
         f"limit the motion{within}."
     )
+
+
+_KEYS = {
+    "angle": "angle_rad",
+    "speed": "velocity_rad_s",
+    "tracking error": "tracking_error_rad",
+    "coupling torque": "coupling_torque_nm",
+    "torque": "torque_nm",
+}
+"""Names of the limited peaks as keys of metadata."""
 
 
 @dataclass(frozen=True, slots=True)
