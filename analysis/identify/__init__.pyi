@@ -46,6 +46,7 @@ from ._result import RecordAnalysis as RecordAnalysis
 from ._result import RecordFit as RecordFit
 from ._result import Ringing as Ringing
 from ._select import Selection as Selection
+from ._select import freest_alone as freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
 from ._verdict import EVEN as EVEN

@@ -119,6 +119,14 @@ Force = Annotated[
 ]
 
 
+NoLook = Annotated[
+    bool,
+    typer.Option(
+        "--no-look", envvar="RIGD_NO_LOOK", help="Make no quick look at a session after its end."
+    ),
+]
+
+
 def session_notes(
     operator: str, specimen: str, note: str, meta: list[str] | None
 ) -> dict[str, str]:

@@ -31,7 +31,8 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
         return f"{plan[f'peak_{name}']:.3g}{limit} {unit}"
 
     what = f"{plan['excitation']} on {plan['profile']}: " if "profile" in plan else ""
-    yield f"{what}{plan['record_s']:g} s of record."
+    sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
+    yield f"{what}{sweep}{plan['record_s']:g} s of record."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
