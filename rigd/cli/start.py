@@ -174,6 +174,7 @@ def _follow(
     from rigd.runner import ProgressLine, QuickLook, result_line
 
     asked = False
+    done = 0
     awaited: set[str] = set()
     made: dict[str, str] = {}
     ended: dict[str, Any] | None = None
@@ -191,7 +192,8 @@ def _follow(
                 raise typer.Exit(EXIT_INTERRUPTED)
             event = client.event(_POLL_S) or {}
             match event.get("event"):
-                case "progress":
+                # Between two sessions there is nothing to show: the bar would stand by the path.
+                case "progress" if event["session"] > done:
                     line.update(
                         Phase[event["phase"].upper()],
                         event["tick"],
@@ -214,7 +216,7 @@ def _follow(
                             typer.echo(event["path"])
                         if looks:
                             awaited.add(event["path"])
-                    line = ProgressLine()
+                    line, done = ProgressLine(), event["number"]
                 case "quick_look" if event["path"] in awaited:
                     awaited.discard(event["path"])
                     look = QuickLook.of_event(event)

@@ -50,6 +50,7 @@ from rigd.runner import (
     SessionRig,
     SignalBlock,
     excitation_for,
+    result_line,
     what_is_kept,
 )
 from rigd.runtime import StopRequest
@@ -731,26 +732,14 @@ class _Told:
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
-        counts = {
-            "ticks scheduled": result.scheduled,
-            "recorded": result.recorded,
-            "missed": result.missed,
-            "late": result.late,
-            "lost": result.lost,
-            "stale angles": result.stale_angles,
-            "stale wrenches": result.stale_wrenches,
-            "not shown live": result.live_dropped,
-        }
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
-            "series %d: session %d of %d: %s, %s: %s%s",
+            "series %d: session %d of %d, %s: %s",
             series.number,
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            result.outcome,
-            ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
-            f": {result.reason}" if result.reason else "",
+            result_line(result.as_dict()),
         )
         self._publish({"event": "session", "number": series.session, **result.as_dict()})
 

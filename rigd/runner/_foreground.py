@@ -238,4 +238,4 @@ def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""
-    _tell(f"stopped: no record{after}. Stopped by the operator before the session began.", err=True)
+    _tell(f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True)

@@ -499,7 +499,7 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     assert health["sensor_status"] == 0
     protocol.json.dumps(status, allow_nan=False)
     assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
-        "control": "at work", "recorder": "at work", "supervisor": "at work",
+        "control": "running", "recorder": "running", "supervisor": "running",
     }  # fmt: skip
     assert [t["name"] for t in status["rig"]["topics"]][-1] == "/rig/sample"
     assert [(h["from"], h["to"]) for h in status["history"]] == [
@@ -533,11 +533,10 @@ def test_the_log_tells_of_refusals_and_results(operated, caplog):
     assert [line.partition(":")[0] for line in refused] == ["start", "reset", "tare"]
     assert "amplitude_rad = 9" in refused[0]
     assert "is controlled by" in refused[2]
-    (result,) = [line for line in told if "scheduled" in line]
+    (result,) = [line for line in told if "samples" in line]
     path = operated.last["sessions"][0]["path"]
     assert result == (
-        f"series 2: session 1 of 1: {path}, complete: 300 ticks scheduled, 300 recorded, 0 missed, "
-        "0 late, 0 lost, 0 stale angles, 0 stale wrenches, 0 not shown live"
+        f"series 2: session 1 of 1, {path}: Complete: 300 of 300 samples, 0 missed, 0 late."
     )
 
 
