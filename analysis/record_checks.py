@@ -82,8 +82,8 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
             raise _wrong(session, key, value, f"must lie between {low:g} and {high:g}")
         values.append(value)
     length_m, density, stiffness = values
-    first_hz = (_FIRST_ROOT / length_m) ** 2 * math.sqrt(stiffness / density) / (2 * math.pi)
-    lowest_hz = _LEAST_PERIODS * rate_hz / ticks
+    beam = Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
+    first_hz, lowest_hz = first_mode_hz(beam), _LEAST_PERIODS * rate_hz / ticks
     if not lowest_hz < first_hz < rate_hz / 2:
         raise RecordError(
             f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m {density:g} "
@@ -92,10 +92,21 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
             + (
                 "record longer, or correct the file's metadata if these are wrong."
                 if first_hz <= lowest_hz
-                else "correct the file's metadata."
+                else "correct the file's metadata, or import the record again if its time was "
+                "taken in the wrong unit."
             )
         )
-    return Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
+    return beam
+
+
+def first_mode_hz(beam: Beam) -> float:
+    """Frequency of the first mode of an undamped beam with locked hub.
+
+    Parameters
+    ----------
+    beam : Beam
+    """
+    return (_FIRST_ROOT / beam.length_m) ** 2 / math.sqrt(beam.density_over_stiffness) / math.tau
 
 
 def stated_tool_inertia_kg_m2(session: Session) -> float:
