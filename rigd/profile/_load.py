@@ -122,6 +122,7 @@ def profile_of(text: str, path: Path) -> Profile:
         limits=section["limits"],
         session=section["session"],
         realtime=section["realtime"],
+        uncertainty=section["uncertainty"],
         sources=sources,
     )
 

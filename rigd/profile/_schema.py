@@ -1,7 +1,7 @@
 """Schema of a profile: its sections, and the settings that no other module declares."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -23,7 +23,7 @@ from rigd.devices import (
     ServoDrive,
     Simulation,
 )
-from rigd.devices.parameters import WrenchSensor
+from rigd.devices.parameters import OPTIONAL, WrenchSensor
 from rigd.safety import Limits
 
 
@@ -69,6 +69,32 @@ class RealtimeSettings:
         return self.priority // 4
 
 
+_RelativePercent = Annotated[float, Ge(0), Le(50)]
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleUncertainty:
+    """Relative standard uncertainties (k = 1) of what all sessions of a rig have in common.
+
+    They do not average out, and no session shows them: an analysis adds them to its statistical
+    intervals. Zero: not stated.
+    """
+
+    torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Scale of the torque over the angle: calibration and mounting of the sensor."""
+    length_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Length of the beam."""
+    density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Mass per length of the beam, such as from weighing it."""
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """Those that the profile states, by the names of the fields."""
+        return {
+            each.name: value for each in fields(self) if (value := getattr(self, each.name)) > 0
+        }
+
+
 @dataclass(frozen=True, slots=True)
 class RigSection:
     """Settings of the rig as a whole."""
@@ -96,6 +122,7 @@ SECTIONS: dict[str, type] = {
     "ati_can": AtiCan,
     "ati_serial": AtiSerial,
     "simulation": Simulation,
+    "uncertainty": ScaleUncertainty,
 }
 WIRING = {
     "cia402": ("can", "acquisition", "cia402"),
@@ -175,6 +202,8 @@ class Profile:
     """Settings round a record."""
     realtime: RealtimeSettings
     """What its processes ask of the operating system."""
+    uncertainty: ScaleUncertainty
+    """How well the scales are known that no session shows."""
     sources: Mapping[str, str]
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None
