@@ -9,7 +9,7 @@ import pytest
 from rigd.engine._messages import Connected
 from rigd.profile import load_profile
 from rigd.profile._load import profile_of
-from rigd.runner._request import file_header
+from rigd.runner._request import Order, file_header
 
 SHIPPED = ("sim", "antenna_can", "antenna_serial")
 
@@ -37,10 +37,7 @@ def test_a_session_carries_what_its_profile_states():
 
     def metadata(text):
         profile = profile_of(text.replace("length_percent", "# length_percent"), Path("a.toml"))
-        order = SimpleNamespace(
-            profile=profile, excitation=excitation, path=Path("a.mcap"), notes={}
-        )
-        header = file_header(order, connected, {})
+        header = file_header(Order(profile, excitation, Path("a.mcap")), connected, {})
         return {k: v for k, v in header.metadata.items() if k.startswith("uncertainty")}
 
     assert metadata(load_profile("sim").text) == {}
