@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from rigd.errors import RigdError
+from rigd.printable import BAR_STYLES
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -63,8 +64,9 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 def _bar(name: str) -> Iterator[Callable[[float], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.theme import Theme
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, theme=Theme(BAR_STYLES))
     with Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -116,6 +118,14 @@ Meta = Annotated[
 ]
 Force = Annotated[
     bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
+]
+
+
+NoLook = Annotated[
+    bool,
+    typer.Option(
+        "--no-look", envvar="RIGD_NO_LOOK", help="Make no quick look at a session after its end."
+    ),
 ]
 
 

@@ -22,6 +22,7 @@ from rigd.cli.options import (
     Force,
     Hardware,
     Meta,
+    NoLook,
     Note,
     Operator,
     Output,
@@ -109,6 +110,7 @@ def run_sessions(
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
@@ -132,6 +134,7 @@ def run_sessions(
             force=force,
             quiet_stdout=as_json,
             hardware=hardware,
+            look=not no_look,
         )
     except SeriesFailedError as error:
         if as_json:

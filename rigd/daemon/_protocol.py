@@ -7,7 +7,7 @@ import inspect
 import json
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -55,6 +55,7 @@ class Watch(Request):
     """Send the events from now on."""
 
     command: Literal["watch"]
+    signals: bool = False
 
 
 class Stop(Request):
@@ -106,11 +107,16 @@ class Notes(BaseModel):
         return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
 
 
-class Start(Request):
-    """Run a session, or a series of them."""
+class Check(Request):
+    """Check profile, control loop and computer, and what the connected devices said."""
 
     controlling = True
-    command: Literal["start"]
+    command: Literal["check"]
+
+
+class SessionRequest(Request):
+    """A session, or a series of them."""
+
     excitation: str
     parameters: dict[str, Any] = {}
     repeat: int = Field(default=1, ge=1, le=MOST_SESSIONS)
@@ -118,11 +124,24 @@ class Start(Request):
     force: bool = False
 
 
-AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Start
+class Start(SessionRequest):
+    """Run it."""
+
+    controlling = True
+    command: Literal["start"]
+
+
+class Predict(SessionRequest):
+    """Predict what it would do."""
+
+    command: Literal["predict"]
+
+
+AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Check | Start | Predict
 _REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
     Annotated[AnyRequest, Field(discriminator="command")]
 )
-_COMMANDS = ("status", "watch", "stop", "tare", "zero", "reset", "start")
+_COMMANDS = "status", "watch", "stop", "tare", "zero", "reset", "check", "start", "predict"
 
 
 def parse_request(line: bytes) -> AnyRequest:
@@ -148,7 +167,7 @@ def parse_request(line: bytes) -> AnyRequest:
     except ValidationError as error:
         raise RequestError(_first_complaint(error), request_id) from None
     try:
-        return _checked(request) if isinstance(request, Start) else request
+        return _checked(request) if isinstance(request, SessionRequest) else request
     except RequestError as error:
         raise RequestError(str(error), request_id) from None
 
@@ -179,7 +198,10 @@ def _first_complaint(error: ValidationError) -> str:
     return f"{where}: {first['msg']}."
 
 
-def _checked(request: Start) -> Start:
+SomeSession = TypeVar("SomeSession", bound=SessionRequest)
+
+
+def _checked(request: SomeSession) -> SomeSession:
     """Check what depends on the excitation, by the signature of its function."""
     if request.excitation not in KINDS:
         raise RequestError(

@@ -375,6 +375,42 @@ def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate,
     assert operated.state is State.READY
 
 
+def test_a_request_waits_until_the_devices_of_a_new_daemon_are_connected(operate):
+    operated = operate()
+
+    async def ask():
+        opening = asyncio.create_task(operated.service.open())
+        await asyncio.sleep(0)
+        assert operated.service.status()["doing"] == "connecting"
+        reply = await operated.handle("zero")
+        await opening
+        return reply
+
+    assert "moved_rad" in operated.loop.run_until_complete(ask())
+    assert operated.state is State.READY
+
+
+def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
+    operated = operate()
+    line = protocol.json.dumps({"command": "start", **SHORT}).encode()
+
+    async def ask():
+        opening = asyncio.create_task(operated.service.open())
+        await asyncio.sleep(0)
+        started = asyncio.create_task(
+            operated.service.handle(protocol.parse_request(line), operated.peer)
+        )
+        await asyncio.sleep(0)
+        assert await operated.handle("stop", peer=OTHER) == {"stopping": False}
+        with pytest.raises(CommandError, match="stopped before it began"):
+            await started
+        await opening
+
+    operated.loop.run_until_complete(ask())
+    assert operated.state is State.READY
+    assert operated.world.highest_nm == 0.0
+
+
 def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
     assert operated.ask("start", **SHORT)["series"] == 1
     crew = operated.rig._crew
@@ -463,7 +499,7 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     assert health["sensor_status"] == 0
     protocol.json.dumps(status, allow_nan=False)
     assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
-        "control": "at work", "recorder": "at work", "supervisor": "at work",
+        "control": "running", "recorder": "running", "supervisor": "running",
     }  # fmt: skip
     assert [t["name"] for t in status["rig"]["topics"]][-1] == "/rig/sample"
     assert [(h["from"], h["to"]) for h in status["history"]] == [
@@ -497,11 +533,10 @@ def test_the_log_tells_of_refusals_and_results(operated, caplog):
     assert [line.partition(":")[0] for line in refused] == ["start", "reset", "tare"]
     assert "amplitude_rad = 9" in refused[0]
     assert "is controlled by" in refused[2]
-    (result,) = [line for line in told if "scheduled" in line]
+    (result,) = [line for line in told if "samples" in line]
     path = operated.last["sessions"][0]["path"]
     assert result == (
-        f"series 2: session 1 of 1: {path}, complete: 300 ticks scheduled, 300 recorded, 0 missed, "
-        "0 late, 0 lost, 0 stale angles, 0 stale wrenches, 0 not shown live"
+        f"series 2: session 1 of 1, {path}: Complete: 300 of 300 samples, 0 missed, 0 late."
     )
 
 
