@@ -18,7 +18,7 @@ REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
 PAGE: Final = "report.html"
 NUMBERS: Final = "analysis.json"
 
-_MOST_JSON_BYTES: Final = 32 << 20
+_MOST_JSON_BYTES: Final = 8 << 20
 _MOST_MODES: Final = 20
 _MOST_CHARACTERS: Final = 1000
 _MOST_META: Final = 100

@@ -203,6 +203,8 @@ class Specimen:
     """Its beam."""
     damping: Damping | None
     """Its nominal damping; None: that of the profile."""
+    uncertainty: ScaleUncertainty
+    """How well its length and density are known; the torque's scale is the rig's."""
     note: str
     """Whatever else is to be known of it."""
 
