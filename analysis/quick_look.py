@@ -15,6 +15,7 @@ import signal
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import Finding, Headline, Mode
     from analysis.record import Record
+    from rigd.spectral import RunningEstimate, Segmentation
 
     Real = NDArray[np.float64]
 
@@ -179,19 +181,16 @@ def _response(record: Record) -> tuple[dict[str, Any], dict[str, Any], list[str]
 
     from analysis.models import LARGEST_SHARE_OF_RATE
     from analysis.suited import against_welch
-    from rigd.spectral import RunningResponse, SpectralError, segmentation_of
+    from rigd.spectral import SpectralError, segmentation_of
 
     last_hz = min(_LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
-    swept, rest_rad = record.sweep, record.rest_angle_rad or 0.0
+    segments = segmentation_of(record.sweep_samples, record.rate_hz)
     try:
-        running = RunningResponse(record.rate_hz, record.sweep_samples, last_hz=last_hz)
-        running.feed(
-            np.arange(record.sweep_samples),
-            record.reference_rad[swept] - rest_rad,
-            record.angle_rad[swept] - rest_rad,
-            record.torque_nm[swept],
-        )
-        estimate = running.estimate()
+        estimate = _estimate(record, segments, last_hz)
+        # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
+        coherence = None
+        if estimate is not None and against_welch(record, (_FIRST_HZ, last_hz)) is None:
+            coherence, segments = _coherence(record, estimate, segments, last_hz)
     except SpectralError as error:
         return _no_response(), _no_coherence(), [str(error)]
     if estimate is None:
@@ -199,26 +198,55 @@ def _response(record: Record) -> tuple[dict[str, Any], dict[str, Any], list[str]
     found = estimate.response.without_delays(
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
-    shown = (
-        estimate.excited & (found.frequency_hz >= _FIRST_HZ) & np.isfinite(np.abs(found.response))
-    )
+    shown = estimate.excited & (found.frequency_hz >= _FIRST_HZ) & np.isfinite(found.response)
     hz, values = found.frequency_hz[shown], found.response[shown]
-    # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
-    tells = found.coherence is not None and against_welch(record, (_FIRST_HZ, last_hz)) is None
-    coherent = found.coherence[shown] if tells and found.coherence is not None else None
     kept = _thinned(hz, np.abs(values))
     response = {
         "frequency_hz": _rounded(hz[kept]),
         "magnitude": _rounded(np.abs(values[kept])),
         "phase_rad": _rounded(np.angle(values[kept])),
-        "coherence": None if coherent is None else _rounded(coherent[kept]),
+        "coherence": None if coherence is None else _rounded(coherence[shown][kept]),
     }
-    if coherent is None or hz.size == 0:
+    if coherence is None or hz.size == 0:
         return response, _no_coherence(), []
-    segment = segmentation_of(record.sweep_samples, record.rate_hz).segment_length
-    low = _bands(hz, coherent < _COHERENT, record.rate_hz / segment)
+    coherent = coherence[shown]
+    low = _bands(hz, coherent < _COHERENT, record.rate_hz / segments.segment_length)
     bands = [[round(edge, 3) for edge in band] for band in low]
     return response, {"mean": round(float(coherent.mean()), 4), "low_bands": bands}, []
+
+
+def _estimate(record: Record, segments: Segmentation, last_hz: float) -> RunningEstimate | None:
+    import numpy as np
+
+    from rigd.spectral import RunningResponse
+
+    swept, rest_rad = record.sweep, record.rest_angle_rad or 0.0
+    running = RunningResponse(
+        record.rate_hz, record.sweep_samples, last_hz=last_hz, segmentation=segments
+    )
+    running.feed(
+        np.arange(record.sweep_samples),
+        record.reference_rad[swept] - rest_rad,
+        record.angle_rad[swept] - rest_rad,
+        record.torque_nm[swept],
+    )
+    return running.estimate()
+
+
+def _coherence(
+    record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
+) -> tuple[Real | None, Segmentation]:
+    """Return the coherence, and the segments that it is of: of a single one there is none."""
+    from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
+
+    if estimate.response.coherence is None:
+        length, overlap = segment_lengths(
+            record.sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
+        )
+        segments = replace(segments, segment_length=length, overlap=overlap)
+        shorter = _estimate(record, segments, last_hz)
+        return None if shorter is None else shorter.response.coherence, segments
+    return estimate.response.coherence, segments
 
 
 def _thinned(frequency_hz: Real, magnitude: Real) -> NDArray[np.intp]:

@@ -89,6 +89,32 @@ def list_sessions(
         typer.echo("\n".join(_lines(rows)))
 
 
+def specimens() -> None:
+    """List the specimens that have a file of their own.
+
+    A file NAME.toml has the section [beam] of a profile and may have [beam.damping] and a text
+    note. It is looked for in specimens of the working folder, then in the per-user folder
+    ($XDG_CONFIG_HOME/rigd/specimens, by default ~/.config/rigd/specimens). Sessions with --specimen
+    NAME use its beam instead of the profile's.
+
+    Example: rigd specimens
+    """
+    from rigd.profile import ProfileError, load_specimen, specimen_files
+
+    for name, path in specimen_files().items():
+        try:
+            found = load_specimen(path)
+        except ProfileError as error:
+            told = f"cannot be used: {str(error).splitlines()[0]}"
+        else:
+            beam = found.beam
+            told = (
+                f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
+                f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
+            )
+        typer.echo(printable(f"{name}: {told}"))
+
+
 def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
     """Return the sessions with modes; those of several specimens have no trend."""
     found = [row for row in rows if row.modes]
@@ -133,7 +159,7 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
                     for text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
                 ", ".join(map(_mode, row.modes)),
-                "" if row.report is None else printable(row.report.parent.name),
+                "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
             for row in rows
         ],
@@ -178,7 +204,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     yield ""
     yield (
         "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
-        "beyond both intervals."
+        "beyond both intervals, ? is flagged in its report or quick look."
     )
 
 
@@ -208,17 +234,19 @@ def _interval(point: "TrendPoint", low: float, high: float) -> str:
 
 
 def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
-    value = scale * quantity["value"]
+    value, mark = scale * quantity["value"], " ?" if quantity["flag"] else ""
     if quantity["interval_95"] is None:
-        return f"{value:.4g}"
-    half = scale * (quantity["interval_95"][1] - quantity["interval_95"][0]) / 2
+        return f"{value:.4g}{mark}"
+    low, high = quantity["interval_95"]
+    half = scale * (high - low) / 2
     if not half > 0:
-        return f"{value:.6g}"
+        return f"{value:.6g}{mark}"
     places = min(decimals(half), 9)
-    return f"{value:.{places}f} ± {half:.{places}f}"
+    return f"{value:.{places}f} ± {half:.{places}f}{mark}"
 
 
 def _relative(change: "Change | None", first: float) -> str:
     if change is None or first == 0:
         return ""
-    return f"{100 * change.difference / first:+.2f} %{' *' if change.beyond_intervals else ''}"
+    percent = 100 * change.difference / first
+    return f"{percent:+.2g} %{' *' if change.beyond_intervals else ''}"

@@ -20,6 +20,7 @@ from rigd.cli.options import (
     EXIT_WRONG_USE,
     AsJson,
     Force,
+    Meta,
     Note,
     Operator,
     Repeat,
@@ -85,6 +86,7 @@ def start_sessions(
     operator: Operator = "",
     specimen: Specimen = "",
     note: Note = "",
+    meta: Meta = None,
     force: Force = False,
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
@@ -92,7 +94,14 @@ def start_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Have the daemon run sessions, and report how they ended."""
-    notes = session_notes(operator, specimen, note)
+    from rigd.session import META_PREFIX
+
+    notes: dict[str, Any] = {}
+    for key, text in session_notes(operator, specimen, note, meta).items():
+        if key.startswith(META_PREFIX):  # an older daemon does not know the member
+            notes.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = text
+        else:
+            notes[key] = text
     for name, value in parameters.items():
         if isinstance(value, float) and not isfinite(value):
             fail(f"{name} = {value} is not a finite number; give one.", EXIT_WRONG_USE)
@@ -103,7 +112,7 @@ def start_sessions(
             for name, value in parameters.items()
         },
         "repeat": repeat,
-        "notes": {name: text for name, text in notes.items() if text},
+        "notes": notes,
         "force": force,
     }
     with daemon_of(profile) as client, _Interrupts.caught() as interrupts:
@@ -120,7 +129,7 @@ def start_sessions(
                 typer.echo(json.dumps({"series": told["series"]}))
             else:
                 _tell_plan(told["plan"], err=False)
-                typer.echo("It is running; rigd status shows how far it is, rigd stop ends it.")
+                typer.echo("Running; rigd status shows the progress, rigd stop ends the session.")
             return
         _tell_plan(told["plan"], err=as_json)
         # A daemon of before an update makes none.
@@ -165,6 +174,7 @@ def _follow(
     from rigd.runner import ProgressLine, QuickLook, result_line
 
     asked = False
+    done = 0
     awaited: set[str] = set()
     made: dict[str, str] = {}
     ended: dict[str, Any] | None = None
@@ -182,7 +192,8 @@ def _follow(
                 raise typer.Exit(EXIT_INTERRUPTED)
             event = client.event(_POLL_S) or {}
             match event.get("event"):
-                case "progress":
+                # Between two sessions there is nothing to show: the bar would stand by the path.
+                case "progress" if event["session"] > done:
                     line.update(
                         Phase[event["phase"].upper()],
                         event["tick"],
@@ -205,7 +216,7 @@ def _follow(
                             typer.echo(event["path"])
                         if looks:
                             awaited.add(event["path"])
-                    line = ProgressLine()
+                    line, done = ProgressLine(), event["number"]
                 case "quick_look" if event["path"] in awaited:
                     awaited.discard(event["path"])
                     look = QuickLook.of_event(event)

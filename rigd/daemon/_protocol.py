@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigd.excitation import FROM_THE_RIG, KINDS, Value
+from rigd.session import NOTES, MetadataError, metadata_keys
 
 LONGEST_LINE = 65_536
 """Bytes of a request, its newline included."""
@@ -20,6 +21,7 @@ _LONGEST_PATH = 4096
 _SHOWN = 60
 
 _LONGEST_ID = 64
+Note = Annotated[str, Field(max_length=1000)]
 Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
@@ -83,6 +85,28 @@ class Reset(Request):
     command: Literal["reset"]
 
 
+class Notes(BaseModel):
+    """What is to stand in the files, beside what the sessions themselves say."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    operator: Note = ""
+    specimen: Note = ""
+    note: Note = ""
+    meta: dict[str, Any] = {}
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return what was given by the keys of the session file.
+
+        Raises
+        ------
+        MetadataError
+            If added metadata breaks a rule.
+        """
+        texts = {name: getattr(self, name) for name in NOTES}
+        return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
+
+
 class Check(Request):
     """Check profile, control loop and computer, and what the connected devices said."""
 
@@ -96,9 +120,7 @@ class SessionRequest(Request):
     excitation: str
     parameters: dict[str, Any] = {}
     repeat: int = Field(default=1, ge=1, le=MOST_SESSIONS)
-    notes: dict[
-        Literal["operator", "specimen", "note"], Annotated[str, Field(max_length=1000)]
-    ] = {}
+    notes: Notes = Notes()
     force: bool = False
 
 
@@ -185,9 +207,13 @@ def _checked(request: SomeSession) -> SomeSession:
         raise RequestError(
             f"excitation = {_shown(request.excitation)} is not known; there are {', '.join(KINDS)}."
         )
-    for note, text in request.notes.items():
-        if not text.isprintable():
+    for note in NOTES:
+        if not getattr(request.notes, note).isprintable():
             raise RequestError(f"notes.{note} is not plain text of one line.")
+    try:
+        request.notes.as_metadata()
+    except MetadataError as error:
+        raise RequestError(f"notes.meta: {error}") from None
     function = KINDS[request.excitation]
     known = {
         name: parameter

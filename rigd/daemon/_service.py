@@ -36,7 +36,7 @@ from rigd.daemon._states import (
 from rigd.devices import WhatMoves, what_moves
 from rigd.engine import Event
 from rigd.errors import RigdError, UserError
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
 from rigd.runner import (
     NoRoomError,
     QuickLook,
@@ -50,6 +50,7 @@ from rigd.runner import (
     SessionRig,
     SignalBlock,
     excitation_for,
+    result_line,
     what_is_kept,
 )
 from rigd.runtime import StopRequest
@@ -147,7 +148,7 @@ class ServedSeries:
             "excitation": self.request.excitation,
             "session": self.session,
             "repeat": self.request.repeat,
-            "notes": dict(self.request.notes),
+            "notes": self.request.notes.model_dump(exclude_defaults=True),
             "plan": None if self.planned is None else self.planned.plan_document(),
             "path": None if self.path is None else str(self.path),
             "running": self.running,
@@ -431,7 +432,11 @@ class Service:
         if self._predictions >= _MOST_PREDICTIONS:
             raise CommandError("Several predictions are being made; try again in a moment.")
         job = aside.PredictionJob(
-            self._profile, request.excitation, request.parameters, request.force
+            self._profile,
+            request.excitation,
+            request.parameters,
+            request.force,
+            request.notes.specimen,
         )
         self._predictions += 1
         try:
@@ -554,14 +559,15 @@ class Service:
 
     def _plan(self, request: protocol.Start) -> Series:
         """Make the excitation and see that it may be run; in the second thread."""
-        profile = self._profile
+        notes = request.notes.as_metadata()
         try:
+            profile = with_specimen(self._profile, notes.get("specimen", ""))
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters),
                 self._folder,
                 repeat=request.repeat,
-                notes={str(name): text for name, text in request.notes.items()},
+                notes=notes,
                 force=request.force,
             )
         except NoRoomError as error:  # the same request may succeed later
@@ -698,7 +704,9 @@ class _Told:
 
     def begins(self, number: int, path: Path) -> None:
         if not self._listens():
-            raise RigError("The daemon hears nobody: no further session is begun.")
+            raise RigError(
+                "The daemon does not respond to requests: no further session is started."
+            )
         self._series.session, self._series.path = number, path
 
     def shown(self, where: str) -> None:
@@ -712,26 +720,14 @@ class _Told:
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
-        counts = {
-            "ticks scheduled": result.scheduled,
-            "recorded": result.recorded,
-            "missed": result.missed,
-            "late": result.late,
-            "lost": result.lost,
-            "stale angles": result.stale_angles,
-            "stale wrenches": result.stale_wrenches,
-            "not shown live": result.live_dropped,
-        }
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
-            "series %d: session %d of %d: %s, %s: %s%s",
+            "series %d: session %d of %d, %s: %s",
             series.number,
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            result.outcome,
-            ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
-            f": {result.reason}" if result.reason else "",
+            result_line(result.as_dict()),
         )
         self._publish({"event": "session", "number": series.session, **result.as_dict()})
 

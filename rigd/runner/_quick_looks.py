@@ -47,6 +47,19 @@ class QuickLook:
     """Why there is none, a sentence; else empty."""
 
     @classmethod
+    def failed(cls, session: Path, error: str) -> "QuickLook":
+        """Return that there is none.
+
+        Parameters
+        ----------
+        session
+            Path of the session file.
+        error
+            Why, a sentence.
+        """
+        return cls(session, None, None, error)
+
+    @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
         """Return what an event of the daemon tells."""
         session, look = Path(event["path"]), event["look"]
@@ -145,18 +158,19 @@ class QuickLooks:
         said = self._end(self._process)
         code, self._process = self._process.returncode, None
         if slow:
-            yield self._without(f"it took longer than {_LONGEST_S:g} s.")
+            yield QuickLook.failed(self._session, f"it took longer than {_LONGEST_S:g} s.")
         elif code != 0:
             words = said.strip().rpartition("\n")[2].removeprefix("Error: ")[:_MOST_SAID]
-            yield self._without(words or f"its program ended with exit code {code}.")
+            yield QuickLook.failed(
+                self._session, words or f"its program ended with exit code {code}."
+            )
         else:
             yield self._done()
 
     def _go_on(self) -> Iterator[QuickLook]:
         """Start the next look; yield those that cannot be."""
         while len(self._waiting) > _MOST_WAITING:
-            self._session = self._waiting.popleft()
-            yield self._without("later sessions came first.")
+            yield QuickLook.failed(self._waiting.popleft(), "later sessions came first.")
         if self._held or self._process is not None or not self._waiting:
             return
         self._session = self._waiting.popleft()
@@ -173,7 +187,9 @@ class QuickLooks:
                 start_new_session=True,  # Ctrl-C is for the session; it ends with this process
             )
         except OSError as error:
-            yield self._without(f"its program cannot be started ({error.strerror}).")
+            yield QuickLook.failed(
+                self._session, f"its program cannot be started ({error.strerror})."
+            )
 
     def _done(self) -> QuickLook:
         path = look_path(self._session)
@@ -183,11 +199,8 @@ class QuickLooks:
             if not isinstance(look["text"], list):
                 raise TypeError
         except (OSError, ValueError, TypeError, KeyError):
-            return self._without(f"{path} cannot be read.")
+            return QuickLook.failed(self._session, f"{path} cannot be read.")
         return QuickLook(self._session, path, look, "")
-
-    def _without(self, why: str) -> QuickLook:
-        return QuickLook(self._session, None, None, why)
 
     def _signal(self, number: signal.Signals) -> None:
         if self._process is not None:

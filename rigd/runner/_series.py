@@ -13,9 +13,9 @@ from typing import Any, Final, Protocol
 from rigd.engine import Event
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._planning import plan_document, plan_session
+from rigd.runner._planning import plan_document, plan_session, predicted_metadata
 from rigd.runner._quick_looks import QuickLooks
-from rigd.runner._request import Order, choose_path, make_room
+from rigd.runner._request import Order, check_required, choose_path, make_room
 from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
 from rigd.runtime import StopRequest
 
@@ -97,7 +97,8 @@ class Series:
     repeat
         Number of sessions.
     notes
-        Operator, specimen, note; what is empty is left out.
+        Operator, specimen, note and added metadata; what is empty is left out. The beam of a
+        specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
 
@@ -111,7 +112,8 @@ class Series:
     Raises
     ------
     RefusedError, ControlDesignError, RealisationError
-        If the sessions would leave the limits, or cannot be predicted.
+        If the sessions would leave the limits, cannot be predicted, or lack metadata that the
+        profile requires.
     NoRoomError
         If there is no room for the first one.
     """
@@ -131,6 +133,7 @@ class Series:
         self._folder = folder
         self._repeat = repeat
         self._notes = {name: text for name, text in (notes or {}).items() if text}
+        check_required(profile, self._notes)
         self.plan = plan_session(profile, excitation, force=force)
         self.results: list[SessionResult] = []
         self._make_room()
@@ -194,7 +197,13 @@ class Series:
             path = choose_path(self._folder, self._excitation.kind, number if counted else None)
             notes = self._notes | ({"series": f"{number} of {self._repeat}"} if counted else {})
             watcher.begins(number, path)
-            order = Order(self._profile, self._excitation, path, tuple(notes.items()))
+            order = Order(
+                self._profile,
+                self._excitation,
+                path,
+                tuple(notes.items()),
+                tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
+            )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:
                     watcher.shown(rig.show(order, stop))

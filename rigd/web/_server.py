@@ -18,6 +18,7 @@ from aiohttp import web
 from rigd.beam import Beam, Damping
 from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.excitation import FROM_THE_RIG, KINDS
+from rigd.profile import specimen_files
 from rigd.runtime import ignore
 from rigd.units import unit_of
 from rigd.view import Subject
@@ -59,7 +60,6 @@ class PageServer:
 
     def __init__(self, job: Document) -> None:
         self._job = job
-        self._beam, self._damping = Beam(**job["beam"]), Damping(**job["damping"])
         self._socket = Path(job["socket"])
         self._access = Access(job["token"])
         self.pages = Pages()
@@ -67,7 +67,7 @@ class PageServer:
         self._library = Library(Path(job["folder"]), self._access, self._jobs)
         self._link = DaemonLink(self._socket, self._take, self._lose)
         self._excitations = dict(_excitations())
-        self._nominal = nominal_document(self._beam, self._damping, job["tool_inertia_kg_m2"])
+        self._nominal = self._nominal_of(job)
         self._specimens: list[str] = []
         self._status: Document | None = None
         self._lost: Document | None = None
@@ -196,6 +196,7 @@ class PageServer:
     def _begin(self, path: str, series: Document) -> None:
         """Make ready for the response of a session."""
         plan, rate_hz = series["plan"], self._job["rate_hz"]
+        self._nominal = self._nominal_of(plan)
         first, end = plan["segments"]["sweep"]
         self._shown = self._last = None
         self._response = None
@@ -206,8 +207,8 @@ class PageServer:
                     rate_hz,
                     round(plan["record_s"] * rate_hz),
                     (first, end),
-                    self._beam,
-                    self._damping,
+                    Beam(**plan["beam"]),
+                    Damping(**plan["damping"]),
                     self._job["tool_inertia_kg_m2"],
                     self._job["angle_delay_s"],
                     self._job["torque_delay_s"],
@@ -216,6 +217,11 @@ class PageServer:
         self.pages.send(self._nominal)
         specimen = str(series["notes"].get("specimen", ""))
         self._begin_finding(self._find_last(specimen, Path(path).stem))
+
+    def _nominal_of(self, specimen: Document) -> Document:
+        """Return the nominal model of the beam that a job or a plan names."""
+        beam, damping = Beam(**specimen["beam"]), Damping(**specimen["damping"])
+        return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
 
     def _take_signals(self, event: Document) -> None:
         if event["count"]:
@@ -257,7 +263,8 @@ class PageServer:
 
     async def _find_specimens(self) -> None:
         with suppress(OSError, ValueError):
-            self._specimens = await self._library.specimens()
+            used = await self._library.specimens()
+            self._specimens = list(dict.fromkeys([*used, *specimen_files()]))
 
     async def _find_last(self, specimen: str, but: str) -> None:
         with suppress(OSError, ValueError):

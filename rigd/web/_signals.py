@@ -143,6 +143,7 @@ class SessionResponse:
         self._sweep = SweepResponse(subject, LAST_HZ)
         self._thinning: Thinning | None = None
         self._fresh = False
+        self._reached_hz = 0.0
 
     def feed(self, block: Block) -> None:
         """Take a block; what is not known of it is left out."""
@@ -162,6 +163,10 @@ class SessionResponse:
         self._fresh = False
         if estimate is None or not estimate.excited.any():
             return None
+        reached_hz = float(estimate.response.frequency_hz[estimate.excited][-1])
+        if estimate.final and reached_hz < self._reached_hz:
+            return None  # the last whole segment ends before the sweep does
+        self._reached_hz = reached_hz
         response = estimate.response.without_delays(
             input_delay_s=self._subject.angle_delay_s, output_delay_s=self._subject.torque_delay_s
         )
@@ -176,7 +181,7 @@ class SessionResponse:
         return _curve(grid[kept], shown[kept]) | {
             "type": "response",
             "coherence": coherence,
-            "reached_hz": round(float(grid[estimate.excited][-1]), 3),
+            "reached_hz": round(reached_hz, 3),
         }
 
 
