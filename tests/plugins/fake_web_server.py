@@ -96,7 +96,9 @@ def gauges(share=0.4, frequency_hz=12.3):
 def strip(t0_s, bins, amplitude_rad=0.025):
     """Envelopes of a chirp at its 20 bins a second."""
     times = [t0_s + 0.05 * k for k in range(bins)]
-    fine = [[amplitude_rad * math.sin(2.0 * (t + 0.005 * j) ** 1.6) for j in range(10)] for t in times]
+    fine = [
+        [amplitude_rad * math.sin(2.0 * (t + 0.005 * j) ** 1.6) for j in range(10)] for t in times
+    ]
     swing = [0.12 * math.sin(16.3 * t) + 0.03 * math.sin(3 * t) for t in times]
     return {
         "type": "strip", "t0_s": t0_s, "dt_s": 0.05,
@@ -124,7 +126,8 @@ def response(kind="response", reached_hz=30.0, shift=1.0, **members):
     }  # fmt: skip
     if kind == "response":
         document["coherence"] = [
-            0.999 - 0.4 * math.exp(-(((f - 4.2) / 0.25) ** 2)) - (0.3 if f < 0.5 else 0.0) for f in at
+            0.999 - 0.4 * math.exp(-(((f - 4.2) / 0.25) ** 2)) - (0.3 if f < 0.5 else 0.0)
+            for f in at
         ]
         document["reached_hz"] = reached_hz
     return document

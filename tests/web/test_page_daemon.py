@@ -162,7 +162,10 @@ def test_a_new_operator_runs_stops_and_compares_sessions(operate, open_page, opt
     report = page.locator("#sessions-result a")
     expect(report).to_have_text("open the report", timeout=2 * END_MS)
     address = daemon.address.split("#")[0].rstrip("/") + report.get_attribute("href")
+    assert not open_page.complaints
     assert "antenna 3" in open_page(address).inner_text("body")
+    # A report has no origin, and so no icon of the page's.
+    open_page.complaints.clear()
 
 
 def test_what_fails_is_told_within_a_second(operate, open_page):
