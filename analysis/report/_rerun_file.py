@@ -303,7 +303,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     rigd.session.SessionError
         If the session file cannot be read any more.
     """
-    from rigd.view import draw_session, recorded_blueprint
+    from rigd.view import draw_session
 
     analysis = result.welch
     assert analysis is not None
@@ -311,8 +311,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
-            layout = recorded_blueprint([tab(analysis)])
-            draw_session(stream, session, timings, layout=layout)
+            draw_session(stream, session, timings, front=[tab(analysis)])
             draw(analysis, tables_text(result), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

@@ -169,7 +169,7 @@ def _job(profile: Profile, folder: Path, socket: Path) -> dict[str, Any]:
         "description": profile.description,
         "rate_hz": rig.rate_hz,
         "limits": asdict(profile.limits),
-        "required_meta": [],
+        "required_meta": list(profile.metadata.required),
         "beam": asdict(rig.beam),
         "damping": asdict(rig.damping),
         "tool_inertia_kg_m2": rig.sensor.tool_inertia_kg_m2,

@@ -108,7 +108,7 @@ class RigSection:
     """Settings of the rig as a whole."""
 
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
-    """Slower loops look too seldom at who else is at work."""
+    """Slower loops check the other processes too seldom."""
 
 
 SECTIONS: dict[str, type] = {
