@@ -37,6 +37,7 @@ _BEAM_RANGES: Final = {
 }
 _MAX_INERTIA_KG_M2: Final = 1e3
 _MAX_DELAY_S: Final = 1.0
+MAX_UNCERTAINTY_PERCENT: Final = 50.0
 _FIRST_ROOT: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
@@ -166,6 +167,30 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
         raise _wrong(session, "torque_filter_order", order, "must be 1 or 2 (Butterworth)")
     constant_s = 1 / (2 * math.pi * corner_hz)
     return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
+
+
+SCALES: Final = ("torque_scale", "length", "density")
+"""What no session shows, and its file may state the uncertainty of."""
+
+
+def stated_uncertainty(session: Session) -> dict[str, float]:
+    """Relative standard uncertainties of the `SCALES` that the file states, by their names.
+
+    Raises
+    ------
+    RecordError
+        One is negative, or so large that the value would not be known at all.
+    """
+    stated = {}
+    for name in SCALES:
+        key = f"uncertainty_{name}_percent"
+        percent = session.number(key, 0.0)
+        if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
+            rule = f"must lie between 0 and {MAX_UNCERTAINTY_PERCENT:g}"
+            raise _wrong(session, key, percent, rule)
+        if percent:
+            stated[name] = percent / 100
+    return stated
 
 
 def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:

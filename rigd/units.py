@@ -19,6 +19,9 @@ UNITS: Final = MappingProxyType(
         "_rad_s2": "rad/s²",
         "_rad_s": "rad/s",
         "_rad": "rad",
+        "_hpa": "hPa",
+        "_kg": "kg",
+        "_mm": "mm",
         "_nm": "N·m",
         "_mb": "MB",
         "_hz": "Hz",
@@ -27,6 +30,7 @@ UNITS: Final = MappingProxyType(
         "_m": "m",
         "_n": "N",
         "_s": "s",
+        "_c": "°C",
     }
 )
 """Ending of a key → its unit, the longer endings first: the first that fits is the key's."""

@@ -24,7 +24,8 @@ from rigd import testing
 from rigd.runtime import use_one_thread
 
 pytest_plugins = [
-    "kinds_of_tests", "paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions",
+    "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "shipped_profile",
+    "standstill", "synthetic_sessions",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.
@@ -43,6 +44,8 @@ _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 # Nor a profile of the user's own that hides a shipped one.
 os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
+# No session pays for a quick look but where that is tested.
+os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 # The same examples each time, and however long they take: what fails is a change's fault. Others

@@ -279,6 +279,7 @@ def _metadata(
         "tool_inertia_kg_m2": plan.specimen.tool_inertia_kg_m2,
         "angle_delay_s": plan.angle_delay_s,
         "torque_delay_s": plan.torque_delay_s,
+        **{f"uncertainty_{k}_percent": v for k, v in plan.specimen.uncertainty_percent.items()},
     }
     with source.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()

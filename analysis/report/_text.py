@@ -207,7 +207,8 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
         )
     if shown:
         found.append(
-            f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals)."
+            f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals, "
+            "statistical only)."
         )
     found.extend(
         f"The {each.damping} damping {_size(each)}{_order(told, each)}."

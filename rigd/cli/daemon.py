@@ -18,6 +18,7 @@ from rigd.cli.options import (
     AsJson,
     Fast,
     Hardware,
+    NoLook,
     Output,
     ProfileName,
     fail,
@@ -45,21 +46,43 @@ def serve(
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
     ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the operator's page on this computer.")
+    ] = False,
+    web_port: Annotated[
+        int | None,
+        typer.Option(
+            "--web-port",
+            min=1,
+            max=65535,
+            help="Port of the page (default: 8720, or another one if that is taken).",
+        ),
+    ] = None,
     fast: Fast = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
 ) -> None:
     """Run the rig daemon; Ctrl-C or SIGTERM ends it safely.
 
     The daemon runs the sessions of rigd start.
 
-    Example: rigd serve --profile antenna_can --output /data/sessions
+    Example: rigd serve --profile antenna_can --output /data/sessions --web
     """
     from rigd.daemon import run_daemon
     from rigd.runner import load_rig, make_folder
 
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
-    number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
+    number = run_daemon(
+        rig_profile,
+        output.absolute(),
+        group=group,
+        live=live,
+        fast=fast,
+        page=web or web_port is not None,
+        page_port=web_port,
+        look=not no_look,
+    )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
 

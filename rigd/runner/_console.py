@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rigd.engine import Phase
+from rigd.printable import BAR_STYLES, grouped
 
 _PATIENCE_S: Final = 2.0
 """Longest wait for a terminal that was stopped, at the end of a session."""
@@ -31,13 +32,15 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
         return f"{plan[f'peak_{name}']:.3g}{limit} {unit}"
 
     what = f"{plan['excitation']} on {plan['profile']}: " if "profile" in plan else ""
-    yield f"{what}{plan['record_s']:g} s of record."
+    sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
+    yield f"{what}{sweep}{plan['record_s']:g} s of record."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
     )
-    if words := plan.get("tip_in_words"):
-        yield words
+    for words in ("specimen_in_words", "tip_in_words"):
+        if plan.get(words):
+            yield plan[words]
     for warning in plan["warnings"]:
         yield f"Warning: {warning}"
 
@@ -50,16 +53,35 @@ def result_line(session: Mapping[str, Any]) -> str:
     session
         As :meth:`rigd.runner.SessionResult.as_dict` gives it.
     """
+    outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""
     if session["part"] is not None:
-        return f"{session['outcome']}: no whole record, but {session['part']}.{reason}"
+        return f"{outcome}: file incomplete, {session['part']}.{reason}"
     if session["path"] is None:
-        return f"{session['outcome']}: no record.{reason}"
-    return (
-        f"{session['outcome']}: {session['scheduled']} ticks scheduled = {session['recorded']} "
-        f"recorded + {session['missed']} missed + {session['lost']} lost; "
-        f"{session['late']} late; {session['stale_angles']} stale angles, "
-        f"{session['stale_wrenches']} stale wrenches.{reason}"
+        return f"{outcome}: no record.{reason}"
+    return f"{outcome}: {counts_text(session)}.{reason}"
+
+
+def counts_text(counts: Mapping[str, Any]) -> str:
+    """Say how many samples of a session were recorded, and what became of the others.
+
+    Parameters
+    ----------
+    counts
+        Counts as of `result_line`. Of what is rare, only what occurred is told.
+    """
+    rare = {
+        "lost": counts["lost"],
+        "stale angles": counts["stale_angles"],
+        "stale wrenches": counts["stale_wrenches"],
+    }
+    return ", ".join(
+        (
+            f"{grouped(counts['recorded'])} of {grouped(counts['scheduled'])} samples",
+            f"{counts['missed']} missed",
+            f"{counts['late']} late",
+            *(f"{count} {name}" for name, count in rare.items() if count),
+        )
     )
 
 
@@ -74,6 +96,7 @@ class ProgressLine:
         # Only now: the processes of the session are on their way.
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.theme import Theme
 
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -81,7 +104,7 @@ class ProgressLine:
             TextColumn("{task.percentage:3.0f} %"),
             TimeRemainingColumn(),
             TextColumn("{task.fields[counts]}"),
-            console=Console(stderr=True),
+            console=Console(stderr=True, theme=Theme(BAR_STYLES)),
             transient=True,
             auto_refresh=False,
         )
@@ -90,6 +113,7 @@ class ProgressLine:
         self._state: dict[str, Any] = {}
         self._messages: list[str] = []
         self._closed = False
+        self._recorded = False
         self._changed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -110,9 +134,11 @@ class ProgressLine:
         number
             Number of the session in its series, such as ``2/5``; empty if it is the only one.
         """
+        # Before tick 0 the count is the last session's.
+        self._recorded |= phase is Phase.RUNNING
         self._state = {
             "description": f"{phase.words} {number}".rstrip(),
-            "completed": tick,
+            "completed": tick if self._recorded else 0,
             "total": total,
             "counts": f"{missed} missed, {late} late" if missed else "",
         }
