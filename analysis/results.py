@@ -185,7 +185,6 @@ def record_result(
     path: Path,
     routes: Routes,
     *,
-    welch_required: bool = False,
     on_step: Callable[[str], None] = lambda _done: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> RecordResult:
@@ -195,9 +194,6 @@ def record_result(
     ----------
     path : Path
     routes : Routes
-    welch_required : bool
-        Whether Welch's fits are run though they suit the record ill. Otherwise they are left out
-        then, if the whole record is analysed, too.
     on_step : callable, optional
         Called with a few words after each step.
     warn : callable, optional
@@ -223,7 +219,7 @@ def record_result(
     if routes.paper:
         welch, left_out = welch_analysis(
             record, routes.settings, routes.band_hz,
-            optional=routes.whole_record and not welch_required, on_step=on_step,
+            optional=routes.whole_record, on_step=on_step,
         )  # fmt: skip
     if left_out:
         warn(f"{path}: {left_out}")

@@ -266,7 +266,7 @@ def analyze(
             param_hint="--fix",
         )
     if method == "record":
-        _check_without_paper(context, is_campaign=is_campaign, rerun=rerun)
+        _check_without_paper(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     routes = Routes(
         settings,
@@ -323,19 +323,13 @@ def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
     raise typer.BadParameter(why, param_hint=" and ".join(options))
 
 
-def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Path | None) -> None:
+def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
     """Refuse outputs of the Welch fits where these are left out; name options without effect."""
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
             "--method all, or add --each.",
             param_hint="--method",
-        )
-    if rerun is not None:
-        raise typer.BadParameter(
-            "its charts are of the paper's fits, which --method record leaves out; take --method "
-            "all.",
-            param_hint="--rerun",
         )
     sources = {name: context.get_parameter_source(name) for name in _OF_WELCH}
     given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]

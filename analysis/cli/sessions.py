@@ -251,7 +251,7 @@ def _analyse_file(
     from analysis.results import record_result
 
     result = record_result(
-        file, routes, welch_required=rerun is not None, on_step=on_step,
+        file, routes, on_step=on_step,
         warn=lambda text: tell(f"Warning: {text}"),
     )  # fmt: skip
     with new_folder(folder, overwrite=overwrite) as part:

@@ -191,7 +191,6 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
         (("--weights", "omega^1e308"), ("omega^1e308",)),
         (("--method", "recrod"), ("there is no 'recrod'; choose from welch, record, all.",)),
         (("--method", "record", "b.mcap"), ("--method", "Tables 3 to 5", "add --each")),
-        (("--method", "record", "--rerun", "a.rrd"), ("--rerun", "take --method all")),
         (("--frf", "h3"), ("there is no 'h3'; choose from h1, h2, hv, iv, fft.",)),
         (("--band", "nan,50"), ("--band", "nan,50")),
         (("--band", "50,1"), ("--band", "0 <= F0 < F1")),

@@ -209,9 +209,9 @@ def test_what_is_shown_is_the_number_rounded(record_result):
         for cell, factor in zip(row, shown["modes"], strict=True):
             assert float(cell.text) == pytest.approx(factor * cell.value, rel=0.06)
     (zeta, alpha, *_) = tables[1].rows
-    assert zeta["value_si"].text == f"{1e5 * zeta['value_si'].value:.2f}"
-    assert alpha["value_si"].text == f"{alpha['value_si'].value:.4f}"
-    assert len(alpha["std_si"].text.lstrip("0.")) == 2  # significant digits of a deviation
+    assert zeta["value"].text == f"{1e5 * zeta['value'].value:.2f}"
+    assert alpha["value"].text == f"{alpha['value'].value:.4f}"
+    assert len(alpha["std"].text.lstrip("0.")) == 2  # significant digits of a deviation
     welch = {(row["type"], row["weighting"]): row for row in of_paper[0].rows}
     for model in record_result.welch.models:
         row = welch[model.fit.structure.name, model.fit.weighting]
@@ -266,9 +266,9 @@ def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
     _modes, tables, _ = report_tables(retold(record_result, headline=told))
     (table,) = [table for table in tables if table.name == "on_condition"]
     assert "If α = 1 is taken for granted: type VII" in table.caption
-    row = {row["parameter"]: row for row in table.rows}["ζ"]
-    assert row["value_si"].value == record_result.whole.fits["VII"].parameters["zeta"]
-    assert row["free_value_si"].value == record_result.whole.fits["VI"].parameters["zeta"]
+    row = {row["parameter"].text: row for row in table.rows}["ζ"]
+    assert row["value"].value == record_result.whole.fits["VII"].parameters["zeta"]
+    assert row["free_value"].value == record_result.whole.fits["VI"].parameters["zeta"]
 
 
 def test_a_band_that_begins_beyond_a_mode_is_drawn(record_result):
