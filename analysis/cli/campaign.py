@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from analysis.results import DEFAULT_FORMATS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
@@ -12,6 +14,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult
     from analysis.identify import Setting
     from analysis.models import WelchSettings
+    from analysis.results import FigureFormat
 
 _NAME: Final = "campaign"
 _TEXT_WIDTH: Final = 120
@@ -31,6 +34,7 @@ def campaign_command(
     jobs: int | None = None,
     dask: str | None = None,
     with_paper: bool = False,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> int:
     """Analyse a campaign, write its folder and its JSON, and print its tables.
 
@@ -56,6 +60,8 @@ def campaign_command(
         Address of a Dask scheduler to use instead.
     with_paper : bool
         Whether the paper's numbers stand beside these.
+    formats : sequence of str
+        Formats of the figures.
 
     Returns
     -------
@@ -88,7 +94,7 @@ def campaign_command(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask,
     )  # fmt: skip
-    found = _analysed(run, len(files), folder, with_paper=with_paper)
+    found = _analysed(run, len(files), folder, with_paper=with_paper, formats=formats)
     to_stdout = json is not None and str(json) == "-"
     console = Console(stderr=to_stdout, highlight=False)
     if not console.is_terminal:
@@ -107,7 +113,12 @@ def campaign_command(
 
 
 def _analysed(
-    run: Callable[..., CampaignResult], files: int, folder: Path, *, with_paper: bool
+    run: Callable[..., CampaignResult],
+    files: int,
+    folder: Path,
+    *,
+    with_paper: bool,
+    formats: Sequence[FigureFormat],
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from rich.console import Console
@@ -136,7 +147,7 @@ def _analysed(
             if len(found.sessions) == 1:
                 raise LoneSessionError(found.sessions[0].path, found.failures)
             write_campaign(
-                found, part, with_paper=with_paper,
+                found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
     for failure in found.failures:
