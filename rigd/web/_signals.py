@@ -95,7 +95,7 @@ class Strips:
         # Without those functions' warning of points of which nothing is known.
         least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
         columns = np.round(
-            (least[0], greatest[0], bins[1, :, ticks // 2], least[2], greatest[2]), _DIGITS
+            (least[0], greatest[0], least[1], greatest[1], least[2], greatest[2]), _DIGITS
         )
         points = [tuple(_known(column)) for column in columns.T]
         first, self._next = self._next, self._next + count
@@ -109,7 +109,10 @@ class Strips:
 
 
 def _strip(first: int, points: list[tuple[float | None, ...]]) -> Document:
-    names = ("angle_min", "angle_max", "reference", "torque_min", "torque_max")
+    names = (
+        *("angle_min", "angle_max", "reference_min", "reference_max"),
+        *("torque_min", "torque_max"),
+    )
     columns = zip(*points, strict=True)
     return {
         "type": "strip",

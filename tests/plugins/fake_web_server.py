@@ -103,7 +103,7 @@ def strip(t0_s, bins, amplitude_rad=0.025):
     return {
         "type": "strip", "t0_s": t0_s, "dt_s": 0.05,
         "angle_min": [min(f) for f in fine], "angle_max": [max(f) for f in fine],
-        "reference": [f[5] for f in fine],
+        "reference_min": [min(f) for f in fine], "reference_max": [max(f) for f in fine],
         "torque_min": [s - 0.04 for s in swing], "torque_max": [s + 0.04 for s in swing],
     }  # fmt: skip
 

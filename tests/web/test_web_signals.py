@@ -51,7 +51,7 @@ def test_what_is_missed_is_no_point_and_what_comes_after_has_its_own_time():
     told = strips.feed(block(200, np.r_[np.full(50, np.nan), np.full(50, 2.0)]))
     assert told["t0_s"] == 0.05
     assert told["angle_min"] == [None, None, None, None, 2.0]
-    assert told["reference"][-1] == 2.0
+    assert told["reference_min"][-1] == told["reference_max"][-1] == 2.0
 
 
 def test_a_new_session_begins_anew_and_only_10_s_are_kept():

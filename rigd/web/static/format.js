@@ -5,10 +5,11 @@ const NOTHING = "–";
 /** A minus is no hyphen. */
 export const minus = (text) => text.replaceAll("-", "−");
 
-/** Endings of names and the units they stand for, the longer endings first (rigd/units.py). */
-const UNITS = {
+/** Endings of names and the units they stand for, the longer endings first, as in rigd/units.py. */
+export const UNITS = {
   _nm_s_per_rad: "N·m·s/rad", _nm_per_rad: "N·m/rad", _kg_per_m: "kg/m", _kg_m2: "kg·m²",
-  _n_m2: "N·m²", _percent: "%", _rad_s2: "rad/s²", _rad_s: "rad/s", _rad: "rad", _nm: "N·m",
+  _n_m2: "N·m²", _n_nm: "N, N·m", _percent: "%", _counts: "counts", _bit_s: "bit/s",
+  _rad_s2: "rad/s²", _rad_s: "rad/s", _rad: "rad", _hpa: "hPa", _kg: "kg", _mm: "mm", _nm: "N·m",
   _mb: "MB", _hz: "Hz", _us: "µs", _ns: "ns", _m: "m", _n: "N", _s: "s", _c: "°C",
 };
 
