@@ -123,7 +123,7 @@ export class Strips {
     name: "Angle", unit: "rad", least: LEAST.angle,
     // The reference behind what is measured: a rim where both agree, a band where they do not.
     bands: [
-      { low: 2, high: 3, colour: "reference", width: 3, filled: 0.35 },
+      { low: 2, high: 3, colour: "reference", width: 2.5, filled: 0.35 },
       { low: 0, high: 1, colour: "measured", width: 1.4 },
     ],
   });
