@@ -6,6 +6,7 @@ from typing import Final
 
 UNITS: Final = MappingProxyType(
     {
+        "_rad_per_nm": "rad/(N·m)",
         "_nm_s_per_rad": "N·m·s/rad",
         "_nm_per_rad": "N·m/rad",
         "_kg_per_m": "kg/m",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult
     from analysis.report._page import Facts, Picture
 
-_OF_RECORDS: Final = ("pooled", "validation")
+_OF_RECORDS: Final = ("damping", "pooled_response", "pooled", "validation")
 """Figures that go with the verdict; the others are the paper's."""
 
 

@@ -78,9 +78,21 @@ def _figures(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], 
         pooled_figure,
         validation_figure,
     )
+    from analysis.report._pooled_figures import damping_figure, response_figure
 
     found: dict[str, tuple[Callable[[], Figure], str]] = {}
+    if campaign.headline is not None and campaign.headline.modes:
+        found["damping"] = (
+            partial(damping_figure, campaign),
+            "Damping ratios of all sessions' modes against frequency, and the pooled ones with "
+            "their 95 % intervals; below, each mode enlarged.",
+        )
     if campaign.headline is not None:
+        found["pooled_response"] = (
+            partial(response_figure, campaign),
+            "Frequency response of the pooled estimate over that of every session: magnitude, "
+            "phase, and half-width of the 95 % band.",
+        )
         found["pooled"] = (
             partial(pooled_figure, campaign),
             "Whole-record estimate of each session with its 95 % interval, and the pooled one.",

@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from analysis.identify import fast_length
 from analysis.report import _style as style
-from analysis.report._bands import loss_factors, response_band, supported_band_hz
+from analysis.report._bands import dense_grid, loss_factors, response_band, supported_band_hz
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.spectral import fft_response
@@ -76,7 +76,7 @@ def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure
     """
     first_hz, last_hz = float(measured.frequency_hz[0]), float(measured.frequency_hz[-1])
     shown = [mode for mode in fit.modes if first_hz < mode.frequency_hz < last_hz]
-    grid_hz = _grid(first_hz, last_hz, [mode.frequency_hz for mode in shown])
+    grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in shown])
     band = response_band(fit, grid_hz)
     seen = measured.response * np.exp(
         2j * np.pi * fit.parameters["delay_s"] * measured.frequency_hz
@@ -164,15 +164,6 @@ def _detail(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[floa
     half_hz = max(share * mode.frequency_hz, spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
     return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
-
-
-def _grid(first_hz: float, last_hz: float, peaks_hz: list[float]) -> NDArray[np.float64]:
-    """Frequencies that are dense over the band and denser at the peaks, which are narrow."""
-    everywhere = np.geomspace(first_hz, last_hz, _POINTS)
-    offsets = np.geomspace(1e-4, 0.1, 40)
-    near = [peak * (1 + np.r_[-offsets, 0.0, offsets]) for peak in peaks_hz]
-    grid = np.unique(np.concatenate([everywhere, *near]))
-    return np.asarray(grid[(grid >= first_hz) & (grid <= last_hz)])
 
 
 def _db(values: NDArray[np.complex128] | NDArray[np.float64]) -> NDArray[np.float64]:

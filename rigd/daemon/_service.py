@@ -214,6 +214,10 @@ class Service:
         self._fault = ""
         """Why it went into fault last, but for what failed in resetting it."""
         self._doing = ""
+        self._opened = asyncio.Event()
+        """Set once the first connection has been tried."""
+        self._stops = 0
+        """Number of stops that were asked for."""
         self._closing = False
         self._series: ServedSeries | None = None
         self._looks = QuickLooks(self._tell_look) if look else None
@@ -245,6 +249,7 @@ class Service:
             pass  # the fault says it
         finally:
             self._doing = ""
+            self._opened.set()
 
     async def attend(self) -> None:
         """Watch over the rig, until cancelled."""
@@ -326,6 +331,7 @@ class Service:
         """Obey a request that may change something."""
         if request.controlling:
             self._take_control(peer)
+            await self._wait_until_opened(peer)
         if isinstance(request, protocol.Start):
             return await self._start(request)
         if isinstance(request, protocol.Stop):
@@ -371,6 +377,7 @@ class Service:
 
     def stop(self, reason: str) -> Document:
         """Ask for the end of what runs; the answer says whether there was anything."""
+        self._stops += 1
         series = self._series
         if series is None or not series.running:
             return {"stopping": False}
@@ -414,6 +421,15 @@ class Service:
         if self.controller is None:
             self.controller = peer
             _log.info("control: taken by %s", peer)
+
+    async def _wait_until_opened(self, peer: Peer) -> None:
+        """Wait for the devices of a daemon that has just been started."""
+        if self._doing != "connecting":
+            return
+        stops = self._stops
+        await self._opened.wait()
+        if self._stops > stops or self.controller != peer:
+            raise CommandError("It was stopped before it began.")
 
     def _check(self, command: str) -> None:
         if self._closing:

@@ -131,6 +131,7 @@ def profile_of(text: str, path: Path) -> Profile:
         session=section["session"],
         realtime=section["realtime"],
         metadata=section["metadata"],
+        uncertainty=section["uncertainty"],
         sources=sources,
     )
 

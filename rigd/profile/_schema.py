@@ -69,6 +69,32 @@ class RealtimeSettings:
         return self.priority // 4
 
 
+_RelativePercent = Annotated[float, Ge(0), Le(50)]
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleUncertainty:
+    """Relative standard uncertainties (k = 1) of what all sessions of a rig have in common.
+
+    They do not average out, and no session shows them: an analysis adds them to its statistical
+    intervals. Zero: not stated.
+    """
+
+    torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Scale of the torque over the angle: calibration and mounting of the sensor."""
+    length_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Length of the beam."""
+    density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Mass per length of the beam, such as from weighing it."""
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """Those that the profile states, by the names of the fields."""
+        return {
+            each.name: value for each in fields(self) if (value := getattr(self, each.name)) > 0
+        }
+
+
 @dataclass(frozen=True, slots=True)
 class MetadataSettings:
     """Metadata of the sessions."""
@@ -105,6 +131,7 @@ SECTIONS: dict[str, type] = {
     "ati_can": AtiCan,
     "ati_serial": AtiSerial,
     "simulation": Simulation,
+    "uncertainty": ScaleUncertainty,
 }
 WIRING = {
     "cia402": ("can", "acquisition", "cia402"),
@@ -176,6 +203,8 @@ class Specimen:
     """Its beam."""
     damping: Damping | None
     """Its nominal damping; None: that of the profile."""
+    uncertainty: ScaleUncertainty
+    """How well its length and density are known; the torque's scale is the rig's."""
     note: str
     """Whatever else is to be known of it."""
 
@@ -204,6 +233,8 @@ class Profile:
     """What its processes ask of the operating system."""
     metadata: MetadataSettings
     """What its sessions must be given."""
+    uncertainty: ScaleUncertainty
+    """How well the scales are known that no session shows."""
     sources: Mapping[str, str]
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None

@@ -334,6 +334,7 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "angle_delay_s": repr(rig.encoder.delay_s),
         "torque_delay_s": repr(rig.sensor.delay_s),
         "actuation_delay_s": repr(rig.actuation.delay_s),
+        **{f"uncertainty_{k}": repr(v) for k, v in order.profile.uncertainty.stated.items()},
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,

@@ -15,8 +15,8 @@ from ._frequency_charts import COHERENCE_AXIS as COHERENCE_AXIS
 from ._frequency_charts import COHERENCE_KEY as COHERENCE_KEY
 from ._frequency_charts import MEASURED_KEY as MEASURED_KEY
 from ._frequency_charts import PHASE_AXIS as PHASE_AXIS
-from ._frequency_charts import SweepResponse as SweepResponse
 from ._frequency_charts import LastResponse as LastResponse
+from ._frequency_charts import SweepResponse as SweepResponse
 from ._frequency_charts import magnitude_axis as magnitude_axis
 from ._frequency_charts import magnitude_db as magnitude_db
 from ._frequency_charts import phase_deg as phase_deg

@@ -35,7 +35,7 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
     assert "nosuch.mcap cannot be read: No such file" in error
     assert "ok.mcap is reported by itself" in result.stderr
     assert "Warning" not in result.stderr
-    assert "ok.mcap: verdict" in result.stdout
+    assert "Report of ok.mcap: ok.report/report.html" in result.stdout
     assert (tmp_path / "ok.report" / "report.html").exists()
     assert not (tmp_path / "campaign.report").exists()
     content = json.loads((tmp_path / "all.json").read_text())

@@ -375,6 +375,42 @@ def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate,
     assert operated.state is State.READY
 
 
+def test_a_request_waits_until_the_devices_of_a_new_daemon_are_connected(operate):
+    operated = operate()
+
+    async def ask():
+        opening = asyncio.create_task(operated.service.open())
+        await asyncio.sleep(0)
+        assert operated.service.status()["doing"] == "connecting"
+        reply = await operated.handle("zero")
+        await opening
+        return reply
+
+    assert "moved_rad" in operated.loop.run_until_complete(ask())
+    assert operated.state is State.READY
+
+
+def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
+    operated = operate()
+    line = protocol.json.dumps({"command": "start", **SHORT}).encode()
+
+    async def ask():
+        opening = asyncio.create_task(operated.service.open())
+        await asyncio.sleep(0)
+        started = asyncio.create_task(
+            operated.service.handle(protocol.parse_request(line), operated.peer)
+        )
+        await asyncio.sleep(0)
+        assert await operated.handle("stop", peer=OTHER) == {"stopping": False}
+        with pytest.raises(CommandError, match="stopped before it began"):
+            await started
+        await opening
+
+    operated.loop.run_until_complete(ask())
+    assert operated.state is State.READY
+    assert operated.world.highest_nm == 0.0
+
+
 def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
     assert operated.ask("start", **SHORT)["series"] == 1
     crew = operated.rig._crew

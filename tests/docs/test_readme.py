@@ -75,7 +75,9 @@ def start(request, tmp_path, runtime_folder):
 
 def script_of(shells):
     # Job control, as on a terminal: the simulated rig of one how-to is ended by its job's number.
-    return "set -em\n" + "\n".join(shells)
+    # What a how-to that failed has left in the background ends with it.
+    trap = "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT"
+    return "\n".join(("set -em", trap, *shells))
 
 
 @pytest.mark.timeout(900)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert result.stderr == ""
     report = tmp_path / "session.report"
     assert sorted(path.name for path in report.iterdir()) == [
-        "analysis.json", "figures", "frf.png", "report.html", "tables", "tables.txt",
+        "SHA256SUMS", "analysis.json", "figures", "frf.png", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
     for picture in (report / "frf.png", *(report / "figures").glob("*.png")):
         assert np.asarray(Image.open(picture).convert("L")).std() > 10
@@ -59,11 +60,20 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert len(of_paper) == 12
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
     assert (best["type"], best["weighting"]) == ("VI", "omega")
-    for word in ("verdict", "Fits", "Resonant peaks", "Modes with", "session.report", "fits.json"):
-        assert word in result.stdout
-    assert (report / "tables.txt").read_text().splitlines()[0] in result.stdout
-    # Welch's windows bias the damping by a third; the whole record tells the plant's.
+    lines = result.stdout.splitlines()
+    assert len(lines) <= 25
     (of_record,) = content["records"]
+    assert lines[0] in of_record["verdict"][0]
+    modes = [line.split() for line in lines if line[:4].strip().isdigit()]
+    assert [float(cells[1]) for cells in modes] == pytest.approx(
+        [mode["frequency_hz"] for mode in content["modes"] if mode["estimator"] == "record"],
+        rel=1e-4,
+    )
+    assert lines[-2:] == [
+        "All results as JSON: fits.json", "Report of session.mcap: session.report/report.html",
+    ]  # fmt: skip
+    assert "Resonant peaks" not in result.stdout
+    # Welch's windows bias the damping by a third; the whole record tells the plant's.
     (selected,) = (
         fit for fit in content["fits"] if fit.get("candidate") == of_record["selected"]
     )  # fmt: skip
@@ -86,7 +96,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     assert names == [
         (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
     ]  # fmt: skip
-    assert "Resonant peaks" in result.stderr
+    assert "Fits to Welch's estimate" in result.stderr
     assert (tmp_path / "out" / "signals.png").exists()
 
 
@@ -252,7 +262,7 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
     assert (process.returncode, stdout, stderr) == (130, "", "Stopped.\n")
     for folder in out.iterdir():
         assert not folder.name.startswith("."), "a half-written report was left"
-        assert len(list(folder.iterdir())) == 5
+        assert len(list(folder.iterdir())) == 6
 
 
 STOPPED = (
@@ -303,6 +313,45 @@ def test_ctrl_c_while_options_are_made_ready_ends_with_130_and_without_traceback
         "analysis.cli.app.main()\n"
     )
     assert run_as_is("early", tmp_path) == (130, "", "")
+
+
+def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("analysis.cli.app.session_command", lambda files, *_: asked.append(files))
+    monkeypatch.setattr(
+        "analysis.cli.campaign.campaign_command", lambda files, *_, **__: asked.append(files) or 0
+    )
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    (folder / "torn.mcap.part").touch()
+    refused = CliRunner().invoke(app, [str(folder)])
+    assert refused.exit_code == 1
+    assert f"{folder}: there is no session" in refused.stderr
+    assert "rigd recover" in refused.stderr
+    for name in ("b.mcap", "a.mcap"):
+        (folder / name).touch()
+        CliRunner().invoke(app, [str(folder)])
+    CliRunner().invoke(app, ["first.mcap", str(folder), "--each"])
+    of_folder = [folder / "a.mcap", folder / "b.mcap"]
+    assert asked == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
+
+
+def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, analyze_here):
+    look = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
+    assert analyze_here(*look, *QUICK).returncode == 0
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    quick = ("--method", "welch", "--types", "II", "--weights", "const")
+    assert analyze_here(*look, *quick).returncode == 0
+    for path in ("fits.json", "out/analysis.json"):
+        (fit,) = json.loads((tmp_path / path).read_text())["fits"]
+        assert fit["type"] == "II"
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+    # Without a name it is the report beside the file, under the same name again.
+    for _ in range(2):
+        assert analyze_here(session.name, "--overwrite", *quick).returncode == 0
+    assert [path.name for path in tmp_path.glob("session.report*")] == ["session.report"]
+    (tmp_path / "fits.json").write_text('{"mine": 1}')
+    refused(analyze_here(*look, *quick), 2, "fits.json", "does not hold results")
 
 
 def test_help_has_an_example_and_the_choices(tmp_path):
