@@ -113,7 +113,7 @@ class PageProcess:
         self._process = process
         assert process.stdin is not None
         assert process.stdout is not None
-        with process.stdout:
+        with process:
             try:
                 process.stdin.write(json.dumps(self._job).encode() + b"\n")
                 process.stdin.flush()
