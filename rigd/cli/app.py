@@ -16,6 +16,7 @@ from rigd.cli.check import bench, check, reset
 from rigd.cli.daemon import serve, status, stop, tare, zero
 from rigd.cli.files import info, recover
 from rigd.cli.identify import identify_app
+from rigd.cli.library import list_sessions, specimens
 from rigd.cli.live import live, replay
 from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, errors_told
 from rigd.cli.profiles import profiles_app
@@ -96,6 +97,8 @@ app.command()(stop)
 app.command()(tare)
 app.command()(zero)
 app.command()(reset)
+app.command("list")(list_sessions)
+app.command()(specimens)
 app.command()(info)
 app.command()(replay)
 app.command()(recover)

@@ -46,6 +46,18 @@ def serve(
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
     ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the operator's page on this computer.")
+    ] = False,
+    web_port: Annotated[
+        int | None,
+        typer.Option(
+            "--web-port",
+            min=1,
+            max=65535,
+            help="Port of the page (default: 8720, or another one if that is taken).",
+        ),
+    ] = None,
     fast: Fast = False,
     hardware: Hardware = False,
     no_look: NoLook = False,
@@ -54,7 +66,7 @@ def serve(
 
     The daemon runs the sessions of rigd start.
 
-    Example: rigd serve --profile antenna_can --output /data/sessions
+    Example: rigd serve --profile antenna_can --output /data/sessions --web
     """
     from rigd.daemon import run_daemon
     from rigd.runner import load_rig, make_folder
@@ -62,7 +74,14 @@ def serve(
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
     number = run_daemon(
-        rig_profile, output.absolute(), group=group, live=live, fast=fast, look=not no_look
+        rig_profile,
+        output.absolute(),
+        group=group,
+        live=live,
+        fast=fast,
+        page=web or web_port is not None,
+        page_port=web_port,
+        look=not no_look,
     )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)

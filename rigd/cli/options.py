@@ -108,6 +108,14 @@ Repeat = Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions
 Operator = Annotated[str, typer.Option("--operator", help="Operator name, stored in the file.")]
 Specimen = Annotated[str, typer.Option("--specimen", help="Specimen, stored in the file.")]
 Note = Annotated[str, typer.Option("--note", help="Note, stored in the file.")]
+Meta = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--meta",
+        metavar="NAME=VALUE",
+        help="Metadata, stored in the file, such as temperature_c=21.4; repeat for each.",
+    ),
+]
 Force = Annotated[
     bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
 ]
@@ -121,13 +129,24 @@ NoLook = Annotated[
 ]
 
 
-def session_notes(operator: str, specimen: str, note: str) -> dict[str, str]:
-    """Return what is to go into the file; a text that cannot ends the command."""
+def session_notes(
+    operator: str, specimen: str, note: str, meta: list[str] | None
+) -> dict[str, str]:
+    """Return what is to go into the file, by its keys there; what cannot ends the command."""
+    from rigd.session import metadata_keys
+
     notes = {"operator": operator, "specimen": specimen, "note": note}
     for option, text in notes.items():
         if not text.isprintable():
             fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
-    return notes
+    added: dict[str, str] = {}
+    for given in meta or []:
+        name, equals, value = given.partition("=")
+        if not equals or name in added:
+            wrong = "is given twice" if equals else "is not NAME=VALUE, as temperature_c=21.4 is"
+            fail(f"--meta {given!r}: {wrong}.", EXIT_WRONG_USE)
+        added[name] = value
+    return {name: text for name, text in notes.items() if text} | metadata_keys(added)
 
 
 def profile_named(name: str) -> "Profile":

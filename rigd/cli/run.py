@@ -21,6 +21,7 @@ from rigd.cli.options import (
     Fast,
     Force,
     Hardware,
+    Meta,
     NoLook,
     Note,
     Operator,
@@ -104,6 +105,7 @@ def run_sessions(
     operator: Operator = "",
     specimen: Specimen = "",
     note: Note = "",
+    meta: Meta = None,
     fast: Fast = False,
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
@@ -112,7 +114,7 @@ def run_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
-    notes = session_notes(operator, specimen, note)
+    notes = session_notes(operator, specimen, note, meta)
     stop, crew = start_processes(live=live)
     from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore

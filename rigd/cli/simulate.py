@@ -87,7 +87,7 @@ def inject(
     no_bit_12[,for=0.5]                       the statusword never shows that the drive follows
     no_pre_operational[,for=0.5]              the drive ignores NMT pre-operational
     no_watch[,for=0.5]                        the drive does not notice a silent host
-    end[,fault=sto]                           end faults of one kind, or all
+    end[,fault=sto]                           end faults of one kind (release the STO), or all
 
     Example: rigd inject --profile antenna_can sto, then rigd inject --profile antenna_can end
     """  # noqa: D301 - the mark that keeps lines apart is no raw text

@@ -20,6 +20,7 @@ from rigd.cli.options import (
     EXIT_WRONG_USE,
     AsJson,
     Force,
+    Meta,
     Note,
     Operator,
     Repeat,
@@ -85,6 +86,7 @@ def start_sessions(
     operator: Operator = "",
     specimen: Specimen = "",
     note: Note = "",
+    meta: Meta = None,
     force: Force = False,
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
@@ -92,7 +94,14 @@ def start_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Have the daemon run sessions, and report how they ended."""
-    notes = session_notes(operator, specimen, note)
+    from rigd.session import META_PREFIX
+
+    notes: dict[str, Any] = {}
+    for key, text in session_notes(operator, specimen, note, meta).items():
+        if key.startswith(META_PREFIX):  # an older daemon does not know the member
+            notes.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = text
+        else:
+            notes[key] = text
     for name, value in parameters.items():
         if isinstance(value, float) and not isfinite(value):
             fail(f"{name} = {value} is not a finite number; give one.", EXIT_WRONG_USE)
@@ -103,7 +112,7 @@ def start_sessions(
             for name, value in parameters.items()
         },
         "repeat": repeat,
-        "notes": {name: text for name, text in notes.items() if text},
+        "notes": notes,
         "force": force,
     }
     with daemon_of(profile) as client, _Interrupts.caught() as interrupts:

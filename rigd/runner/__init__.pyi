@@ -4,9 +4,13 @@ from ._console import result_line as result_line
 from ._foreground import SeriesFailedError as SeriesFailedError
 from ._foreground import run_in_foreground as run_in_foreground
 from ._planning import LoopPreview as LoopPreview
+from ._planning import Plan as Plan
 from ._planning import RefusedError as RefusedError
 from ._planning import excitation_for as excitation_for
+from ._planning import largest_amplitude as largest_amplitude
+from ._planning import plan_document as plan_document
 from ._planning import plan_session as plan_session
+from ._planning import predict_session as predict_session
 from ._process_group import ProcessGroup as ProcessGroup
 from ._quick_looks import QuickLook as QuickLook
 from ._quick_looks import QuickLooks as QuickLooks
@@ -22,5 +26,7 @@ from ._series import SessionRig as SessionRig
 from ._session import SessionFailedError as SessionFailedError
 from ._session import SessionProgress as SessionProgress
 from ._session import SessionResult as SessionResult
+from ._signals import Gauge as Gauge
+from ._signals import SignalBlock as SignalBlock
 from ._status import ProcessStatus as ProcessStatus
 from ._status import RigStatus as RigStatus

@@ -32,13 +32,15 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
         return f"{plan[f'peak_{name}']:.3g} {unit}{limit}"
 
     what = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
-    yield f"{what}record of {plan['record_s']:g} s."
+    sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
+    yield f"{what}{sweep}record of {plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
     )
-    if words := plan.get("tip_in_words"):
-        yield words
+    for words in ("specimen_in_words", "tip_in_words"):
+        if plan.get(words):
+            yield plan[words]
     for warning in plan["warnings"]:
         yield f"Warning: {warning}"
 

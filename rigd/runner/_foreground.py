@@ -13,7 +13,7 @@ from rigd.devices import WhatMoves, simulated_differently, what_moves
 from rigd.engine import Event
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
 from rigd.runner._console import ProgressLine, plan_lines, result_line
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._quick_looks import QuickLook, QuickLooks
@@ -121,8 +121,9 @@ def run_in_foreground(
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
+            mounted = with_specimen(profile, notes.get("specimen", ""))
             series = Series(
-                profile, build(profile), folder, repeat=repeat, notes=notes, force=force
+                mounted, build(mounted), folder, repeat=repeat, notes=notes, force=force
             )
             results = series.results
             for line in plan_lines(series.plan_document()):

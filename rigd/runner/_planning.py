@@ -1,9 +1,11 @@
 """Planning of a session, before anything moves: stability of the loop, peaks, limits."""
 
+import inspect
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +13,17 @@ from numpy.typing import NDArray
 from rigd.beam import SMALL_SLOPE_RAD, Beam, TipMotion, tip_motion
 from rigd.control import ClosedLoop, LoopResponse, check_stability, close_loop
 from rigd.errors import UserError
-from rigd.excitation import Excitation, Value, make_excitation
+from rigd.excitation import KINDS, Excitation, Value, make_excitation
 from rigd.profile import Profile
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+
+_MOST_RAD = 2.0 * math.pi
+"""Largest amplitude that an excitation takes."""
+_ROUNDS = 10
+"""Steps of the search for the largest amplitude; three or four are needed."""
 
 
 class RefusedError(UserError):
@@ -40,7 +48,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A session that stays within the limits."""
+    """What a session is predicted to do, and whether the limits allow it."""
 
     prediction: Prediction
     """What the session is predicted to do."""
@@ -48,6 +56,8 @@ class Plan:
     """Sentences for the operator."""
     tip_in_words: str
     """What the free end will do, and whether the linear model holds there."""
+    refused: str = ""
+    """Why it must not be run: a line for each limit that it would leave; empty if it may be run."""
 
 
 class LoopPreview:
@@ -85,7 +95,7 @@ class LoopPreview:
         """
         response = self._loop.simulate(reference_rad)
         firm, forcible = _limited(self._profile, _peaks(reference_rad, response))
-        return max(channel.value / channel.limit for channel in firm + forcible)
+        return _share(firm + forcible)
 
 
 def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value]) -> Excitation:
@@ -102,6 +112,27 @@ def excitation_for(profile: Profile, kind: str, parameters: Mapping[str, Value])
 
 
 def plan_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
+    """Predict a session and refuse one that would leave the profile's limits.
+
+    Parameters
+    ----------
+    profile, excitation, force
+        See `predict_session`.
+
+    Raises
+    ------
+    RefusedError
+        Naming every limit the session would leave, and the largest amplitude that passes.
+    ControlDesignError, RealisationError
+        As `predict_session`.
+    """
+    plan = predict_session(profile, excitation, force=force)
+    if plan.refused:
+        raise RefusedError(plan.refused)
+    return plan
+
+
+def predict_session(profile: Profile, excitation: Excitation, *, force: bool = False) -> Plan:
     """Predict a session and compare it with the profile's limits.
 
     Parameters
@@ -114,8 +145,6 @@ def plan_session(profile: Profile, excitation: Excitation, *, force: bool = Fals
 
     Raises
     ------
-    RefusedError
-        Naming every limit the session would leave.
     ControlDesignError
         If the loop is unstable.
     RealisationError
@@ -128,16 +157,121 @@ def plan_session(profile: Profile, excitation: Excitation, *, force: bool = Fals
         [finding for limited in channels if (finding := limited.violation())]
         for channels in _limited(profile, prediction)
     )
+    refusals: list[str] = []
     if firm or (forcible and not force):
-        refusals = [f"{finding}; lower the amplitude." for finding in firm]
+        largest_rad = largest_amplitude(profile, excitation, force=force)
+        lower = "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
+        refusals = [f"{finding}; {lower}." for finding in firm]
         refusals += [
-            f"{finding}; lower the amplitude, or let it be clipped with --force."
-            for finding in forcible
+            f"{finding}; {lower}, or let it be clipped with --force." for finding in forcible
         ]
-        raise RefusedError("\n".join(refusals))
     clipped = [f"{finding}: it will be clipped and flagged." for finding in forcible]
-    warnings = tuple(([unstable] if unstable else []) + clipped)
-    return Plan(prediction, warnings, _tip_in_words(prediction, profile.rig.beam))
+    return Plan(
+        prediction,
+        warnings=tuple(([unstable] if unstable else []) + ([] if refusals else clipped)),
+        tip_in_words=_tip_in_words(prediction, profile.rig.beam),
+        refused="\n".join(refusals),
+    )
+
+
+def largest_amplitude(
+    profile: Profile, excitation: Excitation, *, force: bool = False
+) -> float | None:
+    """Return the largest amplitude that all limits allow, the other parameters as they are.
+
+    Parameters
+    ----------
+    profile, excitation
+        Rig and excitation, whatever its amplitude.
+    force
+        Torques may be clipped: only what cannot be forced counts.
+
+    Returns
+    -------
+    float or None
+        In rad, rounded down to three digits; None where the excitation has no amplitude of its own
+        (``hold``, ``file``), keeps it within the limits by itself (``modes``), or none would do.
+
+    Raises
+    ------
+    ControlDesignError
+        If the loop is unstable and the response grows beyond all numbers.
+    RealisationError
+        If the beam's damping cannot be realised.
+    """
+    if excitation.kind == "modes" or not _has_amplitude(excitation.kind):
+        return None
+    loop = close_loop(profile.loop_model())
+    given_rad = abs(float(excitation.parameters["amplitude_rad"]))
+
+    def share_at(amplitude_rad: float) -> float:
+        reference_rad = excitation.reference_rad * (amplitude_rad / given_rad)
+        firm, forcible = _limited(profile, _peaks(reference_rad, loop.simulate(reference_rad)))
+        return _share(firm if force else firm + forcible)
+
+    # All peaks are proportional to the amplitude, but for the friction compensation in the torque.
+    amplitude_rad = min(given_rad, _MOST_RAD)
+    for _ in range(_ROUNDS):
+        share = share_at(amplitude_rad)
+        if not 0.0 < share < math.inf:
+            return None
+        amplitude_rad = min(amplitude_rad / share, _MOST_RAD)
+        if 0.999 < share <= 1.0:
+            break
+    digit_rad = 10.0 ** (math.floor(math.log10(amplitude_rad)) - 2)
+    digits = math.floor(amplitude_rad / digit_rad)
+    while digits > 0 and not share_at(digits * digit_rad) <= 1.0:
+        digits -= 1
+    return float(f"{digits * digit_rad:.3g}") if digits else None
+
+
+def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[str, Any]:
+    """Return a plan as JSON documents have it.
+
+    Parameters
+    ----------
+    profile, excitation
+        Rig and excitation that the plan is for.
+    plan
+        What `predict_session` or `plan_session` returned.
+    """
+    return {
+        "excitation": excitation.kind,
+        "sweep": _sweep_in_words(excitation),
+        "profile": profile.name,
+        "parameters": dict(excitation.parameters),
+        "segments": {name: list(ends) for name, ends in excitation.segments.items()},
+        "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
+        **asdict(plan.prediction),
+        "limits": {
+            "angle_rad": profile.limits.angle_rad,
+            "velocity_rad_s": profile.limits.velocity_rad_s,
+            "torque_nm": profile.rig.motor.peak_torque_nm,
+            "tracking_error_rad": profile.limits.tracking_error_rad,
+            "coupling_torque_nm": _sensor_limit_nm(profile),
+            "tip_slope_rad": SMALL_SLOPE_RAD,
+        },
+        "refused": plan.refused or None,
+        "tip_in_words": plan.tip_in_words,
+        "beam": asdict(profile.rig.beam),
+        "damping": asdict(profile.rig.damping),
+        "specimen_in_words": profile.specimen_in_words,
+        "warnings": list(plan.warnings),
+    }
+
+
+def _has_amplitude(kind: str) -> bool:
+    """Whether an excitation takes its amplitude as an option."""
+    return "amplitude_rad" in inspect.signature(KINDS[kind]).parameters
+
+
+def _sweep_in_words(excitation: Excitation) -> str:
+    """Say from where to where a chirp sweeps; nothing of any other excitation."""
+    if excitation.kind != "chirp":
+        return ""
+    start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
+    down = " down" if stop_hz < start_hz else ""
+    return f"sweeps{down} from {start_hz:g} to {stop_hz:g} Hz"
 
 
 def predict(loop: ClosedLoop, excitation: Excitation) -> Prediction:
@@ -167,6 +301,29 @@ def _peaks(reference_rad: Real, response: LoopResponse, tip: TipMotion | None = 
     )
 
 
+def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str]:
+    """Return the predicted peaks and their limits as a session's file has them.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig, with its limits.
+    predicted
+        What the session is predicted to do.
+
+    Returns
+    -------
+    dict of str to str
+        ``predicted_peak_…`` and ``limit_…``, their units in the names.
+    """
+    firm, forcible = _limited(profile, predicted)
+    metadata = {}
+    for peak in (*firm, *forcible):
+        metadata[f"predicted_peak_{_KEYS[peak.name]}"] = repr(peak.value)
+        metadata[f"limit_{_KEYS[peak.name]}"] = repr(peak.limit)
+    return metadata
+
+
 def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
     tip = predicted.tip
     if tip is None:
@@ -184,6 +341,16 @@ def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
         f"{motion} At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error "
         f"up to {100 * tip.slope_rad**2 / 3:.2g} %), and air drag may limit the motion{within}."
     )
+
+
+_KEYS = {
+    "angle": "angle_rad",
+    "speed": "velocity_rad_s",
+    "tracking error": "tracking_error_rad",
+    "coupling torque": "coupling_torque_nm",
+    "torque": "torque_nm",
+}
+"""Names of the limited peaks as keys of metadata."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +407,12 @@ def _limited(
         ),
     )
     return firm, forcible
+
+
+def _share(channels: tuple[_Limited, ...]) -> float:
+    """Return the largest share of a limit that a predicted peak takes; NaN if one is no number."""
+    shares = [channel.value / channel.limit for channel in channels]
+    return math.nan if any(map(math.isnan, shares)) else max(shares)
 
 
 def _sensor_limit_nm(profile: Profile) -> float:

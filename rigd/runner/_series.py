@@ -7,16 +7,15 @@
 import contextlib
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from rigd.engine import Event
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._planning import plan_session
+from rigd.runner._planning import plan_document, plan_session, predicted_metadata
 from rigd.runner._quick_looks import QuickLooks
-from rigd.runner._request import Order, choose_path, make_room
+from rigd.runner._request import Order, check_required, choose_path, make_room
 from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
 from rigd.runtime import StopRequest
 
@@ -98,7 +97,8 @@ class Series:
     repeat
         Number of sessions.
     notes
-        Operator, specimen, note; what is empty is left out.
+        Operator, specimen, note and added metadata; what is empty is left out. The beam of a
+        specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
 
@@ -112,7 +112,8 @@ class Series:
     Raises
     ------
     RefusedError, ControlDesignError, RealisationError
-        If the sessions would leave the limits, or cannot be predicted.
+        If the sessions would leave the limits, cannot be predicted, or lack metadata that the
+        profile requires.
     NoRoomError
         If there is no room for the first one.
     """
@@ -132,6 +133,7 @@ class Series:
         self._folder = folder
         self._repeat = repeat
         self._notes = {name: text for name, text in (notes or {}).items() if text}
+        check_required(profile, self._notes)
         self.plan = plan_session(profile, excitation, force=force)
         self.results: list[SessionResult] = []
         self._make_room()
@@ -141,22 +143,13 @@ class Series:
         """Ticks of each session's record."""
         return int(self._excitation.reference_rad.size)
 
+    def frequency_hz(self, tick: int) -> float | None:
+        """Return the frequency of the excitation at a tick, where it has one."""
+        return present_frequency_hz(self._excitation, tick)
+
     def plan_document(self) -> dict[str, Any]:
         """Return the plan as JSON documents have it."""
-        profile = self._profile
-        return {
-            "excitation": self._excitation.kind,
-            "profile": profile.name,
-            "record_s": self.ticks / profile.rig.rate_hz,
-            **asdict(self.plan.prediction),
-            "limits": {
-                "angle_rad": profile.limits.angle_rad,
-                "velocity_rad_s": profile.limits.velocity_rad_s,
-                "torque_nm": profile.rig.motor.peak_torque_nm,
-            },
-            "tip_in_words": self.plan.tip_in_words,
-            "warnings": list(self.plan.warnings),
-        }
+        return plan_document(self._profile, self._excitation, self.plan)
 
     def run(
         self,
@@ -204,7 +197,13 @@ class Series:
             path = choose_path(self._folder, self._excitation.kind, number if counted else None)
             notes = self._notes | ({"series": f"{number} of {self._repeat}"} if counted else {})
             watcher.begins(number, path)
-            order = Order(self._profile, self._excitation, path, tuple(notes.items()))
+            order = Order(
+                self._profile,
+                self._excitation,
+                path,
+                tuple(notes.items()),
+                tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
+            )
             with contextlib.nullcontext() if looks is None else looks.held():
                 if live:
                     watcher.shown(rig.show(order, stop))

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from rigd.control import ControlDesignError, PidController, close_loop, design_pid
-from rigd.excitation import chirp, step
-from rigd.runner._planning import RefusedError, plan_session, predict
+from rigd.excitation import chirp, from_csv, hold, multisine, step
+from rigd.runner._console import plan_lines
+from rigd.runner._planning import (
+    RefusedError,
+    largest_amplitude,
+    plan_document,
+    plan_session,
+    predict,
+    predict_session,
+)
 
 
 def test_the_papers_chirp_stays_within_the_shipped_limits(profile):
@@ -65,6 +73,44 @@ def test_predicted_saturation_is_what_the_controller_does(profile):
         controller.step(amplitude, 0.0, 0.0)
         assert controller.saturated == (prediction.peak_torque_nm > 0.9)
         assert prediction.peak_torque_nm >= abs(controller.unlimited_torque_nm) - 1e-12
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda rad: chirp(rate_hz=1000.0, amplitude_rad=rad, duration_s=20.0, taper_s=1.0),
+        lambda rad: step(rate_hz=1000.0, amplitude_rad=-rad, duration_s=1.0, ring_down_s=1.0),
+        lambda rad: multisine(rate_hz=1000.0, amplitude_rad=rad, period_s=5.0, duration_s=10.0),
+    ],
+)
+def test_the_largest_amplitude_passes_and_a_little_more_does_not(profile, make, force):
+    largest_rad = largest_amplitude(profile, make(4.0), force=force)
+    assert largest_amplitude(profile, make(1e-3), force=force) == pytest.approx(
+        largest_rad, rel=0.01
+    )
+    assert not predict_session(profile, make(largest_rad), force=force).refused
+    with pytest.raises(RefusedError, match=f"lower the amplitude to {largest_rad:g} rad"):
+        plan_session(profile, make(1.011 * largest_rad), force=force)
+
+
+def test_what_has_no_amplitude_has_no_largest(profile, tmp_path):
+    path = tmp_path / "reference.csv"
+    path.write_text("0\n3.0\n")
+    far = from_csv(path, rate_hz=1000.0, ring_down_s=1.0)
+    assert "lower the amplitude.\n" in predict_session(profile, far).refused
+    for excitation in (far, hold(rate_hz=1000.0, duration_s=1.0)):
+        assert largest_amplitude(profile, excitation) is None
+
+
+@pytest.mark.parametrize(
+    ("start_hz", "said"),
+    [(60.0, "sweeps down from 60 to 50 Hz"), (0.05, "sweeps from 0.05 to 50 Hz")],
+)
+def test_a_plan_says_which_way_a_chirp_sweeps(profile, start_hz, said):
+    excitation = chirp(rate_hz=1000.0, start_hz=start_hz, duration_s=1.0, amplitude_rad=1e-3)
+    document = plan_document(profile, excitation, plan_session(profile, excitation))
+    assert next(plan_lines(document)) == f"chirp on {profile.name}, {said}, record of 17 s."
 
 
 def test_angle_speed_and_tracking_can_never_be_forced(profile):

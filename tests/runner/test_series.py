@@ -10,10 +10,12 @@ import pytest
 from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner._console import ProgressLine, plan_lines, result_line
+from rigd.runner._planning import RefusedError
 from rigd.runner._request import NoRoomError
 from rigd.runner._series import Series, _await_look
 from rigd.runner._session import SessionResult
 from rigd.runtime import StopRequest
+from rigd.testing import write_profile
 
 WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
 
@@ -75,6 +77,8 @@ def test_a_lone_session_is_not_numbered(make_series):
     make_series().run(rig, StopRequest(), Watcher(), live=False)
     (order,) = rig.orders
     assert order.notes == ()
+    assert dict(order.predicted)["limit_angle_rad"] == "1.57"
+    assert float(dict(order.predicted)["predicted_peak_velocity_rad_s"]) >= 0.0
     assert order.path.stem.endswith("-hold")
 
 
@@ -186,3 +190,23 @@ def test_what_was_said_last_is_written(capsys):
         line.say(f"last {number}")
         line.close()
         assert capsys.readouterr().err == f"[first]\nlast {number}\n"
+
+
+def test_metadata_that_the_profile_requires_is_asked_for(tmp_path):
+    required = ["operator", "temperature_c", "batch"]
+    path = write_profile(tmp_path, {"session.tare_s": 0.5})
+    path.write_text(f"{path.read_text()}\n[metadata]\nrequired = {json.dumps(required)}\n")
+    profile = load_profile(path)
+    excitation = hold(rate_hz=1000.0, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+    given = {"operator": "Ada", "meta_batch": "7"}
+    with pytest.raises(RefusedError) as refusal:
+        Series(profile, excitation, tmp_path, notes=given)
+    assert str(refusal.value) == (
+        f"{path}: metadata.required asks each session for temperature_c; add "
+        "--meta temperature_c=… (°C)."
+    )
+    with pytest.raises(
+        RefusedError, match=r"--operator … --meta temperature_c=… \(°C\) --meta batch=…\."
+    ):
+        Series(profile, excitation, tmp_path)
+    Series(profile, excitation, tmp_path, notes=given | {"meta_temperature_c": "21.4"})

@@ -122,6 +122,11 @@ class Fault:
     after_s: float | None = None
     """Time after the drive was first enabled; None: at once."""
 
+    @property
+    def stands(self) -> bool:
+        """Whether it lasts until it is ended, neither by a time nor by a number of frames."""
+        return self.kind in LASTING and self.kind not in LINE_KINDS and "for" not in self.values
+
     def __str__(self) -> str:
         """Return the fault as it is written; `parse_fault` reads it back."""
         words = [self.kind]

@@ -301,7 +301,8 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     Returns
     -------
     list of str
-        The faults as it understood them; without any, lines on how it stands.
+        The faults as it understood them, and how to end one that lasts; without any, lines on how
+        it stands.
 
     Raises
     ------
@@ -316,11 +317,15 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
             f"No simulated rig of the profile {rig_name} runs; start it with: rigd simulate "
             f"--profile {rig_name}"
         )
-    for spec in specs:
-        parse_fault(spec)  # all of them, before the first one happens
+    faults = [parse_fault(spec) for spec in specs]  # all of them, before the first one happens
     if not specs:
         return [f"{name}: {value}" for name, value in ask(address, {"status": True}).items()]
-    return [str(ask(address, {"inject": spec})["injected"]) for spec in specs]
+    lines = []
+    for fault, spec in zip(faults, specs, strict=True):
+        injected = str(ask(address, {"inject": spec})["injected"])
+        end = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
+        lines.append(f"{injected}; it lasts until: {end}" if fault.stands else injected)
+    return lines
 
 
 class _Process:

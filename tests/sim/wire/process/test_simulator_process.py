@@ -325,7 +325,9 @@ def test_faults_are_injected_while_it_runs(simulate, connect, rigd_here):
 def test_a_cut_bus_stays_cut(simulate, connect, rigd_here):
     simulator = simulate()
     host = connect(simulator)
-    assert rigd_here("inject", "--profile", "antenna_can", "cut").returncode == 0
+    done = rigd_here("inject", "--profile", "antenna_can", "cut")
+    end = "rigd inject --profile antenna_can end,fault=cut"
+    assert (done.returncode, done.stdout) == (0, f"cut,device=bus; it lasts until: {end}\n")
     with pytest.raises(ConnectionError):
         host.receive(0x181)
     with pytest.raises(OSError, match=r"No such file|refused"):
