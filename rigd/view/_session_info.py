@@ -260,7 +260,7 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
         ("late ticks", _number(health.late_ticks), not health.late_ticks),
         ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
         ("recorder backlog", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
-        ("not shown here", _number(health.view_dropped, "{:.0f} samples"), True),
+        ("dropped by the viewer", _number(health.view_dropped, "{:.0f} samples"), True),
         ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
         ("bus errors", _number(health.bus_errors), not health.bus_errors),
         ("sensor status", _status(health.sensor_status), not health.sensor_status),

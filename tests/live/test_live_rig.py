@@ -150,7 +150,7 @@ def test_a_view_that_dies_again_and_again_is_given_up_and_the_session_is_not(rig
     def kill(progress) -> None:
         nonlocal given_up_at
         for process in rig.status().processes:
-            if process.name == "live" and process.state == "at work":
+            if process.name == "live" and process.state == "running":
                 killed.add(process.pid)
                 os.kill(process.pid, signal.SIGKILL)
         if rig.status().live_view is None:
