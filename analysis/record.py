@@ -27,6 +27,7 @@ from analysis.record_checks import (
     stated_rate_hz,
     stated_tool_inertia_kg_m2,
     stated_torque_filter_s,
+    stated_uncertainty,
 )
 from rigd.session import Session, Status, read_session, readable_texts
 
@@ -114,6 +115,8 @@ class Record:
         Inertia between torque sensor and beam.
     torque_filter_s
         Time constants of the torque channel's low-pass filter, of first and of second order.
+    uncertainty
+        Relative standard uncertainties of `record_checks.SCALES`, those that the file states.
     sweep
         Range of samples with the excitation.
     rest_angle_rad
@@ -143,6 +146,7 @@ class Record:
     torque_delay_s: float
     tool_inertia_kg_m2: float
     torque_filter_s: tuple[float, float]
+    uncertainty: Mapping[str, float]
     sweep: slice
     rest_angle_rad: float | None
     gaps: Gaps
@@ -237,6 +241,7 @@ def load_record(path: Path) -> Record:
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
         torque_filter_s=stated_torque_filter_s(session),
+        uncertainty=stated_uncertainty(session),
         sweep=sweep,
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,

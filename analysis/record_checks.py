@@ -37,6 +37,7 @@ _BEAM_RANGES: Final = {
 }
 _MAX_INERTIA_KG_M2: Final = 1e3
 _MAX_DELAY_S: Final = 1.0
+MAX_UNCERTAINTY_PERCENT: Final = 50.0
 _FIRST_ROOT: Final = 1.8751040687119611
 """First root of 1 + cos z cosh z: mode 1 is at (root / length)² √(EI/rho) rad/s."""
 
@@ -82,8 +83,8 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
             raise _wrong(session, key, value, f"must lie between {low:g} and {high:g}")
         values.append(value)
     length_m, density, stiffness = values
-    first_hz = (_FIRST_ROOT / length_m) ** 2 * math.sqrt(stiffness / density) / (2 * math.pi)
-    lowest_hz = _LEAST_PERIODS * rate_hz / ticks
+    beam = Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
+    first_hz, lowest_hz = first_mode_hz(beam), _LEAST_PERIODS * rate_hz / ticks
     if not lowest_hz < first_hz < rate_hz / 2:
         raise RecordError(
             f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m {density:g} "
@@ -92,10 +93,21 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
             + (
                 "record longer, or correct the file's metadata if these are wrong."
                 if first_hz <= lowest_hz
-                else "correct the file's metadata."
+                else "correct the file's metadata, or import the record again if its time was "
+                "taken in the wrong unit."
             )
         )
-    return Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
+    return beam
+
+
+def first_mode_hz(beam: Beam) -> float:
+    """Frequency of the first mode of an undamped beam with locked hub.
+
+    Parameters
+    ----------
+    beam : Beam
+    """
+    return (_FIRST_ROOT / beam.length_m) ** 2 / math.sqrt(beam.density_over_stiffness) / math.tau
 
 
 def stated_tool_inertia_kg_m2(session: Session) -> float:
@@ -155,6 +167,30 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
         raise _wrong(session, "torque_filter_order", order, "must be 1 or 2 (Butterworth)")
     constant_s = 1 / (2 * math.pi * corner_hz)
     return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
+
+
+SCALES: Final = ("torque_scale", "length", "density")
+"""What no session shows, and its file may state the uncertainty of."""
+
+
+def stated_uncertainty(session: Session) -> dict[str, float]:
+    """Relative standard uncertainties of the `SCALES` that the file states, by their names.
+
+    Raises
+    ------
+    RecordError
+        One is negative, or so large that the value would not be known at all.
+    """
+    stated = {}
+    for name in SCALES:
+        key = f"uncertainty_{name}_percent"
+        percent = session.number(key, 0.0)
+        if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
+            rule = f"must lie between 0 and {MAX_UNCERTAINTY_PERCENT:g}"
+            raise _wrong(session, key, percent, rule)
+        if percent:
+            stated[name] = percent / 100
+    return stated
 
 
 def _wrong(session: Session, key: str, value: float, rule: str) -> RecordError:

@@ -1,4 +1,4 @@
-"""p-values and quantiles of the distributions that the analyzer decides by.
+"""p-values and quantiles of the distributions that the analyzer decides by; the fit in per cent.
 
 From `scipy.special`, not `scipy.stats`, which takes four times as long to import; and only when
 one is asked for, since a command that prints its help needs none.
@@ -6,7 +6,7 @@ one is asked for, since a command that prints its help needs none.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -112,3 +112,27 @@ def student_t_quantile(level: float, degrees_of_freedom: float) -> float:
     from scipy.special import stdtrit
 
     return float(stdtrit(degrees_of_freedom, (1 + level) / 2))
+
+
+def nrmse_percent(residual: NDArray[Any], measured: NDArray[Any]) -> float:
+    """Fit as ``compare`` of MATLAB's System Identification Toolbox has it, in %.
+
+    ``100 (1 - |residual| / |measured - its mean|)``: 100 for a model that leaves nothing, 0 for one
+    that is no better than the mean, below 0 for one that is worse.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        Measured less modelled, real or complex.
+    measured : ndarray, shape (n,)
+        The mean already taken out, such as the part of a spectrum without its first bin.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from analysis.statistics import nrmse_percent
+    >>> measured = np.array([3.0, -4.0])
+    >>> nrmse_percent(0.1 * measured, measured)
+    90.0
+    """
+    return 100 * (1 - float(np.linalg.norm(residual)) / float(np.linalg.norm(measured) or np.nan))

@@ -90,7 +90,7 @@ def recorded_session(folder: Path) -> Path:
     """Record the paper's session on the simulated rig under the virtual clock."""
     rigd = Path(sys.executable).with_name("rigd")
     subprocess.run(
-        [rigd, "run", "chirp", "--fast", "--seed", "1", "--output", folder],
+        [rigd, "run", "chirp", "--fast", "--no-look", "--seed", "1", "--output", folder],
         check=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -46,7 +46,17 @@ def recorded(folder: Path) -> list[Path]:
     """Sessions of a folder, made if it has none."""
     if not any(folder.glob("*.mcap")):
         rigd = Path(sys.executable).with_name("rigd")
-        command = [rigd, "run", "chirp", "--fast", "--seed", "1", "--repeat", str(SESSIONS)]
+        command = [
+            rigd,
+            "run",
+            "chirp",
+            "--fast",
+            "--no-look",
+            "--seed",
+            "1",
+            "--repeat",
+            str(SESSIONS),
+        ]
         subprocess.run([*command, "--output", folder], check=True, stdout=subprocess.DEVNULL)
     return sorted(folder.glob("*.mcap"))
 

@@ -62,7 +62,7 @@ def run(folder: Path, profile: Path, kind: list[str], seed: int) -> Path:
     """Run a session from the command line unless it is there, and say where it is."""
     kept = folder / f"{profile.stem}-{kind[0]}-{seed:03d}.mcap"
     if not kept.exists():
-        command = [sys.executable, "-m", "rigd", "run", *kind, "--fast", "--json"]
+        command = [sys.executable, "-m", "rigd", "run", *kind, "--fast", "--no-look", "--json"]
         command += ["--profile", str(profile), "--seed", str(seed), "--output", str(folder)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:

@@ -221,7 +221,18 @@ def judged(name: str, seed: int) -> Scored:
 def _judged_rig(seed: int) -> Scored:
     """Run and analyse one session of the shipped rig through the command line."""
     with tempfile.TemporaryDirectory() as folder:
-        run = ("rigd", "run", "chirp", "--fast", "--seed", str(seed), "--output", folder, "--json")
+        run = (
+            "rigd",
+            "run",
+            "chirp",
+            "--fast",
+            "--no-look",
+            "--seed",
+            str(seed),
+            "--output",
+            folder,
+            "--json",
+        )
         (session,) = json.loads(_output(run))["sessions"]
         options = ("--method", "record", "--report", f"{folder}/report", "--json", "-")
         start = time.monotonic()

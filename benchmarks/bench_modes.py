@@ -72,7 +72,17 @@ def recorded(kind: list[str], profile: Path, count: int, folder: Path) -> list[M
 
     measurements = []
     for seed in range(count):
-        command = [sys.executable, "-m", "rigd", "run", *kind, "--profile", str(profile), "--fast"]
+        command = [
+            sys.executable,
+            "-m",
+            "rigd",
+            "run",
+            *kind,
+            "--no-look",
+            "--profile",
+            str(profile),
+            "--fast",
+        ]
         command += ["--seed", str(seed + 1), "--output", str(folder), "--json"]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         path = Path(json.loads(done.stdout)["sessions"][0]["path"])

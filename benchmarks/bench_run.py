@@ -30,7 +30,7 @@ def run(*command: object) -> None:
 def session() -> None:
     """Run the paper's chirp, 136 s of rig time, from the command line to the closed file."""
     with tempfile.TemporaryDirectory() as folder:
-        run(RIGD, "run", "chirp", "--fast", "--output", folder)
+        run(RIGD, "run", "chirp", "--fast", "--no-look", "--output", folder)
 
 
 def cycle() -> Callable[[], None]:

@@ -11,6 +11,8 @@
      |    +-- RealisationError      the beam's damping has no stable state space
      |    +-- RefusedError          the predicted angle exceeds limits.angle_rad
      |    |    +-- NoRoomError          the disk is too full for the session
+     |    +-- MetadataError         --meta temperature_c=warm: the name's unit asks for a number
+     |    +-- LibraryError          rigd list of a folder that does not exist
      |    +-- UnknownGroupError     --group names no group of this computer
      |    +-- WrongUseError         rigd inject with a fault that does not exist
      +-- FailureError          the same request may succeed later: exit code 1

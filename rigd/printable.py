@@ -1,9 +1,19 @@
-"""Printable text: what comes from outside, made fit for a terminal and for a message."""
+"""Printable text: what comes from outside, and counts, made fit for a terminal."""
 
-from typing import Final
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Final
 
 UNPRINTABLE: Final = "?"
 """Replacement of a character that cannot be printed."""
+
+_FROM: Final = 10_000
+"""Numbers of four digits are read without help."""
+
+BAR_STYLES: Final = MappingProxyType(
+    {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
+)
+"""Theme of rich for a progress bar: its own is red, which on a rig is for alarms."""
 
 
 def printable(text: str, most: int | None = None) -> str:
@@ -23,3 +33,43 @@ def printable(text: str, most: int | None = None) -> str:
     if not shown.isprintable():
         shown = "".join(c if c.isprintable() else UNPRINTABLE for c in shown)
     return shown if len(shown) == len(text) else f"{shown}…"
+
+
+def grouped(count: int) -> str:
+    """Return a whole number with its thousands set apart.
+
+    Examples
+    --------
+    >>> from rigd.printable import grouped
+    >>> print(grouped(136000), grouped(1200))
+    136 000 1200
+    """
+    return f"{count:,}".replace(",", " ") if count >= _FROM else str(count)
+
+
+def counts_text(counts: Mapping[str, Any]) -> str:
+    """Say how many samples of a session were recorded, and what became of the others.
+
+    Parameters
+    ----------
+    counts
+        ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
+        ``stale_wrenches``, as numbers or as texts; of the last three only what occurred is told.
+
+    Examples
+    --------
+    >>> from rigd.printable import counts_text
+    >>> print(counts_text({"recorded": 11_998, "scheduled": 12_000, "missed": 2, "late": 5}))
+    11 998 of 12 000 samples, 2 missed, 5 late
+    """
+    rare = ("lost", "stale_angles", "stale_wrenches")
+    told = [
+        f"{grouped(int(counts['recorded']))} of {grouped(int(counts['scheduled']))} samples",
+        *(f"{grouped(int(counts[name]))} {name}" for name in ("missed", "late")),
+        *(
+            f"{grouped(int(counts[name]))} {name.replace('_', ' ')}"
+            for name in rare
+            if int(counts.get(name) or 0)
+        ),
+    ]
+    return ", ".join(told)

@@ -6,6 +6,7 @@ from typing import Final
 
 UNITS: Final = MappingProxyType(
     {
+        "_rad_per_nm": "rad/(N·m)",
         "_nm_s_per_rad": "N·m·s/rad",
         "_nm_per_rad": "N·m/rad",
         "_kg_per_m": "kg/m",
@@ -18,6 +19,9 @@ UNITS: Final = MappingProxyType(
         "_rad_s2": "rad/s²",
         "_rad_s": "rad/s",
         "_rad": "rad",
+        "_hpa": "hPa",
+        "_kg": "kg",
+        "_mm": "mm",
         "_nm": "N·m",
         "_mb": "MB",
         "_hz": "Hz",
@@ -26,6 +30,7 @@ UNITS: Final = MappingProxyType(
         "_m": "m",
         "_n": "N",
         "_s": "s",
+        "_c": "°C",
     }
 )
 """Ending of a key → its unit, the longer endings first: the first that fits is the key's."""

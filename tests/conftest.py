@@ -24,7 +24,8 @@ from rigd import testing
 from rigd.runtime import use_one_thread
 
 pytest_plugins = [
-    "kinds_of_tests", "paper_sweeps", "shipped_profile", "standstill", "synthetic_sessions",
+    "browsers", "kinds_of_tests", "library_folders", "paper_sweeps", "shipped_profile",
+    "standstill", "synthetic_sessions", "web_daemon",
 ]  # fmt: skip
 
 # As in the commands; threads would fight each other where tests run in parallel.
@@ -43,6 +44,8 @@ _RUNTIME = tempfile.mkdtemp(prefix="rigd-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _RUNTIME
 # Nor a profile of the user's own that hides a shipped one.
 os.environ["XDG_CONFIG_HOME"] = f"{_RUNTIME}/config"
+# No session pays for a quick look but where that is tested.
+os.environ["RIGD_NO_LOOK"] = "1"
 atexit.register(shutil.rmtree, _RUNTIME, ignore_errors=True)
 
 # The same examples each time, and however long they take: what fails is a change's fault. Others
@@ -93,22 +96,28 @@ PATIENT = {
 BRIEF = {"session.tare_s": "0.5", "session.return_s": "0.3"}
 
 
-@pytest.fixture
-def write_profile(tmp_path):
-    """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
+@pytest.fixture(scope="session")
+def write_profile_in():
+    """Write a shipped profile into a folder, as `write_profile` does."""
 
-    One that is `patient` bears that the machine stands still.
-    """
-
-    def write(name: str, values: dict[str, str] | None = None, *, patient: bool = False) -> Path:
+    def write(folder, name, values=None, *, patient=False) -> Path:
         base = HW_PROFILES / f"{name}.toml"
         sections = tomllib.loads(base.read_text("utf-8"))
         borne = {key: PATIENT[key] for key in PATIENT if key.split(".")[0] in sections}
         texts = BRIEF | (borne if patient else {}) | (values or {})
         other = {key: tomllib.loads(f"value = {text}")["value"] for key, text in texts.items()}
-        return testing.write_profile(tmp_path, other, base=str(base))
+        return testing.write_profile(folder, other, base=str(base))
 
     return write
+
+
+@pytest.fixture
+def write_profile(tmp_path, write_profile_in):
+    """Write a shipped profile with other values (by `section.key`) and short ways from and to rest.
+
+    One that is `patient` bears that the machine stands still.
+    """
+    return partial(write_profile_in, tmp_path)
 
 
 @pytest.fixture

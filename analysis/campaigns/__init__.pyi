@@ -10,6 +10,7 @@ from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity
 from ._homogeneity import Homogeneity as Homogeneity
 from ._pooling import PooledEstimate as PooledEstimate
+from ._pooling import PooledMode as PooledMode
 from ._pooling import PooledParameter as PooledParameter
 from ._sentences import MIXTURE_MARK as MIXTURE_MARK
 from ._sentences import MIXTURE_NOTE as MIXTURE_NOTE

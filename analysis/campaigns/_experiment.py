@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
+from rigd.session import added_metadata
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -81,6 +82,8 @@ class Experiment:
         When it was recorded, to the second; empty if the file does not say.
     operator, note : str
         What the file says of either, or nothing.
+    added : mapping of str to (float or str)
+        Metadata that the user added, by its names, such as ``temperature_c``.
     """
 
     facts: Mapping[str, str | float]
@@ -89,6 +92,7 @@ class Experiment:
     start_utc: str = ""
     operator: str = ""
     note: str = ""
+    added: Mapping[str, float | str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, record: Record) -> Experiment:
@@ -114,6 +118,7 @@ class Experiment:
             start_utc=_time(metadata.get("start_utc_ns", "")),
             operator=metadata.get("operator", "").strip(),
             note=metadata.get("note", "").strip(),
+            added=added_metadata(metadata),
         )
 
     @property

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
-from analysis.cli.sessions import session_command
+from analysis.cli.sessions import NoSessionsError, Outputs, session_command, session_files
 from analysis.cli.standard_streams import standard_streams
 from analysis.cli.welch_options import (
     Band,
@@ -27,7 +27,7 @@ from analysis.cli.welch_options import (
     choice,
     welch_settings,
 )
-from analysis.results import Routes
+from analysis.results import FIGURE_FORMATS, Routes
 from rigd.runtime import raise_on, use_one_thread
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import LoneSessionError
     from analysis.identify import Setting
+    from analysis.results import FigureFormat
 
 DEFAULT: Final = "default"
 """Name under which the command is registered that takes all other arguments."""
@@ -66,6 +67,16 @@ class DefaultCommandGroup(TyperGroup):
         return super().invoke(ctx) if ctx.command is self else ctx.command.invoke(ctx)
 
 
+class CommandBesideOthers(TyperCommand):
+    """The default command: its help names the others, which the group itself never shows."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
+        """Write the commands behind arguments and options."""
+        super().format_options(ctx, formatter)
+        with formatter.section("Commands"):
+            formatter.write_dl([*_COMMANDS.items()])
+
+
 def _tell(asked: bool) -> None:
     if asked:
         typer.echo(f"analyze {rigd.__version__}")
@@ -80,16 +91,22 @@ Version = Annotated[
 
 _EXIT_INTERRUPTED: Final = 130
 
+_COMMANDS: Final = {
+    "import": "Make a session file of a record of another program (.csv, .mat, .tdms, .uff).",
+    "export record": "Write the samples of a session for another program (.csv, .mat, .uff).",
+    "export frf": "Write the frequency response of a session (.csv, .mat, .uff).",
+}
+"""The other commands, each with a --help of its own."""
+
 _EPILOG = """\
 Example: analyze session.mcap --types III,VI --json fits.json
 
-Writes figures, tables and JSON into session.report/ beside the file (session.report-2/ if that
-exists). Several files are a campaign: statistics, nominal models, pooled estimate and validation go
-to campaign.report/ beside the first. Records of other programs: analyze import --help; results for
-them: analyze export --help. Sessions that do not suit Welch's method (steps, multisines, narrow
-sweeps, short or stopped ones) get the whole-record analysis alone, and a line that says why.
-Exit code: 0 done; 1 a file could not be analysed, being too short for --segment for one; 2 wrong
-use, options that contradict each other or the record's rate included; 130 stopped by Ctrl-C."""
+Figures, tables and JSON go to session.report/ beside the file (session.report-2/ if that exists).
+Several files are a campaign: statistics, nominal models, pooled estimate and validation go to
+campaign.report/ beside the first. Sessions that do not suit Welch's method (steps, multisines,
+narrow sweeps, short or stopped ones) get the whole-record analysis alone, and a line that says why.
+
+Exit code: 0 done; 1 a file could not be analysed; 2 wrong use; 130 stopped by Ctrl-C."""
 
 
 _METHODS: Final = ("welch", "record", "all")
@@ -136,12 +153,14 @@ def _quieten_libraries() -> None:
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
-@app.command(DEFAULT, epilog=_EPILOG)
+@app.command(DEFAULT, epilog=_EPILOG, cls=CommandBesideOthers)
 def analyze(
     context: typer.Context,
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE", readable=False, help="Session files (.mcap)."),
+        typer.Argument(
+            metavar="FILE", readable=False, help="Session files (.mcap), or folders of them."
+        ),
     ],
     method: Annotated[
         str,
@@ -154,18 +173,18 @@ def analyze(
         str,
         typer.Option(
             metavar="LIST",
-            help="What the whole-record fits take from the file instead of estimating it: "
-            "density_over_stiffness, bending_stiffness_n_m2, delay_s, tool_inertia_kg_m2.",
+            help="Hold at the file's values in whole-record fits: density_over_stiffness, "
+            "bending_stiffness_n_m2, delay_s, tool_inertia_kg_m2.",
         ),
     ] = "",
     types: Annotated[
-        str, typer.Option(metavar="LIST", help="Model types, of I to VII, comma-separated.")
+        str, typer.Option(metavar="LIST", help="Model types of the Welch fits, I to VII.")
     ] = "I,II,III,IV,V,VI",
     weights: Annotated[
         str,
         typer.Option(
             metavar="LIST",
-            help="Weightings of the cost: const, omega (1/omega), omega^K for any power K.",
+            help="Weightings of the Welch fits: const, omega (1/omega), omega^K.",
         ),
     ] = "const,omega",
     band: Band = None,
@@ -177,35 +196,53 @@ def analyze(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of the report, new or empty; with --each, one folder per file in it.",
+            help="Folder of the report, new or empty; with --each, of one folder per file.",
         ),
     ] = None,
+    figures: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST", help="File formats of the figures: png, svg, pdf, comma-separated."
+        ),
+    ] = "png,svg",
     json: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="New file for all results as JSON; - for stdout."),
+        typer.Option(metavar="FILE", help="Write all results as JSON; - for standard output."),
     ] = None,
     rerun: Annotated[
         Path | None,
         typer.Option(
             metavar="OUT.rrd",
-            help="New file for Rerun's viewer with the session and its fits; one session only.",
+            help="Write session and fits for Rerun's viewer; one session only.",
         ),
     ] = None,
+    overwrite: Annotated[
+        bool,
+        typer.Option(
+            "--overwrite",
+            help="Replace an earlier report and its --json file; files of others stay.",
+        ),
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print all tables, not the main results alone.")
+    ] = False,
     each: Annotated[
         bool,
         typer.Option("--each", help="Report each of several files by itself, not as a campaign."),
     ] = False,
     paper: Annotated[
         bool,
-        typer.Option("--paper", help="Campaign: show the paper's Tables 3 and 4 for comparison."),
+        typer.Option("--paper", help="Campaign: set the paper's Tables 3 and 4 beside."),
     ] = False,
     jobs: Annotated[
         int | None,
-        typer.Option(min=1, help="Campaign: worker processes.  [default: one per core]"),
+        typer.Option(
+            metavar="N", min=1, help="Campaign: number of worker processes.  [default: cores]"
+        ),
     ] = None,
     dask: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Campaign: address of a Dask scheduler to run on."),
+        typer.Option(metavar="ADDRESS", help="Campaign: run on this Dask scheduler."),
     ] = None,
     version: Version = False,  # noqa: ARG001 - its callback has told it
 ) -> None:
@@ -216,6 +253,11 @@ def analyze(
     """
     from analysis.report import OutputError, OutputExistsError, check_new_file
 
+    try:
+        files = session_files(files)
+    except NoSessionsError as error:
+        _complain(str(error))
+        raise typer.Exit(1) from None
     is_campaign = len(files) > 1 and not each
     if not is_campaign:
         given = {"--paper": paper, "--jobs": jobs is not None, "--dask": dask is not None}
@@ -231,7 +273,7 @@ def analyze(
             param_hint="--fix",
         )
     if method == "record":
-        _check_without_paper(context, is_campaign=is_campaign, rerun=rerun)
+        _check_without_paper(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     routes = Routes(
         settings,
@@ -239,15 +281,16 @@ def analyze(
         whole_record=method != "welch",
         fixed=_fixed(fix),
         band_hz=band_hz(band),
+        figures=_figure_formats(figures),
     )
+    outputs = Outputs(report, json, overwrite, verbose)
     try:
-        to_stdout = json is not None and str(json) == "-"
-        if json is not None and not to_stdout:
-            check_new_file(json, "--json")
+        if json is not None and not outputs.json_to_stdout:
+            check_new_file(json, "--json", overwrite=overwrite)
         if rerun is not None:
             _check_rerun(rerun, files)
         if not is_campaign:
-            code = session_command(files, routes, report, json, rerun)
+            code = session_command(files, routes, outputs, rerun)
         else:
             from analysis.campaigns import CampaignError, LoneSessionError
             from analysis.cli.campaign import campaign_command
@@ -255,12 +298,13 @@ def analyze(
 
             try:
                 code = campaign_command(
-                    files, settings, structures=tuple(STRUCTURES) if routes.whole_record else (),
-                    fixed=routes.fixed, band_hz=routes.band_hz, report=report, json=json,
-                    jobs=jobs, dask=dask, with_paper=paper,
+                    files, settings, outputs,
+                    structures=tuple(STRUCTURES) if routes.whole_record else (),
+                    fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
+                    with_paper=paper, formats=routes.figures,
                 )  # fmt: skip
             except LoneSessionError as lone:
-                code = _lone_session(lone, routes, report, json)
+                code = _lone_session(lone, routes, outputs)
             except CampaignError as error:
                 _complain(str(error))
                 code = 1
@@ -287,19 +331,13 @@ def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
     raise typer.BadParameter(why, param_hint=" and ".join(options))
 
 
-def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Path | None) -> None:
+def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
     """Refuse outputs of the Welch fits where these are left out; name options without effect."""
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
             "--method all, or add --each.",
             param_hint="--method",
-        )
-    if rerun is not None:
-        raise typer.BadParameter(
-            "its charts are of the paper's fits, which --method record leaves out; take --method "
-            "all.",
-            param_hint="--rerun",
         )
     sources = {name: context.get_parameter_source(name) for name in _OF_WELCH}
     given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]
@@ -312,15 +350,13 @@ def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Pa
         )
 
 
-def _lone_session(
-    lone: LoneSessionError, routes: Routes, report: Path | None, json: Path | None
-) -> int:
+def _lone_session(lone: LoneSessionError, routes: Routes, outputs: Outputs) -> int:
     """Tell what is wrong with the other files of a campaign, and report the one that is left."""
     for failure in lone.failures:
         _complain(failure.message)
     typer.echo(f"One session makes no campaign: {lone.path} is reported by itself.", err=True)
     others = {str(failure.path): failure.message for failure in lone.failures}
-    return max(1, session_command([lone.path], routes, report, json, others=others))
+    return max(1, session_command([lone.path], routes, outputs, others=others))
 
 
 def _fixed(text: str) -> tuple[Setting, ...]:
@@ -334,6 +370,18 @@ def _fixed(text: str) -> tuple[Setting, ...]:
             param_hint="--fix",
         )
     return tuple(name for name in SETTINGS if name in names)
+
+
+def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
+    names = {name.strip().lower() for name in text.split(",") if name.strip()}
+    unknown = sorted(names.difference(FIGURE_FORMATS))
+    if unknown or not names:
+        raise typer.BadParameter(
+            f"there is no {', '.join(unknown) or 'format'}; choose from "
+            f"{', '.join(FIGURE_FORMATS)}.",
+            param_hint="--figures",
+        )
+    return tuple(each for each in FIGURE_FORMATS if each in names)
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:

@@ -5,32 +5,35 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from analysis.results import DEFAULT_FORMATS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from analysis.campaigns import CampaignResult
+    from analysis.cli.sessions import Outputs
     from analysis.identify import Setting
     from analysis.models import WelchSettings
+    from analysis.results import FigureFormat
 
 _NAME: Final = "campaign"
-_TEXT_WIDTH: Final = 120
-_FIGURES: Final = 6
+_FIGURES: Final = 8
 """At most; each takes about as long as half a session."""
 
 
 def campaign_command(
     files: Sequence[Path],
     settings: WelchSettings,
+    outputs: Outputs,
     *,
     structures: Sequence[str],
     fixed: Sequence[Setting] = (),
     band_hz: tuple[float, float] | None = None,
-    report: Path | None = None,
-    json: Path | None = None,
     jobs: int | None = None,
     dask: str | None = None,
     with_paper: bool = False,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> int:
     """Analyse a campaign, write its folder and its JSON, and print its tables.
 
@@ -39,23 +42,23 @@ def campaign_command(
     files : sequence of Path
     settings : WelchSettings
         Settings of the Welch fits.
+    outputs : Outputs
+        Its folder is by default ``campaign.report`` beside the first file, or if that exists
+        ``campaign.report-2`` and so on.
     structures : sequence of str
         Types fitted to the whole records.
     fixed : sequence of str
         Settings that those fits take from the files.
     band_hz : tuple of float, optional
         Band of all fits; by default what suits each record.
-    report : Path, optional
-        Folder, new or empty; by default ``campaign.report`` beside the first file, or if that
-        exists ``campaign.report-2`` and so on.
-    json : Path, optional
-        New file for all results; ``-`` for standard output, which then holds nothing else.
     jobs : int, optional
         Worker processes, by default one per core.
     dask : str, optional
         Address of a Dask scheduler to use instead.
     with_paper : bool
         Whether the paper's numbers stand beside these.
+    formats : sequence of str
+        Formats of the figures.
 
     Returns
     -------
@@ -71,8 +74,6 @@ def campaign_command(
     OutputExistsError, OutputError
         Something cannot be written.
     """
-    from rich.console import Console
-
     from analysis.campaigns import campaign
     from analysis.report import (
         campaign_document,
@@ -82,32 +83,36 @@ def campaign_command(
         write_new,
     )
 
-    first = files[0] if report is not None else files[0].with_name(_NAME)
-    (folder,) = report_folders([first], report)
+    first = files[0] if outputs.report is not None else files[0].with_name(_NAME)
+    (folder,) = report_folders([first], outputs.report, overwrite=outputs.overwrite)
     run = partial(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask,
     )  # fmt: skip
-    found = _analysed(run, len(files), folder, with_paper=with_paper)
-    to_stdout = json is not None and str(json) == "-"
-    console = Console(stderr=to_stdout, highlight=False)
-    if not console.is_terminal:
-        console = Console(stderr=to_stdout, highlight=False, width=_TEXT_WIDTH)
-    lines = [f"Report of the campaign: {folder}"]
-    if json is not None and not to_stdout:
+    found = _analysed(run, len(files), folder, outputs, with_paper=with_paper, formats=formats)
+    lines = [f"Report of the campaign: {folder / 'report.html'}"]
+    if outputs.json is not None and not outputs.json_to_stdout:
         # Before anything is said: the streams may take nothing.
-        write_new(json, document_text(campaign_document(found, with_paper=with_paper)))
-        lines.append(f"All results as JSON: {json}")
-    console.print(campaign_tables(found, with_paper=with_paper))
+        text = document_text(campaign_document(found, with_paper=with_paper))
+        write_new(outputs.json, text, overwrite=outputs.overwrite)
+        lines.insert(0, f"All results as JSON: {outputs.json}")
+    console = outputs.console()
+    console.print(campaign_tables(found, with_paper=with_paper, verbose=outputs.verbose))
     console.print("\n".join(lines), markup=False, soft_wrap=True)
-    if to_stdout:
+    if outputs.json_to_stdout:
         content = campaign_document(found, with_paper=with_paper)
         print(document_text(content, ascii_only=True), end="")  # noqa: T201 - what was asked for
     return 1 if found.failures or found.lost_trials else 0
 
 
 def _analysed(
-    run: Callable[..., CampaignResult], files: int, folder: Path, *, with_paper: bool
+    run: Callable[..., CampaignResult],
+    files: int,
+    folder: Path,
+    outputs: Outputs,
+    *,
+    with_paper: bool,
+    formats: Sequence[FigureFormat],
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from rich.console import Console
@@ -131,12 +136,12 @@ def _analysed(
         def on_progress(done: int, total: int, name: str) -> None:
             progress.update(bar, completed=done, total=total + _FIGURES, description=name)
 
-        with new_folder(folder) as part:
+        with new_folder(folder, overwrite=outputs.overwrite) as part:
             found = run(on_progress=on_progress)
             if len(found.sessions) == 1:
                 raise LoneSessionError(found.sessions[0].path, found.failures)
             write_campaign(
-                found, part, with_paper=with_paper,
+                found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
     for failure in found.failures:

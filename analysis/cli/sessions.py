@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -15,15 +16,86 @@ if TYPE_CHECKING:
 
     from analysis.results import RecordResult, Routes
 
+_TEXT_WIDTH: Final = 120
+"""Columns of what is printed into a file or a pipe."""
 _FIGURE_STEPS: Final = 4
 """How many times longer a figure takes than another step, roughly."""
+
+
+class NoSessionsError(ValueError):
+    """A folder without a session."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """What is written and printed.
+
+    Attributes
+    ----------
+    report : Path or None
+        Folder of the report, new or empty; by default beside the first file.
+    json : Path or None
+        New file for all results; ``-`` for standard output, which then holds nothing else.
+    overwrite : bool
+        Whether an earlier report, and earlier results in JSON, are replaced.
+    verbose : bool
+        Whether all tables are printed.
+    """
+
+    report: Path | None = None
+    json: Path | None = None
+    overwrite: bool = False
+    verbose: bool = False
+
+    @property
+    def json_to_stdout(self) -> bool:
+        """Whether standard output is for the results alone."""
+        return self.json is not None and str(self.json) == "-"
+
+    def console(self) -> Console:
+        """Return where people's text goes, in the report's width where that is no terminal."""
+        from rich.console import Console
+
+        console = Console(stderr=self.json_to_stdout, highlight=False)
+        if console.is_terminal:
+            return console
+        return Console(stderr=self.json_to_stdout, highlight=False, width=_TEXT_WIDTH)
+
+
+def session_files(paths: Sequence[Path]) -> list[Path]:
+    """Put in the place of each folder the sessions in it, by name; torn ones are left out.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files, which need not exist, and folders.
+
+    Raises
+    ------
+    NoSessionsError
+        A folder has no session in it.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        sessions = sorted(each for each in path.glob("*.mcap") if each.is_file())
+        if not sessions:
+            torn = any(path.glob("*.mcap.part"))
+            raise NoSessionsError(
+                f"{path}: there is no session (*.mcap) in this folder; give session files, or the "
+                "folder that holds them."
+                + (" Of a torn one (*.mcap.part) `rigd recover` makes a session." if torn else "")
+            )
+        found += sessions
+    return found
 
 
 def session_command(
     files: Sequence[Path],
     routes: Routes,
-    report: Path | None,
-    json: Path | None,
+    outputs: Outputs,
     rerun: Path | None = None,
     others: Mapping[str, str] | None = None,
 ) -> int:
@@ -33,10 +105,8 @@ def session_command(
     ----------
     files : sequence of Path
     routes : Routes
-    report : Path, optional
-        Folder of the report of one file, or of one folder per file.
-    json : Path, optional
-        New file for all results; ``-`` for standard output, which then holds nothing else.
+    outputs : Outputs
+        Its folder is that of the report of one file, or of one folder per file.
     rerun : Path, optional
         New file with session and fits for Rerun's viewer, of one session.
     others : mapping of str to str, optional
@@ -52,53 +122,52 @@ def session_command(
     OutputExistsError, OutputError
         Something cannot be written.
     """
-    from rich.console import Console
-
     from analysis.report import document, document_text, report_folders, write_new
 
-    folders = report_folders(files, report)
-    found, errors, code = _analyse_all(files, folders, routes, rerun)
+    folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
+    found, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
     if not found:
         return code
     results = document(found, {**(others or {}), **errors})
-    to_stdout = json is not None and str(json) == "-"
-    if json is not None and not to_stdout:
+    if outputs.json is not None and not outputs.json_to_stdout:
         # Before anything is said: the streams may take nothing.
-        write_new(json, document_text(results))
-    console = Console(stderr=to_stdout, highlight=False)
-    if not console.is_terminal:
-        console = Console(stderr=to_stdout, highlight=False, width=120)
-    _print_tables(console, found, single=len(files) == 1)
-    _say(console, "")
-    for file, folder in zip(files, folders, strict=True):
-        if str(file) not in errors:
-            _say(console, f"Report of {file}: {folder}")
+        write_new(outputs.json, document_text(results), overwrite=outputs.overwrite)
+    console = outputs.console()
+    _print_tables(console, found, single=len(files) == 1, verbose=outputs.verbose)
+    if outputs.json_to_stdout:
+        typer.echo(document_text(results, ascii_only=True), nl=False)
+    elif outputs.json is not None:
+        _say(console, f"All results as JSON: {outputs.json}")
     if rerun is not None:
         _say(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
-    if to_stdout:
-        typer.echo(document_text(results, ascii_only=True), nl=False)
-    elif json is not None:
-        _say(console, f"All results as JSON: {json}")
+    for file, folder in zip(files, folders, strict=True):
+        if str(file) not in errors:
+            page = folder / "report.html"
+            _say(console, f"Report of {file}: {page if page.exists() else folder}")
     return code
 
 
-def _print_tables(console: Console, results: Sequence[RecordResult], *, single: bool) -> None:
-    """Print all tables of a single file, of several those of the Welch fits together."""
-    from analysis.report import analysis_tables, record_text, summary_table
+def _print_tables(
+    console: Console, results: Sequence[RecordResult], *, single: bool, verbose: bool
+) -> None:
+    """Print what matters most of a single file, or all tables; of several a summary."""
+    from analysis.report import result_text, summary_table
 
     by_welch = [each for each in results if each.welch is not None]
     if single or not by_welch:
-        for whole in (each.whole for each in results):
-            if whole is not None:
-                console.print(record_text(whole))
-    if single and by_welch:
-        console.print(analysis_tables(*by_welch))
-    elif by_welch:
+        for each in results:
+            console.print(result_text(each, verbose=verbose))
+    else:
         console.print(summary_table(by_welch))
+        console.print("")
 
 
 def _analyse_all(
-    files: Sequence[Path], folders: Sequence[Path], routes: Routes, rerun: Path | None
+    files: Sequence[Path],
+    folders: Sequence[Path],
+    routes: Routes,
+    rerun: Path | None,
+    outputs: Outputs,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
     """Analyse and report every file; return results, message by failed file, and exit code."""
     from numpy.linalg import LinAlgError
@@ -132,7 +201,11 @@ def _analyse_all(
                 progress.update(task, advance=weight, description=f"{name}: {done}")
 
             try:
-                found.append(_analyse_file(file, folder, routes, rerun, on_step, tell))
+                found.append(
+                    _analyse_file(
+                        file, folder, routes, rerun, on_step, tell, overwrite=outputs.overwrite
+                    )
+                )
             except (
                 SessionError, RecordError, EstimateError, MeasurementError, OutputError,
                 MemoryError, LinAlgError,
@@ -171,16 +244,18 @@ def _analyse_file(
     rerun: Path | None,
     on_step: Callable[[str], None],
     tell: Callable[[str], None],
+    *,
+    overwrite: bool,
 ) -> RecordResult:
     from analysis.report import new_folder, write_report
     from analysis.results import record_result
 
     result = record_result(
-        file, routes, welch_required=rerun is not None, on_step=on_step,
+        file, routes, on_step=on_step,
         warn=lambda text: tell(f"Warning: {text}"),
     )  # fmt: skip
-    with new_folder(folder) as part:
-        write_report(result, part, on_step)
+    with new_folder(folder, overwrite=overwrite) as part:
+        write_report(result, part, on_step, formats=routes.figures)
     if rerun is not None:
         from analysis.report import write_rerun_file
 

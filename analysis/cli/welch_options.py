@@ -22,29 +22,35 @@ Band = Annotated[
     str | None,
     typer.Option(
         metavar="F0,F1",
-        help="Band that is fitted, in Hz, ends included.  [default: 0.5875,50 of a Welch "
-        "estimate, 0,50 of whole records, up to 0.4 of the record's rate]",
+        help="Band of the fits (Hz).  [default: 0,50; of Welch fits 0.5875,50; at most 0.4 of the "
+        "record's rate]",
     ),
 ]
 Estimator = Annotated[
     str,
     typer.Option(
         metavar="h1|h2|hv|iv|fft",
-        help="Estimator that is fitted: Welch's H1, H2 or Hv, Hiv with the reference as instrument "
-        "(not biased by noise that the controller feeds back), or one FFT of the whole record.",
+        help="Estimator of the response: Welch's H1, H2 or Hv; iv: instrumental variable, with the "
+        "reference as instrument (no bias from fed-back noise); fft: one FFT of the whole record.",
     ),
 ]
 Segment = Annotated[
     int | None,
-    typer.Option(min=2, help="Welch segment, samples.  [default: 17.266 s, the paper's]"),
+    typer.Option(
+        metavar="SAMPLES", min=2, help="Welch segment.  [default: 17.266 s, as in the paper]"
+    ),
 ]
 Overlap = Annotated[
     int | None,
-    typer.Option(min=0, help="Overlap, samples.  [default: 15 % of the segment]"),
+    typer.Option(
+        metavar="SAMPLES", min=0, help="Overlap of segments.  [default: 15 % of the segment]"
+    ),
 ]
 Nfft = Annotated[
     int | None,
-    typer.Option(min=2, max=_MAX_NFFT, help="Length of the transform, samples.  [default: 160 s]"),
+    typer.Option(
+        metavar="SAMPLES", min=2, max=_MAX_NFFT, help="Length of the transform.  [default: 160 s]"
+    ),
 ]
 
 

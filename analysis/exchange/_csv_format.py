@@ -20,11 +20,14 @@ from analysis.exchange._source import (
 from rigd.printable import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import BinaryIO, TextIO
 
     from analysis.exchange._table import Column, Table
+
+    _Reader = Callable[[str], float]
+    """Makes a number of a text, or raises ValueError."""
 
 
 # Reading
@@ -44,11 +47,14 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     The separator is a tab, a semicolon or a comma, the first of them that the first line has, or
     blanks if neither that line nor the next has any of them. A column is named as the first line
     names it, or ``#3`` for the third; a first line of numbers is the first sample. An empty cell
-    reads as NaN.
+    reads as NaN. Numbers have decimal points or, where the separator is another, decimal commas.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            return _read(path, _bounded_lines(path, stream), names)
+        try:
+            return _read(path, names, float)
+        except _DecimalCommaError:
+            # Anew, as a point in what was read so far may not be a decimal point.
+            return _read(path, names, _with_comma)
     except UnicodeDecodeError as error:
         raise ExchangeError(
             f"{path}: is not text in UTF-8 (byte {error.start}); save it as CSV in UTF-8."
@@ -57,7 +63,25 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
         raise ExchangeError(f"{path}: is not a CSV file ({error}).") from error
 
 
-def _read(path: Path, lines: Iterator[str], names: Sequence[str]) -> Mapping[str, SourceChannel]:
+class _DecimalCommaError(Exception):
+    """A decimal comma in a file that is being read as one with decimal points."""
+
+
+def _with_comma(text: str) -> float:
+    """Read a number with a decimal comma, if any; ValueError if it is none, as of `float`."""
+    if "." in text:
+        raise ValueError(text)
+    return float(text.replace(",", "."))
+
+
+def _read(path: Path, names: Sequence[str], number: _Reader) -> Mapping[str, SourceChannel]:
+    with path.open(encoding="utf-8-sig", newline="") as stream:
+        return _channels(path, _bounded_lines(path, stream), names, number)
+
+
+def _channels(
+    path: Path, lines: Iterator[str], names: Sequence[str], number: _Reader
+) -> Mapping[str, SourceChannel]:
     written = (line for line in lines if line.strip())
     first, second = next(written, None), next(written, "")
     if first is None:
@@ -65,7 +89,9 @@ def _read(path: Path, lines: Iterator[str], names: Sequence[str]) -> Mapping[str
     separator = _separator(first, second)
     rows = _rows(chain([first, second], written), separator)
     cells = [cell.strip() for cell in next(rows)]
-    if _is_sample(cells):
+    if separator != "," and not _is_sample(cells, number) and _is_sample(cells, _with_comma):
+        raise _DecimalCommaError
+    if _is_sample(cells, number):
         rows = chain([cells], rows)
         header = _numbers(len(cells))
     elif separator == _BLANKS:
@@ -83,9 +109,9 @@ def _read(path: Path, lines: Iterator[str], names: Sequence[str]) -> Mapping[str
             continue
         for column, append, name in wanted:
             try:
-                append(float(row[column]))
+                append(number(row[column]))
             except (ValueError, IndexError):
-                append(_odd_cell(path, row, column, name, separator, len(values[name])))
+                append(_odd_cell(path, row, column, name, len(values[name]), separator, number))
         if len(values[name]) > MAX_SAMPLES:
             check_samples(path, "The file", len(values[name]))
     return {name: SourceChannel(np.frombuffer(column)) for name, column in values.items()}
@@ -98,7 +124,7 @@ def _separator(first: str, second: str) -> str:
         return found
     in_second = any(mark in second for mark in _SEPARATORS)
     cells = (second or first).split()
-    blanks = not in_second and len(cells) > 1 and _is_sample(cells)
+    blanks = not in_second and len(cells) > 1 and _is_sample(cells, float)
     return _BLANKS if blanks else ","
 
 
@@ -112,10 +138,10 @@ def _numbers(count: int) -> list[str]:
     return [f"#{number}" for number in range(1, count + 1)]
 
 
-def _is_sample(cells: Sequence[str]) -> bool:
+def _is_sample(cells: Sequence[str], number: _Reader) -> bool:
     """Whether a line is one of numbers, some of which may be missing."""
     known = [cell for cell in cells if cell]
-    return bool(known) and all(map(_is_number, known))
+    return bool(known) and all(_is_number(cell, number) for cell in known)
 
 
 def _bounded_lines(path: Path, stream: TextIO) -> Iterator[str]:
@@ -144,7 +170,13 @@ def _column(path: Path, name: str, header: Sequence[str]) -> int:
 
 
 def _odd_cell(
-    path: Path, row: Sequence[str], column: int, name: str, separator: str, before: int
+    path: Path,
+    row: Sequence[str],
+    column: int,
+    name: str,
+    before: int,
+    separator: str,
+    number: _Reader,
 ) -> float:
     """Return NaN for an empty cell, and say what is wrong with any other that is no number."""
     place = f"sample {before + 1} of the column '{name}'"
@@ -156,9 +188,13 @@ def _odd_cell(
     cell = row[column].strip()
     if not cell:
         return float("nan")
-    if separator != "," and _is_number(cell.replace(",", ".", 1)):
+    if separator != "," and number is float and _is_number(cell, _with_comma):
+        raise _DecimalCommaError
+    if _is_number(cell, float):
         raise ExchangeError(
-            f"{path}: {place} is '{cell}', with a decimal comma; save the file with decimal points."
+            f"{path}: {place} is '{printable(cell, 40)}', with a decimal point, and other numbers "
+            "have decimal commas; save the file with one of them, and without separators between "
+            "thousands."
         )
     raise ExchangeError(
         f"{path}: {place} is '{printable(cell, 40)}' and not a number; below the line with the "
@@ -166,9 +202,9 @@ def _odd_cell(
     )
 
 
-def _is_number(text: str) -> bool:
+def _is_number(text: str, number: _Reader) -> bool:
     try:
-        float(text)
+        number(text)
     except ValueError:
         return False
     return True

@@ -24,7 +24,7 @@ from analysis.exchange._channels import (
 )
 from analysis.exchange._session_file import write_session
 from analysis.exchange._source import ExchangeError, read_source
-from analysis.record_checks import too_much_unknown
+from analysis.record_checks import first_mode_hz, too_much_unknown
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
 from rigd.printable import printable
 from rigd.session import Status
@@ -147,6 +147,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     remarks = dict.fromkeys(channel.remark for channel in channels.values() if channel.remark)
     warnings = [*remarks, *check_units(source, plan, channels)]
     base = timebase(source, plan, channels)
+    warnings += _check_rate(source, plan, base)
     segments = _segments(source, plan.segments_s, base.rate_hz, int(base.ticks[-1]) + 1)
     columns = _columns(plan, channels)
     del channels  # of the largest files, a quarter of a gigabyte
@@ -177,6 +178,30 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
         warnings,
     )
     return ImportedRecord(target, len(ticks), base.rate_hz, segments, tuple(warnings))
+
+
+def _check_rate(path: Path, plan: ImportPlan, base: Timebase) -> list[str]:
+    """Refuse a rate at which no record shows the beam; warn of a time next to none."""
+    beam, time = plan.specimen.beam, plan.time
+    first_hz, duration_s = first_mode_hz(beam), (int(base.ticks[-1]) + 1) / base.rate_hz
+    remedy = (
+        f"state the unit of '{time.channel}', which was taken to be {time.unit}, with --time "
+        f"{time.channel}:UNIT (s, ms, us, ns)"
+        if time
+        else "state the true rate with --rate-hz"
+    )
+    if first_hz >= base.rate_hz / 2:
+        raise ExchangeError(
+            f"{path}: the record lasts {duration_s:.6g} s at {base.rate_hz:g} Hz, but the first "
+            f"mode of this beam is at {first_hz:.3g} Hz, beyond the Nyquist frequency of "
+            f"{base.rate_hz / 2:g} Hz; {remedy}, or correct the beam in --profile."
+        )
+    if duration_s * first_hz < 1:
+        return [
+            f"The record lasts {duration_s:.3g} s at {base.rate_hz:g} Hz, less than one period of "
+            f"the first mode of this beam, {first_hz:.3g} Hz; if that is wrong, {remedy}."
+        ]
+    return []
 
 
 def _columns(
@@ -254,6 +279,7 @@ def _metadata(
         "tool_inertia_kg_m2": plan.specimen.tool_inertia_kg_m2,
         "angle_delay_s": plan.angle_delay_s,
         "torque_delay_s": plan.torque_delay_s,
+        **{f"uncertainty_{k}_percent": v for k, v in plan.specimen.uncertainty_percent.items()},
     }
     with source.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()

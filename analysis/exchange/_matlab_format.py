@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from analysis.exchange._source import (
     ExchangeError,
@@ -12,6 +15,8 @@ from analysis.exchange._source import (
     check_samples,
     no_such_channel,
 )
+from rigd.session import META_PREFIX, NOTES
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Mapping, Sequence
@@ -161,17 +166,43 @@ def _hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  
 
 
 def write_mat(table: Table, stream: BinaryIO) -> None:
-    """Write each column as a variable of its name, n×1, and ``information``, a struct of texts."""
+    """Write each column as a variable of its name, n×1, and ``information``, a struct.
+
+    Its fields are numbers where the information is one, rows where it is several with commas
+    between them, otherwise texts.
+    """
     from scipy.io import savemat
 
     variables = {column.name: column.values for column in (table.axis, *table.columns)}
     savemat(
         stream,
-        {**variables, "information": {_identifier(k): v for k, v in table.information.items()}},
+        {
+            **variables,
+            "information": {_identifier(k): _value(k, v) for k, v in table.information.items()},
+        },
         long_field_names=True,
         do_compression=True,
         oned_as="column",
     )
+
+
+_WORDS: Final = ("id", *NOTES)
+_NUMBER: Final = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)")
+_LARGEST_EXACT: Final = 2**53
+"""From here on not every whole number is a double."""
+
+
+def _value(key: str, text: str) -> str | float | NDArray[Any]:
+    """Return what a text of the session's metadata stands for."""
+    parts = [part.strip() for part in text.split(",")]
+    words = key in _WORDS or (key.startswith(META_PREFIX) and not unit_of(key))
+    if words or not all(map(_NUMBER.fullmatch, parts)):
+        return text
+    if len(parts) > 1:
+        return np.array([list(map(float, parts))])
+    if text.strip().isdecimal() and _LARGEST_EXACT < int(text) < 2**63:
+        return np.array([[int(text)]], dtype=np.int64)
+    return float(text)
 
 
 def _identifier(key: str) -> str:

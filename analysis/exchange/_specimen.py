@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.exchange._source import ExchangeError
+from analysis.record_checks import MAX_UNCERTAINTY_PERCENT, SCALES
 from rigd.beam import Beam
 from rigd.units import unit_of
 
@@ -27,14 +28,17 @@ class Specimen:
     beam : Beam
     tool_inertia_kg_m2 : float
         Inertia about the motor's axis of what sits between torque sensor and beam.
+    uncertainty_percent : mapping of str to float
+        Relative standard uncertainties of `analysis.record_checks.SCALES`, those stated.
     """
 
     beam: Beam
     tool_inertia_kg_m2: float = 0.0
+    uncertainty_percent: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_specimen(path: Path) -> Specimen:
-    """Read ``[beam]`` and, if it is there, ``[sensor] tool_inertia_kg_m2``.
+    """Read ``[beam]`` and, if there are any, ``[sensor] tool_inertia_kg_m2``, ``[uncertainty]``.
 
     A number stands by itself or, as in a profile, as ``{ value = 0.98, source = "measured" }``.
     Nothing else of a profile is used: delays, rate and limits are those of the rig's own recorder.
@@ -61,7 +65,9 @@ def read_specimen(path: Path) -> Specimen:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise ExchangeError(f"{path}: is not a TOML file ({error}).") from error
-    beam, sensor = (_section(path, content, name) for name in ("beam", "sensor"))
+    beam, sensor, uncertainty = (
+        _section(path, content, name) for name in ("beam", "sensor", "uncertainty")
+    )
     tool_inertia_kg_m2 = 0.0
     if "tool_inertia_kg_m2" in sensor:
         tool_inertia_kg_m2 = _number(path, "sensor", sensor, "tool_inertia_kg_m2")
@@ -77,6 +83,11 @@ def read_specimen(path: Path) -> Specimen:
             bending_stiffness_n_m2=_positive(path, beam, "bending_stiffness_n_m2"),
         ),
         tool_inertia_kg_m2,
+        {
+            name: _uncertainty_percent(path, uncertainty, key)
+            for name in SCALES
+            if (key := f"{name}_percent") in uncertainty
+        },
     )
 
 
@@ -94,6 +105,16 @@ def _positive(path: Path, section: Mapping[str, Any], key: str) -> float:
             f"{path}: beam.{key} is {value:g} {unit_of(key)}, but must be positive."
         )
     return value
+
+
+def _uncertainty_percent(path: Path, section: Mapping[str, Any], key: str) -> float:
+    percent = _number(path, "uncertainty", section, key)
+    if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
+        raise ExchangeError(
+            f"{path}: uncertainty.{key} is {percent:g} %, but must lie between 0 and "
+            f"{MAX_UNCERTAINTY_PERCENT:g}."
+        )
+    return percent
 
 
 def _number(path: Path, name: str, section: Mapping[str, Any], key: str) -> float:

@@ -45,7 +45,13 @@ from ._result import ModeEstimate as ModeEstimate
 from ._result import RecordAnalysis as RecordAnalysis
 from ._result import RecordFit as RecordFit
 from ._result import Ringing as Ringing
+from ._scales import SCALE_EXPONENTS as SCALE_EXPONENTS
+from ._scales import DensityCheck as DensityCheck
+from ._scales import density_check as density_check
+from ._scales import scales_absorbed as scales_absorbed
+from ._scales import with_scales as with_scales
 from ._select import Selection as Selection
+from ._select import freest_alone as freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size
 from ._verdict import EVEN as EVEN

@@ -106,8 +106,7 @@ class CandidateSet:
         """
         if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
             # No beam explains such a record: one structure shows what remains as well as all.
-            found = fit_record(measurement, (_FREEST,), fixed=fixed, band_hz=band_hz)
-            return replace(cls._uniform(found, fixed), misread=misread)
+            return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
         field = cls._uniform(fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed)
         field = field._without_leakage()
         likeliest = field.likeliest
@@ -118,6 +117,24 @@ class CandidateSet:
                 else field._with_modes_searched(measurement, fixed, band_hz)
             )
         return with_extras(field.cross_checked())
+
+    @classmethod
+    def of_freest(
+        cls,
+        measurement: Measurement,
+        fixed: tuple[Setting, ...],
+        band_hz: tuple[float, float],
+    ) -> CandidateSet:
+        """Fit nothing but the structure with every order free, on a uniform beam.
+
+        Raises
+        ------
+        MeasurementError
+            The record cannot be used.
+        """
+        return cls._uniform(
+            fit_record(measurement, (_FREEST,), fixed=fixed, band_hz=band_hz), fixed
+        )
 
     @classmethod
     def _uniform(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._noise import Noise
-from analysis.statistics import chi_square_p_value
+from analysis.statistics import chi_square_p_value, nrmse_percent
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -208,3 +208,20 @@ class RecordAnalysis:
         """The noise as the fits had it: the power of each bin."""
         scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
         return Noise(self.noise_nm2_per_hz * scale, self.compared, self.lines)
+
+    def fit_percent(self, fit: RecordFit) -> float:
+        """Fit of one of the models to the measured torque in the band (`nrmse_percent`).
+
+        Hum is no part of that torque, and at its lines nothing is compared; a decay that began
+        before the record counts as explained, as initial conditions do.
+
+        Parameters
+        ----------
+        fit : RecordFit
+            One of `fits`, or one under the same noise.
+        """
+        comparison, noise = self.comparison, self.noise
+        torque_nm = comparison.torque_nm[comparison.kept] + comparison.apart_nm - comparison.hum_nm
+        measured = comparison.spectrum(torque_nm)[noise.counts]
+        residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]
+        return nrmse_percent(residual, measured)

@@ -18,6 +18,7 @@ from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
 from ._text import analysis_tables as analysis_tables
 from ._text import record_text as record_text
+from ._text import result_text as result_text
 from ._text import summary_table as summary_table
 from ._write import figures_of_paper as figures_of_paper
 from ._write import write_report as write_report

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
@@ -11,14 +11,16 @@ from analysis.identify import LOGARITHMIC, ResponseGrid
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
-    from analysis.identify import RecordAnalysis
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from analysis.identify import Plant, RecordAnalysis
+    from analysis.models import Structure
     from analysis.record import Record
     from analysis.results import WholeRecord
 
     Band = tuple[float, float]
-    from numpy.typing import NDArray
-
-    from analysis.identify import Plant, RecordFit
 
     Real = NDArray[np.float64]
 
@@ -84,6 +86,53 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     return float(edges_hz[loud[0] * _BLOCK]), float(edges_hz[(loud[-1] + 1) * _BLOCK - 1])
 
 
+class Estimate(Protocol):
+    """Fitted plant with the covariance of its parameters, as a `RecordFit` has them."""
+
+    @property
+    def structure(self) -> Structure:
+        """Which damping it has."""
+
+    @property
+    def plant(self) -> Plant:
+        """What was found."""
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """The same by name."""
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Parameters in the order of the covariance."""
+
+    @property
+    def covariance(self) -> Real:
+        """Covariance of these; of positive ones that of the logarithms."""
+
+
+_GRID_POINTS: Final = 900
+
+
+def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Real:
+    """Frequencies that are dense over a band and denser at the peaks, which are narrow.
+
+    Parameters
+    ----------
+    first_hz, last_hz : float
+        Ends of the band, positive.
+    peaks_hz : sequence of float
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    everywhere = np.geomspace(first_hz, last_hz, _GRID_POINTS)
+    offsets = np.geomspace(1e-4, 0.1, 40)
+    near = [peak * (1 + np.r_[-offsets, 0.0, offsets]) for peak in peaks_hz]
+    grid = np.unique(np.concatenate([everywhere, *near]))
+    return np.asarray(grid[(grid >= first_hz) & (grid <= last_hz)])
+
+
 _QUARTER_TURN: Final = np.pi / 2
 _GRADIENT_NAMES: Final = {
     "density_over_stiffness": "ln_density_over_stiffness",
@@ -116,12 +165,12 @@ class ResponseBand:
         return _limits(np.abs(self.response), self.log_magnitude_std)
 
 
-def response_band(fit: RecordFit, frequency_hz: Real) -> ResponseBand:
+def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     """Propagate a fit's covariance to its frequency response.
 
     Parameters
     ----------
-    fit : RecordFit
+    fit : Estimate
     frequency_hz : ndarray, shape (n,)
         Positive.
 
@@ -190,12 +239,12 @@ class LossFactors:
     total: LossFactor
 
 
-def loss_factors(fit: RecordFit, frequency_hz: Real) -> LossFactors:
+def loss_factors(fit: Estimate, frequency_hz: Real) -> LossFactors:
     """Loss factors of a fit with their uncertainty.
 
     Parameters
     ----------
-    fit : RecordFit
+    fit : Estimate
     frequency_hz : ndarray, shape (n,)
         Positive.
 
@@ -250,7 +299,7 @@ def _loss(
     return lost / rest, (1 / rest, by_order)
 
 
-def _rows(fit: RecordFit, slopes: dict[str, Real], points: int) -> Real:
+def _rows(fit: Estimate, slopes: dict[str, Real], points: int) -> Real:
     """Slopes in the order of the fit's covariance, shape (k, n)."""
     return np.array([slopes.get(name, np.zeros(points)) for name in fit.determined]).reshape(
         len(fit.determined), points

@@ -19,7 +19,9 @@ from analysis.report._pooled_tables import (
     structures_table,
 )
 from analysis.report._specimen_tables import homogeneity_table, specimens_table
-from analysis.report._table import ABSENT, WORDS, Cell, Column, Row, Table
+from analysis.report._table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
+from rigd.session import META_PREFIX
+from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult, SessionResult
@@ -41,6 +43,14 @@ def shown_tables(campaign: CampaignResult) -> tuple[Table, ...]:
         *([validation_summary(campaign)] if campaign.validation else []),
         *([] if found.mixed else scatter),
     )
+
+
+def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
+    """Tables that the terminal shows unasked: pooled modes and parameters."""
+    if campaign.headline is None:
+        return ()
+    modes = [modes_table(campaign)] if campaign.headline.modes else []
+    return (*modes, pooled_table(campaign, campaign.headline))
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
@@ -66,12 +76,21 @@ def session_list_table(campaign: CampaignResult) -> Table:
     def said(text: str) -> Cell:
         return Cell(text, text or ABSENT)
 
-    headings = ("file", "recorded (UTC)", "specimen", "operator", "note", "used")
-    keys = ("file", "start_utc", "specimen", "operator", "note", "used")
+    headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
+    keys = ("file", "start_utc", "specimen", "operator", "note")
+    stated = (
+        *(each.experiment for each in campaign.sessions),
+        *(each.experiment for each in campaign.failures),
+    )
+    added = dict.fromkeys(name for its in stated if its for name in its.added)
     return Table.of(
         "session_list",
         "Sessions, as their files state them",
-        [Column(heading, key, WORDS) for heading, key in zip(headings, keys, strict=True)],
+        (
+            *(Column(heading, key, WORDS) for heading, key in zip(headings, keys, strict=True)),
+            *map(_added_column, added),
+            Column("used", "used", WORDS),
+        ),
         (
             (
                 Cell(str(each.path), each.path.name),
@@ -79,6 +98,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
                 said(its.label if its else ""),
                 said(its.operator if its else ""),
                 said(its.note if its else ""),
+                *(_added_cell(its.added.get(name) if its else None) for name in added),
                 used,
             )
             for used, group in ((True, campaign.sessions), (False, campaign.failures))
@@ -88,8 +108,21 @@ def session_list_table(campaign: CampaignResult) -> Table:
     )
 
 
+def _added_column(name: str) -> Column:
+    """Column of metadata that users added, with the unit that its name ends in."""
+    unit = unit_of(name)
+    words = name.removesuffix(suffix_of(name)).replace("_", " ")
+    return Column(f"{words} ({unit})" if unit else words, f"{META_PREFIX}{name}", WORDS)
+
+
+def _added_cell(value: float | str | None) -> Cell:
+    if value is None:
+        return Cell(None, ABSENT)
+    return Cell(value, value if isinstance(value, str) else f"{value:g}")
+
+
 def sessions_welch_table(campaign: CampaignResult) -> Table:
-    """Every session's fits by the paper's route, and the nominal models' distance from it."""
+    """Every session's Welch fits, and the distance of the nominal models."""
     rows = [
         {
             "file": str(session.path),
@@ -115,7 +148,7 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
             "uniform": each.uniform,
             **each.parameters,
             **{
-                f"{name}_std": value if name in each.free else None
+                _std_key(name): value if name in each.free else None
                 for name, value in each.std.items()
             },
             "cost": each.cost,
@@ -127,6 +160,12 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
         for each in session.record_estimates
     ]
     return _for_programs("sessions_record", rows)
+
+
+def _std_key(parameter: str) -> str:
+    """Name the standard deviation of a parameter, whose unit stands last: ``delay_std_s``."""
+    unit = suffix_of(parameter)
+    return f"{parameter.removesuffix(unit)}_std{unit}"
 
 
 def _for_programs(name: str, rows: list[dict[str, Any]]) -> Table:
@@ -144,6 +183,7 @@ def validation_table(campaign: CampaignResult) -> Table:
             "weighting": each.weighting,
             "error": each.error,
             "own_error": each.own_error,
+            "nrmse_percent": None if each.own_error is None else 100 * (1 - each.own_error),
             "lost": None,
         }
         for each in campaign.validation
@@ -153,7 +193,7 @@ def validation_table(campaign: CampaignResult) -> Table:
 
 
 def validation_summary(campaign: CampaignResult) -> Table:
-    """Error of each model over the sessions that it was to predict, the best model first."""
+    """Fit, and leave-one-out error, of each model over the sessions, the best model first."""
     rows: list[Row] = []
     for method, name, weighting, errors in by_model(campaign.validation):
         values = [each.error for each in errors]
@@ -164,22 +204,26 @@ def validation_summary(campaign: CampaignResult) -> Table:
                 "type": name,
                 "weighting": weighting or "",
                 "sessions": f"{len(values)} of {campaign.trials}",
+                "nrmse_percent": 100 * (1 - float(np.mean(own))) if own else None,
+                "own_error": float(np.mean(own)) if own else None,
                 "error": float(np.mean(values)),
                 "worst": max(values),
-                "own_error": float(np.mean(own)) if own else None,
             }
         )
     return Table(
         "validation",
-        "Each session predicted from the others: rms error of the torque",
+        "Leave-one-out validation: rms error of the torque, mean over the sessions",
         (
             Column("method", "method", WORDS), *NAMES, Column("sessions", "sessions"),
-            Column("mean (%)", "error", ".2f", 100.0), Column("worst (%)", "worst", ".2f", 100.0),
-            Column("session's own fit (%)", "own_error", ".2f", 100.0),
+            Column("fit (NRMSE, %)", "nrmse_percent", ".2f"),
+            Column("in-sample error (%)", "own_error", ".2f", 100.0),
+            Column("leave-one-out error (%)", "error", ".2f", 100.0),
+            Column("worst (%)", "worst", ".2f", 100.0),
         ),
         tuple(rows),
         (
-            "The session's own whole-record fit has the noise in it, too: nothing predicts better.",
+            "Fit: 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖), each session by its own whole-record fit: "
+            "100 % less the in-sample error. Both errors include the noise of the torque.",
             *lost_trials(campaign.lost_trials, campaign.trials),
         ),
     )  # fmt: skip
@@ -190,30 +234,42 @@ def sessions_table(campaign: CampaignResult) -> Table:
     leading = campaign.homogeneity.leading
     groups = leading.groups if leading else ()
     group_of = {name: f"{place}" for place, names in enumerate(groups, 1) for name in names}
+    name = campaign.headline.name if campaign.headline else None
+    tried = {each.path: each for each in campaign.validation if each.name == name}
 
-    def row(session: SessionResult) -> tuple[str, ...]:
-        verdict = session.verdict
+    def row(session: SessionResult) -> tuple[Entry, ...]:
+        verdict, trial = session.verdict, tried.get(session.path)
+        own = trial.own_error if trial else None
         found = [each.kind for each in verdict.findings] if verdict else []
         return (
             session.path.name,
             f"type {session.selected}" if session.selected else ABSENT,
+            None if own is None else 100 * (1 - own),
+            trial.error if trial else None,
             ABSENT if verdict is None else "noise" if verdict.adequate else "more than noise",
             ", ".join(dict.fromkeys(found)) or ABSENT,
         )
 
-    left_out = [(each.path.name, "left out", ABSENT, each.message) for each in campaign.failures]
+    left_out: list[tuple[Entry, ...]] = [
+        (each.path.name, "left out", None, None, ABSENT, each.message) for each in campaign.failures
+    ]
     return Table.of(
         "sessions",
-        "Sessions, and what each says by itself",
+        "Sessions, each by itself",
         (
             Column("file", "file", WORDS), Column("selects", "selected", WORDS),
+            Column("fit (NRMSE, %)" if tried else "", "nrmse_percent", ".2f"),
+            Column("leave-one-out error (%)" if tried else "", "error", ".2f", 100.0),
             Column("residual", "left", WORDS),
             Column("other effects", "findings", WORDS),
             Column("group" if groups else "", "group", WORDS),
         ),
         (
-            (*cells, group_of.get(cells[0], ABSENT))
+            (*cells, group_of.get(str(cells[0]), ABSENT))
             for cells in (*map(row, campaign.sessions), *left_out)
         ),
-        (f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else (),
+        (
+            *((f"Fit and error: of type {name}.",) if tried else ()),
+            *((f"Group: by the {label(leading.quantity)[0]}.",) if leading and groups else ()),
+        ),
     )  # fmt: skip

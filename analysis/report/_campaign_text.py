@@ -8,7 +8,7 @@ from rich.console import Group
 from rich.text import Text
 
 from analysis.campaigns import lost_trials, specimens
-from analysis.report._campaign_tables import shown_tables
+from analysis.report._campaign_tables import main_tables, shown_tables
 from analysis.report._paper_tables import paper_tables
 from analysis.report._text import as_text, spaced
 
@@ -34,7 +34,9 @@ def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     )
 
 
-def campaign_tables(campaign: CampaignResult, *, with_paper: bool = False) -> RenderableType:
+def campaign_tables(
+    campaign: CampaignResult, *, with_paper: bool = False, verbose: bool = True
+) -> RenderableType:
     """Return the verdict, what it rests on, and the paper's Tables 3 to 5.
 
     Parameters
@@ -42,6 +44,9 @@ def campaign_tables(campaign: CampaignResult, *, with_paper: bool = False) -> Re
     campaign : CampaignResult
     with_paper : bool
         Whether the paper's numbers stand beside these.
+    verbose : bool
+        Whether all tables are shown; otherwise, beside the verdict, the pooled modes and parameters
+        are, and the tables of the paper if its numbers are to stand beside them.
     """
     parts: list[RenderableType] = []
     said = campaign_sentences(campaign)
@@ -52,7 +57,9 @@ def campaign_tables(campaign: CampaignResult, *, with_paper: bool = False) -> Re
             parts.append(Text("What would tell more:"))
             parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]
         parts.append("")
-    parts += spaced((*shown_tables(campaign), *paper_tables(campaign, with_paper=with_paper)))
+    parts += spaced(shown_tables(campaign) if verbose else main_tables(campaign))
+    if verbose or with_paper or campaign.headline is None:
+        parts += spaced(paper_tables(campaign, with_paper=with_paper))
     parts += [
         Text(f"Warning: {session.path.name}: {warning}", style="yellow")
         for session in campaign.sessions

@@ -18,18 +18,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
-from analysis.identify import ResponseGrid, headline_json
+from analysis.identify import ResponseGrid, headline_json, scales_absorbed, with_scales
 from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
 from analysis.report._bands import loss_factors, response_band, supported_band_hz
 from analysis.report._table import unreported
+from analysis.statistics import nrmse_percent
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from analysis.identify import DampingSize, RecordFit
+    from analysis.identify import DampingSize, Quantity, RecordFit
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._bands import LossFactor
@@ -84,6 +85,38 @@ def _indices(measured: FrequencyResponse, model: NDArray[np.complex128]) -> Inde
     return asdict(fit_indices(omega, measured.response[known], model[known]))
 
 
+def combined_parameters(whole: WholeRecord) -> dict[str, Quantity]:
+    """Widen the parameters' intervals by the scales' uncertainty.
+
+    Parameters
+    ----------
+    whole : WholeRecord
+
+    Returns
+    -------
+    dict of str to Quantity
+        Those that a scale acts on whose uncertainty the file states.
+    """
+    if not scales_absorbed(whole.fit):
+        return {}
+    return with_scales(whole.headline.parameters, whole.record.uncertainty)
+
+
+def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
+    """Fit of a Welch fit's model to the response that it was fitted to (`nrmse_percent`).
+
+    Parameters
+    ----------
+    analysis : WelchAnalysis
+    model : FittedModel
+        One of its models.
+    """
+    measured = analysis.response.response
+    known = np.isfinite(measured)
+    measured, modelled = measured[known], model.response[known]
+    return nrmse_percent(measured - modelled, measured - measured.mean())
+
+
 _CURVE_POINTS = 200
 
 
@@ -124,7 +157,11 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
     file = str(whole.record.path)
     verdict = whole.verdict
     return {
-        "headline": headline_json(file, whole.headline, whole.orders, verdict.findings),
+        "headline": {
+            **headline_json(file, whole.headline, whole.orders, verdict.findings),
+            "scale_uncertainty": dict(whole.record.uncertainty),
+            "combined": {n: each.as_json() for n, each in combined_parameters(whole).items()},
+        },
         "fits": [
             {
                 **name,
@@ -138,6 +175,7 @@ def record_entries(whole: WholeRecord, welch: WelchAnalysis | None) -> dict[str,
                 "cost": fit.cost,
                 "degrees_of_freedom": fit.degrees_of_freedom,
                 "at_bounds": list(fit.at_bounds),
+                "nrmse_percent": whole.analysis.fit_percent(fit),
                 "determined": list(fit.determined),
                 "covariance": fit.covariance.tolist(),
                 "internal_size": _size(fit.internal),
@@ -356,6 +394,7 @@ def _fit(analysis: WelchAnalysis, model: FittedModel, withheld: Collection[str])
         else {name: std if name in fit.structure.free else None for name, std in fit.std.items()},
         "cost": fit.cost,
         "at_bounds": list(fit.at_bounds),
+        "nrmse_percent": response_fit_percent(analysis, model),
         "indices": asdict(model.indices),
     }
 

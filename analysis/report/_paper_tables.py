@@ -149,8 +149,8 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
                     name: value
                     for each in model.deviations
                     for name, value in (
-                        (f"mdr_omega{each.mode}_rad_s", each.frequency_rad_s),
-                        (f"mdr_magnitude{each.mode}_db", each.magnitude_db),
+                        (f"mdr_omega_{each.mode}_rad_s", each.frequency_rad_s),
+                        (f"mdr_magnitude_{each.mode}_db", each.magnitude_db),
                     )
                 },
                 **_papers(theirs),

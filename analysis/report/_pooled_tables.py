@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns import MIXTURE_NOTE, label, title, with_unit
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     )
 
 NOT_POOLED: Final = (
-    "In grey: not pooled, since fewer than two sessions determine its damping, or not all tried it."
+    "In grey: not pooled, as fewer than two sessions determine its damping or not all were fitted."
 )
 
 
@@ -57,19 +57,19 @@ def structures_table(campaign: CampaignResult) -> Table:
 
     return Table(
         "structures",
-        title("Structures on the whole records of all sessions together", campaign.homogeneity),
+        title("Structures, whole records of all sessions together", campaign.homogeneity),
         (
             Column("type", "type", WORDS),
             Column("sessions fitted", "fitted"),
-            Column("that determine it", "sessions"),
-            Column("that select it alone", "selected_alone"),
-            Column("BIC above the lowest", "bic_above_lowest"),
+            Column("damping determined in", "sessions"),
+            Column("selected in", "selected_alone"),
+            Column("ΔBIC", "bic_above_lowest"),
             Column("residual (noise = 1)", "misfit"),
         ),
         tuple(map(row, campaign.structures)),
         (
-            "Damping and the modes' offsets are the specimen's, one value for all sessions (and a "
-            "scatter between them, where they differ); settings of the rig are each session's.",
+            "Damping and stiffness corrections have one value for all sessions, with a scatter "
+            "between sessions where they differ; settings of the rig have one per session.",
             *(() if all(each.pooled for each in campaign.structures) else (NOT_POOLED,)),
         ),
         selected=0 if campaign.pooled else None,
@@ -105,7 +105,7 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         Column("pooled", "value"), Column("std", "std", spread=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column("one session's std", "within_std"), Column("between sessions", "between_std"),
-        Column("p", "chance"),
+        Column("p", "p_value"),
     )  # fmt: skip
     if only is None:
         pooled = sorted(campaign.pooled, key=lambda each: each is not headline)
@@ -132,10 +132,10 @@ def pooled_table(campaign: CampaignResult, only: PooledEstimate | None = None) -
         return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
     role = "freest structure"
     if only is not headline:
-        role = "lowest BIC, conditional on its being the true one"
+        role = "lowest BIC; valid only if it is the true one"
     notes = [
-        "One session's std: what a session states as its own. Between sessions: scatter beyond "
-        "that. p: probability of so much scatter by the sessions' own uncertainties alone. "
+        "One session's std: standard deviation that a typical session states. Between sessions: "
+        "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
         f"Residual {only.misfit:.4g} times the noise."
     ]
     if unreported(STRUCTURES[only.structure], withheld):
@@ -181,7 +181,7 @@ def _pooled_row(
         "high_95": high,
         "within_std": number(each.within_std, ".2g", factor),
         "between_std": number(each.between_std, ".2g", factor),
-        "chance": chance_cell(each.chance),
+        "p_value": chance_cell(each.chance),
         "next_low_95": each.next_interval[0],
         "next_high_95": each.next_interval[1],
         "reported": reported,
@@ -194,7 +194,7 @@ def modes_table(campaign: CampaignResult) -> Table:
     found = campaign.homogeneity
     rows: list[Row] = []
     for mode in campaign.headline.modes if campaign.headline else ():
-        shown: dict[str, Entry] = {"number": mode.number}
+        shown: dict[str, Entry] = {"mode": mode.number}
         for name, std, between, factor in (
             ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
             ("damping_ratio", "damping_ratio_std", "damping_ratio_between_std", 100.0),
@@ -206,7 +206,7 @@ def modes_table(campaign: CampaignResult) -> Table:
             shown[between] = number(getattr(mode, between), ".2g", factor)
         rows.append(
             {
-                **{name: shown[name] for name in asdict(mode)},
+                **shown,
                 "frequency_mixture": found.is_mixed(f"frequency_hz_{mode.number}"),
                 "damping_ratio_mixture": found.is_mixed(f"damping_ratio_{mode.number}"),
             }
@@ -214,9 +214,9 @@ def modes_table(campaign: CampaignResult) -> Table:
     mixed = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
     return Table(
         "pooled_modes",
-        title("Modes of the beam on a motor that stands still, mean of the sessions", found),
+        title("Modes with locked hub (clamped–free), mean of the sessions", found),
         (
-            Column("mode", "number"),
+            Column("mode", "mode"),
             Column("frequency (Hz)", "frequency_hz"),
             Column("std", "frequency_std_hz", spread=True),
             Column("between sessions", "frequency_between_std_hz"),

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_SHIFT
+from analysis.report._document import combined_parameters, response_fit_percent
+from analysis.report._scales import scale_notes
 from analysis.report._table import (
     ABSENT,
     MARK,
@@ -62,34 +64,51 @@ def modes_table(whole: WholeRecord) -> Table:
             Column("std (Hz)", "frequency_std_hz"),
             Column("Damping ratio (%)", "damping_ratio"),
             Column("std (%)", "damping_ratio_std"),
-            Column("95 % from (%)", "damping_ratio_low"),
-            Column("to (%)", "damping_ratio_high"),
+            Column("95 % from (%)", "damping_ratio_low_95"),
+            Column("to (%)", "damping_ratio_high_95"),
         ),
         rows,
-        _reasons(mode.damping_ratio for mode in told.modes),
+        (
+            "Intervals are statistical only; no torque scale, length or density acts on "
+            "frequencies and damping ratios.",
+            *_reasons(mode.damping_ratio for mode in told.modes),
+        ),
     )
 
 
 def parameters_table(whole: WholeRecord) -> Table:
-    """All parameters with their uncertainty; those with a flag are marked, with the reason."""
+    """All parameters with their uncertainty; those with a flag are marked, with the reason.
+
+    Where the file states how well the scales are known, the intervals that include them stand
+    beside the statistical ones.
+    """
     told = whole.headline
+    combined = combined_parameters(whole)
+    including_scales = (
+        Column("", "combined_std"),
+        Column("with scales: from", "combined_low_95"),
+        Column("to", "combined_high_95"),
+    )
     return Table.of(
         "parameters",
         f"Parameters, type {told.name}",
         (
             Column("Parameter", "parameter", WORDS),
             Column("Meaning", "meaning", WORDS),
-            Column("Unit shown", "unit_shown", WORDS),
-            Column("Value", "value_si"),
-            Column("std", "std_si"),
-            Column("95 % from", "low_si"),
-            Column("to", "high_si"),
+            Column("Unit", "unit", WORDS),
+            Column("Value", "value"),
+            Column("std", "std"),
+            Column("95 % from", "low_95"),
+            Column("to", "high_95"),
+            *(including_scales if combined else ()),
             Column("Remark", "remark", WORDS),
         ),
-        (_parameter_row(told, name, each) for name, each in told.parameters.items()),
+        (_parameter_row(told, name, each, combined) for name, each in told.parameters.items()),
         (
             "std is one standard deviation; intervals of ζ, γ, ρ/EI and EI are symmetric in the "
-            "logarithm. The CSV file has SI units.",
+            f"logarithm. The CSV file has SI units. Fit {whole.analysis.fit_percent(told.fit):.2f} "
+            "% (NRMSE).",
+            *scale_notes(whole),
             *((_MARKED,) if told.flags else ()),
         ),
     )
@@ -108,8 +127,8 @@ def sizes_table(whole: WholeRecord) -> Table:
             Column("Value", "value"),
             Column("std", "std"),
             Column("std (%)", "relative_std"),
-            Column("95 % from", "low"),
-            Column("to", "high"),
+            Column("95 % from", "low_95"),
+            Column("to", "high_95"),
         ),
         (_size_row(told, each) for each in told.sizes),
         (
@@ -132,8 +151,8 @@ def condition_table(whole: WholeRecord) -> Table | None:
         free = told.parameters[name]
         rows.append(
             (
-                symbol,
-                unit,
+                Cell(name, symbol),
+                _unit_cell(unit),
                 *estimate((each.value, *_ends(each)), each.std, factor),
                 *estimate((free.value, *_ends(free)), free.std, factor),
             )
@@ -143,13 +162,13 @@ def condition_table(whole: WholeRecord) -> Table | None:
         f"If {taken or 'the rest'} is taken for granted: type {simpler.name}, which suffices",
         (
             Column("Parameter", "parameter", WORDS),
-            Column("Unit shown", "unit_shown", WORDS),
-            Column("Then", "value_si"),
-            Column("95 % from", "low_si"),
-            Column("to", "high_si"),
-            Column("Free", "free_value_si"),
-            Column("95 % from", "free_low_si"),
-            Column("to", "free_high_si"),
+            Column("Unit", "unit", WORDS),
+            Column("Then", "value"),
+            Column("95 % from", "low_95"),
+            Column("to", "high_95"),
+            Column("Free", "free_value"),
+            Column("95 % from", "free_low_95"),
+            Column("to", "free_high_95"),
         ),
         rows,
         ("The intervals on the left hold only if what is taken for granted is true.",),
@@ -168,20 +187,43 @@ def correlations_table(whole: WholeRecord) -> Table:
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
         ),
         (
-            (symbol, *(_correlation(i == j, value) for j, value in enumerate(row)))
-            for i, (symbol, row) in enumerate(zip(symbols, fit.correlation.tolist(), strict=True))
+            (Cell(name, symbol), *(_correlation(i == j, value) for j, value in enumerate(row)))
+            for i, (name, symbol, row) in enumerate(
+                zip(fit.determined, symbols, fit.correlation.tolist(), strict=True)
+            )
         ),
         ("Of ζ, γ, ρ/EI and EI the logarithms. Bold: 0.9 or more.",),
     )
 
 
-def _parameter_row(told: Headline, name: str, each: Quantity) -> tuple[Entry, ...]:
+def _parameter_row(
+    told: Headline, name: str, each: Quantity, combined: Mapping[str, Quantity]
+) -> tuple[Entry, ...]:
     symbol, meaning, unit, factor = _described(name)
     shown = estimate((each.value, each.std or None, *_ends(each)), each.std, factor)
+    if combined:
+        # A parameter that goes with no scale has the same interval with them.
+        both = combined.get(name, each)
+        shown += estimate((both.std or None, *_ends(both)), both.std, factor)
     if each.flag is not None:
         shown = (marked(shown[0]), *map(greyed, shown[1:]))
     fixed = name not in told.fit.interval and name != "drag"
-    return (symbol, meaning, unit, *shown, "fixed" if fixed else each.flag or "")
+    return (
+        Cell(name, symbol),
+        meaning,
+        _unit_cell(unit),
+        *shown,
+        "fixed" if fixed else each.flag or "",
+    )
+
+
+_SI: Final = {"µs": "s", "ms": "s", "g": "kg", "mm": "m", "ppm": "1", "%": "1"}
+
+
+def _unit_cell(shown: str) -> Cell:
+    """Show a unit; for programs it is the SI unit, which their numbers have."""
+    power, _, unit = shown.rpartition(" ")
+    return Cell(_SI.get(shown, unit if power.startswith("1e") else shown), shown)
 
 
 def _size_row(told: Headline, each: Size) -> tuple[Entry, ...]:
@@ -255,6 +297,7 @@ def structures_table(whole: WholeRecord) -> Table:
                 its,
                 *(map(_left_out, damping) if its == "excluded" else damping),
                 *([delta_bic[name]] if delta_bic else []),
+                whole.analysis.fit_percent(fit),
                 fit.cost / fit.degrees_of_freedom,
                 fit.free_parameters,
                 fit.cost,
@@ -271,6 +314,7 @@ def structures_table(whole: WholeRecord) -> Table:
             Column("", "status", WORDS),
             *_damping_columns(),
             *([Column("ΔBIC", "delta_bic")] if delta_bic else []),
+            Column("Fit (%)", "nrmse_percent", ".2f"),
             Column("Residual", "cost_per_degree_of_freedom"),
             Column("Free", "free_parameters"),
             Column("", "cost"),
@@ -281,8 +325,9 @@ def structures_table(whole: WholeRecord) -> Table:
         rows,
         (
             *footnotes(withheld),
-            "ΔBIC: Bayesian information criterion above the lowest; 10 is clear. Residual: its "
-            "power over that of the noise, 1 if nothing but noise is left. Free: number of free "
+            "ΔBIC: Bayesian information criterion above the lowest; 10 is clear. Fit: NRMSE "
+            "of the torque in the band, 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖). Residual: its power "
+            "over that of the noise, 1 if nothing but noise is left. Free: number of free "
             "parameters, those of rig and beam included. * rests on the edge of the range "
             "searched. The marked row is the one that the numbers are of. What the record excludes "
             "has numbers in the CSV file only, beside the sums of squares.",
@@ -354,7 +399,12 @@ def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) ->
     return Table.of(
         "welch_fits",
         "Fits to Welch's estimate, as in the paper",
-        (*_NAMES, *_damping_columns(), *(Column(name.upper(), name) for name in _INDICES)),
+        (
+            *_NAMES,
+            *_damping_columns(),
+            Column("Fit (%)", "nrmse_percent", ".2f"),
+            *(Column(name.upper(), name) for name in _INDICES),
+        ),
         (
             (
                 *_names(model),
@@ -362,16 +412,17 @@ def welch_fits_table(analysis: WelchAnalysis, withheld: Collection[str] = ()) ->
                     fit.structure, fit.parameters, fit.std, withheld=withheld,
                     at_bounds=fit.at_bounds,
                 ),
+                response_fit_percent(analysis, model),
                 *(getattr(model.indices, name) for name in _INDICES),
             )
             for fit, model in zip(fits, analysis.models, strict=True)
         ),
         (
             *footnotes(withheld),
-            f"{_INDEX_UNITS} std (±): one standard deviation, from the scatter of the response "
-            "about the model. The bias of Welch's estimate on a chirp, which the window "
-            "smears at the resonances, is not in it and is often larger: whole-record fits do not "
-            "have it.",
+            f"Fit: NRMSE of the complex response in the band. {_INDEX_UNITS} std (±): one standard "
+            "deviation, from the scatter of the response about the model. The bias of Welch's "
+            "estimate on a chirp, which the window smears at the resonances, is not in it and is "
+            "often larger: whole-record fits do not have it.",
             *([_ON_THE_EDGE] if any(fit.at_bounds for fit in fits) else []),
         ),
         grouped=True,
@@ -537,8 +588,8 @@ def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
                 Column("Tip amplitude (mm)", "tip_amplitude_m", ".3g", 1e3),
                 Column("Damping ratio (%)", "damping_ratio"),
                 Column("std (%)", "damping_ratio_std"),
-                Column("95 % from (%)", "damping_ratio_low"),
-                Column("to (%)", "damping_ratio_high"),
+                Column("95 % from (%)", "damping_ratio_low_95"),
+                Column("to (%)", "damping_ratio_high_95"),
             ),
             rows,
             ("Amplitude 0 is the beam without air, as in the table of the modes.",),

@@ -66,24 +66,25 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
             "between_in_own_std": each.own_stds,
             "cochran_q": each.cochran_q,
             "i_squared": replace(number(each.i_squared), text=percent(each.i_squared)),
-            "chance": chance_cell(each.chance),
+            "p_value": chance_cell(each.chance),
             "mixture": each.mixed,
         }
 
     return Table(
         "homogeneity",
-        f"Sessions compared{f', all by type {found.structure}' if found.structure else ''}",
+        f"Homogeneity of the sessions{f', by type {found.structure}' if found.structure else ''}",
         (
             Column("quantity", "quantity", WORDS), Column("sessions", "sessions"),
             Column("mean", "mean"), Column("between sessions", "between_std"),
-            Column("in own std", "between_in_own_std", ".3g"),
+            Column("τ/s", "between_in_own_std", ".3g"),
             Column("Cochran's Q", "cochran_q", ".3g"),
-            Column("I²", "i_squared"), Column("p", "chance"),
+            Column("I²", "i_squared"), Column("p", "p_value"),
         ),
         tuple(map(row, found.quantities)),
         (
-            "Between sessions: scatter beyond their own uncertainties. I²: share of the variance "
-            "that is such scatter. p: probability of so much by the uncertainties alone.",
+            "Between sessions: standard deviation beyond the sessions' own uncertainties (τ). τ/s: "
+            "the same over a typical session's own. I²: its share of the variance. p: p-value of "
+            "Cochran's Q.",
             *([MIXTURE_NOTE] if found.mixed else []),
         ),
     )  # fmt: skip

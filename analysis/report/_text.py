@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from rich.console import Console, Group
@@ -11,7 +12,7 @@ from rich.text import Text
 
 from analysis.identify import MISREAD
 from analysis.report import _record_tables as tables
-from analysis.report._table import estimate, terminal_table
+from analysis.report._table import MARK, estimate, terminal_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -33,6 +34,66 @@ def as_text(shown: RenderableType) -> str:
     return capture.get()
 
 
+def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
+    """Return what the terminal shows of one record.
+
+    Parameters
+    ----------
+    result : RecordResult
+    verbose : bool
+        Whether that is everything; otherwise the verdict, the modes and the parameters of damping
+        and beam, or without the whole record the Welch fits.
+    """
+    whole, welch = result.whole, result.welch
+    shown: list[RenderableType] = []
+    if whole is not None:
+        shown.append(record_text(whole) if verbose else _main_results(whole))
+    if welch is not None and verbose:
+        shown.append(analysis_tables(result))
+    elif welch is not None:
+        if whole is None:
+            shown += spaced((tables.welch_fits_table(welch),))
+        shown += _warnings(result)
+    return Group(*shown)
+
+
+_OF_RIG: Final = ("delay_s", "tool_inertia_kg_m2")
+"""Parameters that the verdict names where they are not as the file states them."""
+
+
+def _main_results(whole: WholeRecord) -> RenderableType:
+    """Return the verdict, the modes and the parameters, without captions to save lines."""
+    parameters = tables.parameters_table(whole)
+    rows = [
+        row
+        for name, row in zip(whole.headline.parameters, parameters.rows, strict=True)
+        if name not in _OF_RIG
+    ]
+    # Room for one column of words.
+    spare = "meaning" if any(row["remark"] for row in rows) else "remark"
+    columns = tuple(each for each in parameters.columns if each.key != spare)
+    return Group(
+        *map(Text, whole.verdict.sentences),
+        "",
+        *spaced(
+            map(
+                _bare,
+                (tables.modes_table(whole), replace(parameters, columns=columns, rows=tuple(rows))),
+            )
+        ),
+    )
+
+
+def _bare(table: Table) -> Table:
+    """Leave of what stands round a table the reasons for marked numbers."""
+    notes = tuple(note for note in table.notes if note.startswith(MARK))
+    return replace(table, caption="", notes=notes)
+
+
+def _warnings(result: RecordResult) -> list[RenderableType]:
+    return [Text(f"Warning: {warning}", style="yellow") for warning in result.warnings]
+
+
 def tables_text(result: RecordResult) -> str:
     """Return what a terminal would show of the Welch fits, without them of the whole record."""
     if result.welch is not None:
@@ -49,7 +110,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
     assert welch is not None
     modes = tables.welch_modes_table(welch)
     return Group(
-        Text(f"{result.name}: the paper's route", style="italic"),
+        Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
         "",
         *spaced(
             (
@@ -58,12 +119,12 @@ def analysis_tables(result: RecordResult) -> RenderableType:
                 *(() if modes is None else (modes,)),
             )
         ),
-        *(Text(f"Warning: {warning}", style="yellow") for warning in result.warnings),
+        *_warnings(result),
     )
 
 
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
-    """Return what the paper's route gives over several files, as far as it was gone."""
+    """Return the Welch fits of several files in one table: those that were made."""
     found = [each.welch for each in results if each.welch is not None]
     return terminal_table(tables.summary_table(found))
 
@@ -80,6 +141,13 @@ def record_text(whole: WholeRecord) -> RenderableType:
         Text(f"{whole.record.path.name}: verdict", style="italic"),
         *(Padding(sentence, (0, 0, 0, 2)) for sentence in said),
         "",
+        record_tables(whole),
+    )
+
+
+def record_tables(whole: WholeRecord) -> RenderableType:
+    """Return the modes, the sizes of the damping and the parameters of one record."""
+    return Group(
         *spaced(
             (
                 *(
@@ -88,7 +156,7 @@ def record_text(whole: WholeRecord) -> RenderableType:
                 ),
                 *tables.amplitude_tables(whole),
             )
-        ),
+        )
     )
 
 
@@ -139,7 +207,8 @@ def damping_sentences(told: Headline) -> tuple[str, ...]:
         )
     if shown:
         found.append(
-            f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals)."
+            f"The antenna's damping ratio is {_listed(shown)} (in brackets: 95 % intervals, "
+            "statistical only)."
         )
     found.extend(
         f"The {each.damping} damping {_size(each)}{_order(told, each)}."

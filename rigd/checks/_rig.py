@@ -1,8 +1,10 @@
 """The whole check of a rig, in the order in which one thing rules out the next."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from rigd.checks._devices import inspect_devices
+from rigd.checks._devices import calibration_rows, inspect_devices
 from rigd.checks._machine import machine_rows, rights_rows
 from rigd.checks._on_paper import eds_rows, loop_rows, profile_rows, travel_rows, wiring_rows
 from rigd.checks._rows import Row, Verdict
@@ -15,20 +17,40 @@ def check_rig(profile: Profile) -> list[Row]:
     Where the identifiers meet or the bus cannot carry the frames, nothing is connected: devices
     might obey what is not meant for them.
     """
-    wiring = list(wiring_rows(profile.rig))
-    rows = [
+    rows = _rows_without_devices(profile)
+    if any(row.verdict is Verdict.FAIL for row in wiring_rows(profile.rig)):
+        why = "not connected: first the bus has to be right"
+        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
+    return rows + inspect_devices(profile)
+
+
+def check_beside(profile: Profile, calibration: Mapping[str, Any] | None) -> list[Row]:
+    """Check the rig of a profile while a daemon has its devices: they are not asked anything.
+
+    Parameters
+    ----------
+    profile
+        Rig to check.
+    calibration
+        What the sensor told of itself when the daemon connected it; None: it is not connected.
+    """
+    rows = _rows_without_devices(profile)
+    if calibration is None:
+        return [*rows, Row("devices", "connection", "not connected", "", Verdict.SKIPPED)]
+    rows.append(Row("devices", "connection", "connected by the daemon", "", Verdict.OK))
+    return [*rows, *calibration_rows(calibration, profile.rig)]
+
+
+def _rows_without_devices(profile: Profile) -> list[Row]:
+    return [
         *_drive_rows(profile),
         *profile_rows(profile),
-        *wiring,
+        *wiring_rows(profile.rig),
         *loop_rows(profile),
         *travel_rows(profile),
         *rights_rows(profile.realtime),
         *machine_rows(profile.realtime),
     ]
-    if any(row.verdict is Verdict.FAIL for row in wiring):
-        why = "not connected: first the bus has to be right"
-        return [*rows, Row("devices", "connection", why, "", Verdict.SKIPPED)]
-    return rows + inspect_devices(profile)
 
 
 def _drive_rows(profile: Profile) -> list[Row]:

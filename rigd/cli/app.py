@@ -6,7 +6,7 @@ import io
 import os
 import signal
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -16,6 +16,7 @@ from rigd.cli.check import bench, check, reset
 from rigd.cli.daemon import serve, status, stop, tare, zero
 from rigd.cli.files import info, recover
 from rigd.cli.identify import identify_app
+from rigd.cli.library import list_sessions, specimens
 from rigd.cli.live import live, replay
 from rigd.cli.options import EXIT_FAILED, EXIT_INTERRUPTED, errors_told
 from rigd.cli.profiles import profiles_app
@@ -39,10 +40,36 @@ def before_a_command(
     """Take the options that stand before a command; they have done their work by then."""
 
 
+_SECTIONS: Final = {
+    "Sessions": ("run", "serve", "start", "status", "stop"),
+    "Rig": ("check", "tare", "zero", "reset", "live"),
+    "Session files": ("list", "info", "replay", "recover"),
+    "Set-up": ("profiles", "identify", "bench"),
+    "Simulated devices": ("simulate", "inject"),
+}
+"""Commands by what they are for, as the help lists them."""
+_OTHERS: Final = "Other commands"
+
+
 class RigdGroup(TyperGroup):
     """All commands: what an error says, and its exit code, are told here for each of them."""
 
     # Typer's click is its own in some versions and the package of that name in others.
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
+        """Write the list of commands, in sections."""
+        listed = {name for names in _SECTIONS.values() for name in names}
+        others = tuple(name for name in self.list_commands(ctx) if name not in listed)
+        width = formatter.width - 6 - max(map(len, self.commands))
+        for title, names in {**_SECTIONS, _OTHERS: others}.items():
+            rows = [
+                (name, self.commands[name].get_short_help_str(width))
+                for name in names
+                if name in self.commands
+            ]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
         """Run the command that was asked for."""
         with errors_told():
@@ -70,6 +97,8 @@ app.command()(stop)
 app.command()(tare)
 app.command()(zero)
 app.command()(reset)
+app.command("list")(list_sessions)
+app.command()(specimens)
 app.command()(info)
 app.command()(replay)
 app.command()(recover)

@@ -18,6 +18,7 @@ from rigd.cli.options import (
     AsJson,
     Fast,
     Hardware,
+    NoLook,
     Output,
     ProfileName,
     fail,
@@ -45,21 +46,43 @@ def serve(
     live: Annotated[
         bool, typer.Option("--live", help="Show the signals of each session in Rerun.")
     ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the operator's page on this computer.")
+    ] = False,
+    web_port: Annotated[
+        int | None,
+        typer.Option(
+            "--web-port",
+            min=1,
+            max=65535,
+            help="Port of the page (default: 8720, or another one if that is taken).",
+        ),
+    ] = None,
     fast: Fast = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
 ) -> None:
     """Run the rig daemon; Ctrl-C or SIGTERM ends it safely.
 
     The daemon runs the sessions of rigd start.
 
-    Example: rigd serve --profile antenna_can --output /data/sessions
+    Example: rigd serve --profile antenna_can --output /data/sessions --web
     """
     from rigd.daemon import run_daemon
     from rigd.runner import load_rig, make_folder
 
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
-    number = run_daemon(rig_profile, output.absolute(), group=group, live=live, fast=fast)
+    number = run_daemon(
+        rig_profile,
+        output.absolute(),
+        group=group,
+        live=live,
+        fast=fast,
+        page=web or web_port is not None,
+        page_port=web_port,
+        look=not no_look,
+    )
     if number is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
 
@@ -113,8 +136,8 @@ def status(
             fail("--watch and --json do not go together; ask for one.", EXIT_WRONG_USE)
         if not sys.stdout.isatty():
             fail(
-                "--watch goes on in place on a terminal, and there is none; ask for the status "
-                "again and again, or watch the daemon's socket.",
+                "--watch needs a terminal; without one, run rigd status repeatedly, or watch the "
+                "daemon's socket.",
                 EXIT_WRONG_USE,
             )
         _watch(profile)
@@ -188,8 +211,8 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
         return
     for axis, mean in told["mean"].items():
         name, unit = axis.removesuffix(suffix_of(axis)), unit_of(axis)
-        typer.echo(f"{name}: {mean:.4g} {unit}, scatter {told['std'][axis]:.2g} {unit}")
-    typer.echo(f"coupling torque: scatter {told['torque_std_nm']:.2g} N·m")
+        typer.echo(f"{name}: mean {mean:.3f} {unit}, s.d. {told['std'][axis]:.3f} {unit}")
+    typer.echo(f"coupling torque: s.d. {told['torque_std_nm']:.3f} N·m")
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from rigd.errors import RigdError
+from rigd.printable import BAR_STYLES
 
 if TYPE_CHECKING:
     from rigd.profile import Profile
@@ -63,8 +64,9 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 def _bar(name: str) -> Iterator[Callable[[float], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.theme import Theme
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, theme=Theme(BAR_STYLES))
     with Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -106,18 +108,45 @@ Repeat = Annotated[int, typer.Option("--repeat", min=1, help="Number of sessions
 Operator = Annotated[str, typer.Option("--operator", help="Operator name, stored in the file.")]
 Specimen = Annotated[str, typer.Option("--specimen", help="Specimen, stored in the file.")]
 Note = Annotated[str, typer.Option("--note", help="Note, stored in the file.")]
+Meta = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--meta",
+        metavar="NAME=VALUE",
+        help="Metadata, stored in the file, such as temperature_c=21.4; repeat for each.",
+    ),
+]
 Force = Annotated[
     bool, typer.Option("--force", help="Run even if the torque is predicted to saturate.")
 ]
 
 
-def session_notes(operator: str, specimen: str, note: str) -> dict[str, str]:
-    """Return what is to go into the file; a text that cannot ends the command."""
+NoLook = Annotated[
+    bool,
+    typer.Option(
+        "--no-look", envvar="RIGD_NO_LOOK", help="Make no quick look at a session after its end."
+    ),
+]
+
+
+def session_notes(
+    operator: str, specimen: str, note: str, meta: list[str] | None
+) -> dict[str, str]:
+    """Return what is to go into the file, by its keys there; what cannot ends the command."""
+    from rigd.session import metadata_keys
+
     notes = {"operator": operator, "specimen": specimen, "note": note}
     for option, text in notes.items():
         if not text.isprintable():
             fail(f"--{option} {text!r}: is not plain text of one line.", EXIT_WRONG_USE)
-    return notes
+    added: dict[str, str] = {}
+    for given in meta or []:
+        name, equals, value = given.partition("=")
+        if not equals or name in added:
+            wrong = "is given twice" if equals else "is not NAME=VALUE, as temperature_c=21.4 is"
+            fail(f"--meta {given!r}: {wrong}.", EXIT_WRONG_USE)
+        added[name] = value
+    return {name: text for name, text in notes.items() if text} | metadata_keys(added)
 
 
 def profile_named(name: str) -> "Profile":

@@ -21,6 +21,8 @@ from rigd.cli.options import (
     Fast,
     Force,
     Hardware,
+    Meta,
+    NoLook,
     Note,
     Operator,
     Output,
@@ -58,7 +60,7 @@ StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the 
 StopHz = Annotated[float, typer.Option("--stop-hz", help="Frequency where the band ends (Hz).")]
 Duration = Annotated[float, typer.Option("--duration", help="Duration of the excitation (s).")]
 Rest = Annotated[float, typer.Option("--rest", help="Rest before the excitation (s).")]
-RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after it (s).")]
+RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after the excitation (s).")]
 Taper = Annotated[float, typer.Option("--taper", help="Fade-in and fade-out time (s).")]
 
 
@@ -103,14 +105,16 @@ def run_sessions(
     operator: Operator = "",
     specimen: Specimen = "",
     note: Note = "",
+    meta: Meta = None,
     fast: Fast = False,
     live: Annotated[bool, typer.Option("--live", help="Show the signals in Rerun.")] = False,
     force: Force = False,
     hardware: Hardware = False,
+    no_look: NoLook = False,
     as_json: AsJson = False,
 ) -> None:
     """Run sessions one after the other and report how they ended."""
-    notes = session_notes(operator, specimen, note)
+    notes = session_notes(operator, specimen, note, meta)
     stop, crew = start_processes(live=live)
     from rigd.runner import SeriesFailedError, excitation_for, run_in_foreground
     from rigd.runtime import ignore
@@ -130,6 +134,7 @@ def run_sessions(
             force=force,
             quiet_stdout=as_json,
             hardware=hardware,
+            look=not no_look,
         )
     except SeriesFailedError as error:
         if as_json:

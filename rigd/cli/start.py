@@ -3,6 +3,7 @@
 import contextlib
 import json
 import signal
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import isfinite
@@ -19,6 +20,7 @@ from rigd.cli.options import (
     EXIT_WRONG_USE,
     AsJson,
     Force,
+    Meta,
     Note,
     Operator,
     Repeat,
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
 
 
 _POLL_S = 0.2
+_LOOK_PATIENCE_S = 10.0
+"""Longest wait for the last quick look at the end."""
 
 
 class SessionCommands(TyperGroup):
@@ -82,6 +86,7 @@ def start_sessions(
     operator: Operator = "",
     specimen: Specimen = "",
     note: Note = "",
+    meta: Meta = None,
     force: Force = False,
     detach: Annotated[
         bool, typer.Option("--detach", help="Return at once; rigd status shows the progress.")
@@ -89,7 +94,14 @@ def start_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Have the daemon run sessions, and report how they ended."""
-    notes = session_notes(operator, specimen, note)
+    from rigd.session import META_PREFIX
+
+    notes: dict[str, Any] = {}
+    for key, text in session_notes(operator, specimen, note, meta).items():
+        if key.startswith(META_PREFIX):  # an older daemon does not know the member
+            notes.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = text
+        else:
+            notes[key] = text
     for name, value in parameters.items():
         if isinstance(value, float) and not isfinite(value):
             fail(f"{name} = {value} is not a finite number; give one.", EXIT_WRONG_USE)
@@ -100,11 +112,12 @@ def start_sessions(
             for name, value in parameters.items()
         },
         "repeat": repeat,
-        "notes": {name: text for name, text in notes.items() if text},
+        "notes": notes,
         "force": force,
     }
     with daemon_of(profile) as client, _Interrupts.caught() as interrupts:
-        typer.echo(client.ask("status")["daemon"]["what_moves"], err=True)
+        daemon = client.ask("status")["daemon"]
+        typer.echo(daemon["what_moves"], err=True)
         if not detach:
             client.ask("watch")
         told = client.ask("start", **request)
@@ -116,10 +129,12 @@ def start_sessions(
                 typer.echo(json.dumps({"series": told["series"]}))
             else:
                 _tell_plan(told["plan"], err=False)
-                typer.echo("It is running; rigd status shows how far it is, rigd stop ends it.")
+                typer.echo("Running; rigd status shows the progress, rigd stop ends the session.")
             return
         _tell_plan(told["plan"], err=as_json)
-        series = _follow(client, told["series"], interrupts, as_json=as_json)
+        # A daemon of before an update makes none.
+        looks = daemon.get("quick_looks", False)
+        series = _follow(client, told["series"], interrupts, as_json=as_json, looks=looks)
     if as_json:
         typer.echo(json.dumps({"sessions": series["sessions"]}))
     if series["failed"]:
@@ -152,25 +167,33 @@ class _Interrupts:
 
 
 def _follow(
-    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool
+    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, looks: bool
 ) -> dict[str, Any]:
     """Show the progress of a series to its end, and return what the daemon says of it."""
     from rigd.engine import Phase
-    from rigd.runner import ProgressLine, result_line
+    from rigd.runner import ProgressLine, QuickLook, result_line
 
     asked = False
+    done = 0
+    awaited: set[str] = set()
+    made: dict[str, str] = {}
+    ended: dict[str, Any] | None = None
+    heard, deadline_s = 0, 0.0
     line = ProgressLine()
     try:
-        while True:
+        while ended is None or (awaited and time.monotonic() < deadline_s):
+            if ended is not None and interrupts.count > heard:
+                break
             if interrupts.count and not asked:
                 asked = True
                 client.send("stop")
                 line.say("Stopping; Ctrl-C again leaves the rest to the daemon.")
-            if interrupts.count > 1:
+            if ended is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
             event = client.event(_POLL_S) or {}
             match event.get("event"):
-                case "progress":
+                # Between two sessions there is nothing to show: the bar would stand by the path.
+                case "progress" if event["session"] > done:
                     line.update(
                         Phase[event["phase"].upper()],
                         event["tick"],
@@ -188,13 +211,28 @@ def _follow(
                 case "session":
                     line.say(result_line(event))
                     line.close()  # standard output may be the same terminal
-                    if not as_json and event["path"] is not None:
-                        typer.echo(event["path"])
-                    line = ProgressLine()
+                    if event["path"] is not None:
+                        if not as_json:
+                            typer.echo(event["path"])
+                        if looks:
+                            awaited.add(event["path"])
+                    line, done = ProgressLine(), event["number"]
+                case "quick_look" if event["path"] in awaited:
+                    awaited.discard(event["path"])
+                    look = QuickLook.of_event(event)
+                    if look.path is not None:
+                        made[event["path"]] = str(look.path)
+                    for text in look.lines:
+                        line.say(text)
                 case "series" if event["series"] == number:
-                    return event
+                    ended, heard = event, interrupts.count
+                    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+                    if awaited:
+                        line.say("Quick look at the session; Ctrl-C skips it.")
     finally:
         line.close()
+    sessions = [each | {"look": made.get(each["path"])} for each in ended["sessions"]]
+    return ended | {"sessions": sessions}
 
 
 def _tell_plan(plan: dict[str, Any], *, err: bool) -> None:

@@ -9,6 +9,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from rigd.daemon import page_address
 from rigd.engine import Phase
 
 _STYLES = {
@@ -79,6 +80,8 @@ def _rows(told: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     rig = told["rig"]
     if rig is not None and rig["live_view"] is not None:
         yield "live view", Text(rig["live_view"]["url"])
+    if daemon.get("web") is not None:
+        yield "page", Text(page_address(daemon["profile"]) or daemon["web"])
     yield "output", Text(daemon["output"])
 
 

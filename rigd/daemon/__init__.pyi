@@ -11,3 +11,4 @@ from ._client import daemons as daemons
 from ._client import find_views as find_views
 from ._client import stop_session as stop_session
 from ._main import run_daemon as run_daemon
+from ._page import page_address as page_address

@@ -26,7 +26,15 @@ _log = logging.getLogger(NAME)
 
 
 def run_daemon(
-    profile: Profile, folder: Path, *, group: str | None, live: bool, fast: bool
+    profile: Profile,
+    folder: Path,
+    *,
+    group: str | None,
+    live: bool,
+    fast: bool,
+    look: bool,
+    page: bool = False,
+    page_port: int | None = None,
 ) -> signal.Signals:
     """Own a rig until a signal asks for the end.
 
@@ -40,6 +48,12 @@ def run_daemon(
         Group whose members may command it, as well as this user.
     live, fast
         See :class:`rigd.runner._rig.Rig`.
+    look
+        Take a quick look at each session.
+    page
+        Serve the operator's page.
+    page_port
+        Port of the page on loopback; None: 8720, or another one if that is taken.
 
     Returns
     -------
@@ -74,10 +88,16 @@ def run_daemon(
             partial(reality, profile.rig),
             fast=fast,
             live=live,
+            look=look,
         )
         _log.info("%s Listening on %s", what_moves(profile.rig, moving), path)
         for difference in simulated_differently(profile.rig):
             _log.warning("the simulated rig has %s", difference)
+        if page:
+            from rigd.daemon._page import PageProcess
+
+            serving = PageProcess(profile, folder, path, page_port, service.set_page)
+            ending.callback(serving.close)
         return asyncio.run(_run(server, service))
 
 
@@ -97,6 +117,8 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     server.serve(service)
     opening = asyncio.create_task(service.open())
     attending = asyncio.create_task(service.attend())
+    telling = asyncio.create_task(service.tell_signals())
+    telling.add_done_callback(_note_end)
     # Attending ends only by a mistake in the program, which must not leave a rig unattended.
     attending.add_done_callback(lambda _: end(signal.SIGABRT))
     await asked
@@ -104,9 +126,16 @@ async def _run(server: Server, service: Service) -> signal.Signals:
     _log.info("%s and ends", why)
     await service.close(why)
     attending.cancel()
-    await asyncio.gather(opening, attending, return_exceptions=True)
+    telling.cancel()
+    await asyncio.gather(opening, attending, telling, return_exceptions=True)
     await server.close()
     return asked.result()
+
+
+def _note_end(telling: "asyncio.Task[None]") -> None:
+    """Log why no signals are told any more; the rig does not depend on them."""
+    if not telling.cancelled():
+        _log.error("the signals are not told any more", exc_info=telling.exception())
 
 
 def _stop(service: Service) -> None:

@@ -7,11 +7,12 @@ import inspect
 import json
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigd.excitation import FROM_THE_RIG, KINDS, Value
+from rigd.session import NOTES, MetadataError, metadata_keys
 
 LONGEST_LINE = 65_536
 """Bytes of a request, its newline included."""
@@ -20,6 +21,7 @@ _LONGEST_PATH = 4096
 _SHOWN = 60
 
 _LONGEST_ID = 64
+Note = Annotated[str, Field(max_length=1000)]
 Id = int | Annotated[str, Field(max_length=_LONGEST_ID)]
 
 
@@ -53,6 +55,7 @@ class Watch(Request):
     """Send the events from now on."""
 
     command: Literal["watch"]
+    signals: bool = False
 
 
 class Stop(Request):
@@ -82,25 +85,63 @@ class Reset(Request):
     command: Literal["reset"]
 
 
-class Start(Request):
-    """Run a session, or a series of them."""
+class Notes(BaseModel):
+    """What is to stand in the files, beside what the sessions themselves say."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    operator: Note = ""
+    specimen: Note = ""
+    note: Note = ""
+    meta: dict[str, Any] = {}
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return what was given by the keys of the session file.
+
+        Raises
+        ------
+        MetadataError
+            If added metadata breaks a rule.
+        """
+        texts = {name: getattr(self, name) for name in NOTES}
+        return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
+
+
+class Check(Request):
+    """Check profile, control loop and computer, and what the connected devices said."""
 
     controlling = True
-    command: Literal["start"]
+    command: Literal["check"]
+
+
+class SessionRequest(Request):
+    """A session, or a series of them."""
+
     excitation: str
     parameters: dict[str, Any] = {}
     repeat: int = Field(default=1, ge=1, le=MOST_SESSIONS)
-    notes: dict[
-        Literal["operator", "specimen", "note"], Annotated[str, Field(max_length=1000)]
-    ] = {}
+    notes: Notes = Notes()
     force: bool = False
 
 
-AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Start
+class Start(SessionRequest):
+    """Run it."""
+
+    controlling = True
+    command: Literal["start"]
+
+
+class Predict(SessionRequest):
+    """Predict what it would do."""
+
+    command: Literal["predict"]
+
+
+AnyRequest = Status | Watch | Stop | Tare | Zero | Reset | Check | Start | Predict
 _REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
     Annotated[AnyRequest, Field(discriminator="command")]
 )
-_COMMANDS = ("status", "watch", "stop", "tare", "zero", "reset", "start")
+_COMMANDS = "status", "watch", "stop", "tare", "zero", "reset", "check", "start", "predict"
 
 
 def parse_request(line: bytes) -> AnyRequest:
@@ -126,7 +167,7 @@ def parse_request(line: bytes) -> AnyRequest:
     except ValidationError as error:
         raise RequestError(_first_complaint(error), request_id) from None
     try:
-        return _checked(request) if isinstance(request, Start) else request
+        return _checked(request) if isinstance(request, SessionRequest) else request
     except RequestError as error:
         raise RequestError(str(error), request_id) from None
 
@@ -157,15 +198,22 @@ def _first_complaint(error: ValidationError) -> str:
     return f"{where}: {first['msg']}."
 
 
-def _checked(request: Start) -> Start:
+SomeSession = TypeVar("SomeSession", bound=SessionRequest)
+
+
+def _checked(request: SomeSession) -> SomeSession:
     """Check what depends on the excitation, by the signature of its function."""
     if request.excitation not in KINDS:
         raise RequestError(
             f"excitation = {_shown(request.excitation)} is not known; there are {', '.join(KINDS)}."
         )
-    for note, text in request.notes.items():
-        if not text.isprintable():
+    for note in NOTES:
+        if not getattr(request.notes, note).isprintable():
             raise RequestError(f"notes.{note} is not plain text of one line.")
+    try:
+        request.notes.as_metadata()
+    except MetadataError as error:
+        raise RequestError(f"notes.meta: {error}") from None
     function = KINDS[request.excitation]
     known = {
         name: parameter

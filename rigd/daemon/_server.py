@@ -27,6 +27,7 @@ from rigd.daemon._protocol import (
     Id,
     RequestError,
     Stop,
+    Watch,
     parse_request,
 )
 from rigd.daemon._service import CommandError, Service
@@ -81,10 +82,10 @@ class Server:
 
     def publish(self, event: Document) -> None:
         """Send an event to all who watch."""
-        data = _line(event)
-        for client in list(self._clients):
-            if client.watching:
-                client.write(data)
+        watching = [client for client in self._clients if client.wants(event)]
+        data = _line(event) if watching else b""
+        for client in watching:
+            client.write(data)
 
     async def close(self) -> None:
         """Send what is still to be sent, and let everybody go."""
@@ -294,6 +295,7 @@ class _Client(asyncio.Protocol):
         self._leaving = False
         self.connecting: asyncio.Task[None] | None = None
         self.watching = False
+        self._wants_signals = False
         self.heard_s = time.monotonic()
 
     @property
@@ -311,6 +313,10 @@ class _Client(asyncio.Protocol):
     def pid(self) -> int:
         """Number of its process."""
         return self._peer.pid
+
+    def wants(self, event: Document) -> bool:
+        """Whether it is to be told of an event."""
+        return self.watching and (self._wants_signals or event["event"] != "signals")
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begin."""
@@ -400,6 +406,8 @@ class _Client(asyncio.Protocol):
                 self.write(_line(_refusal(request.id, text, command="watch", wrong_use=False)))
                 return
             self.watching = True
+        if isinstance(request, Watch):
+            self._wants_signals |= request.signals
         task = asyncio.create_task(self._answer(request))
         self._tasks.add(task)
         task.add_done_callback(self._answered)

@@ -8,7 +8,7 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from rigd.daemon import _protocol as protocol
+from rigd.daemon import aside
 from rigd.daemon._log import NAME
 from rigd.daemon._states import (
     Document,
@@ -29,14 +30,17 @@ from rigd.daemon._states import (
     peer_document,
     progress_document,
     rig_document,
+    signals_document,
     transition_document,
 )
 from rigd.devices import WhatMoves, what_moves
 from rigd.engine import Event
 from rigd.errors import RigdError, UserError
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
 from rigd.runner import (
     NoRoomError,
+    QuickLook,
+    QuickLooks,
     RigError,
     RigStatus,
     Series,
@@ -44,13 +48,19 @@ from rigd.runner import (
     SessionProgress,
     SessionResult,
     SessionRig,
+    SignalBlock,
     excitation_for,
+    result_line,
     what_is_kept,
 )
 from rigd.runtime import StopRequest
 
 LOOK_S = 0.2
 """Time from one look at the rig to the next."""
+_SIGNALS_S = 0.05
+"""Time from one block of a record's signals to the next."""
+_MOST_PREDICTIONS = 4
+"""At a time: one is made, the others wait."""
 _DEAF_S = 1.5
 """Time without a look after which the event loop counts as stuck, and hears no stop."""
 _RATE_LOOKS = 10
@@ -77,6 +87,10 @@ class RigControl(SessionRig, Protocol):
     connected: bool
     zero_lost: bool
 
+    @property
+    def calibration(self) -> Mapping[str, Any] | None:
+        """Identity and calibration of the connected sensor."""
+
     def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Connect the devices."""
 
@@ -91,6 +105,9 @@ class RigControl(SessionRig, Protocol):
 
     def status(self) -> RigStatus | None:
         """Read the status from shared memory, from any thread."""
+
+    def signals(self) -> list[SignalBlock]:
+        """Return what has come of the record since the last call."""
 
     def disconnect(self) -> None:
         """Close everything."""
@@ -131,6 +148,8 @@ class ServedSeries:
             "excitation": self.request.excitation,
             "session": self.session,
             "repeat": self.request.repeat,
+            "notes": self.request.notes.model_dump(exclude_defaults=True),
+            "plan": None if self.planned is None else self.planned.plan_document(),
             "path": None if self.path is None else str(self.path),
             "running": self.running,
             "stopped": self.stop.requested,
@@ -159,6 +178,8 @@ class Service:
         Says what would move if the rig were connected now.
     fast, live
         Options with which the rig was made.
+    look
+        Take a quick look at each session.
 
     Attributes
     ----------
@@ -177,6 +198,7 @@ class Service:
         *,
         fast: bool = False,
         live: bool = False,
+        look: bool = False,
     ) -> None:
         self._rig = rig
         self._profile = profile
@@ -192,14 +214,25 @@ class Service:
         self._fault = ""
         """Why it went into fault last, but for what failed in resetting it."""
         self._doing = ""
+        self._opened = asyncio.Event()
+        """Set once the first connection has been tried."""
+        self._stops = 0
+        """Number of stops that were asked for."""
         self._closing = False
         self._series: ServedSeries | None = None
+        self._looks = QuickLooks(self._tell_look) if look else None
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._count = 0
         self._listened_s = inf
         self._look: RigStatus | None = None
         self._written: deque[tuple[float, dict[str, int]]] = deque(maxlen=_RATE_LOOKS + 1)
+        self._signal_watchers: set[Peer] = set()
+        self._predictions = 0
+        self._predicting = asyncio.Lock()
+        self._last_check: Document | None = None
         self.controller: Peer | None = None
+        self._page: str | None = None
 
     @property
     def state(self) -> State:
@@ -209,12 +242,14 @@ class Service:
     async def open(self) -> None:
         """Connect the rig; a failure leaves a fault, which an operator may reset."""
         self._doing = "connecting"
+        self._loop = asyncio.get_running_loop()
         try:
             await self._connect(reset_fault=False)
         except CommandError:
             pass  # the fault says it
         finally:
             self._doing = ""
+            self._opened.set()
 
     async def attend(self) -> None:
         """Watch over the rig, until cancelled."""
@@ -222,8 +257,28 @@ class Service:
             await asyncio.sleep(LOOK_S)
             self._listened_s = time.monotonic()
             self.look()
+            if self._looks is not None:
+                self._looks.attend()
             # Not waited for: another look is due while the second thread is busy.
             await self.watch()
+
+    async def tell_signals(self) -> None:
+        """Publish the signals to those who want them, until cancelled."""
+        while True:
+            at_work = self.state in (State.RUNNING, State.STOPPING)
+            await asyncio.sleep(_SIGNALS_S if at_work else LOOK_S)
+            if not self._signal_watchers:
+                continue
+            series = self._series
+            planned = series.planned if series is not None and series.running else None
+            for block in self._rig.signals():
+                self._publish(
+                    signals_document(
+                        block,
+                        self._profile.rig.rate_hz,
+                        None if planned is None else planned.frequency_hz(block.last_tick),
+                    )
+                )
 
     async def close(self, reason: str) -> None:
         """End a running session safely and let the rig go."""
@@ -231,12 +286,19 @@ class Service:
         self.stop(reason)
         if self._task is not None:
             await asyncio.wait([self._task])
+        if self._looks is not None:
+            self._looks.close()
         await self._call(self._rig.disconnect)
         if self.state is State.READY:
             self._states.move(State.IDLE, reason)
 
+    def set_page(self, address: str | None) -> None:
+        """Take note of where the operator's page is, without its token; from any thread."""
+        self._page = address
+
     def release(self, peer: Peer) -> None:
         """Take control from a client that is gone; what it started goes on."""
+        self._signal_watchers.discard(peer)
         if self.controller == peer:
             self.controller = None
             _log.info("control: released by %s", peer)
@@ -249,8 +311,15 @@ class Service:
         CommandError
             If it is refused, or fails.
         """
-        if not (request.controlling or isinstance(request, protocol.Stop)):
-            return self.status() if isinstance(request, protocol.Status) else {}
+        match request:
+            case protocol.Status():
+                return self.status()
+            case protocol.Watch():
+                if request.signals:
+                    self._signal_watchers.add(peer)
+                return {}
+            case protocol.Predict():
+                return await self._predict(request)
         _log.info("%s: asked by %s", request.command, peer)
         try:
             return await self._obey(request, peer)
@@ -262,10 +331,13 @@ class Service:
         """Obey a request that may change something."""
         if request.controlling:
             self._take_control(peer)
+            await self._wait_until_opened(peer)
         if isinstance(request, protocol.Start):
             return await self._start(request)
         if isinstance(request, protocol.Stop):
             return self.stop(f"stop asked for by {peer}")
+        if isinstance(request, protocol.Check):
+            return await self._check_rig()
         if isinstance(request, protocol.Tare):
             return await self._measure("tare", self._rig.tare)
         if isinstance(request, protocol.Zero):
@@ -285,6 +357,9 @@ class Service:
                 told=what_moves(self._profile.rig, self._began_moving),
                 fast=self._fast,
                 live=self._live,
+                web=self._page,
+                calibration=self._rig.calibration,
+                quick_looks=self._looks is not None,
                 began_utc_ns=self._began_utc_ns,
             ),
             "state": self.state.value,
@@ -296,11 +371,13 @@ class Service:
             "series": None if series is None else series.as_document(),
             "progress": self._progress(),
             "rig": None if look is None else rig_document(look, self._rates()),
+            "last_check": self._last_check,
             "history": histories(self._states.history),
         }
 
     def stop(self, reason: str) -> Document:
         """Ask for the end of what runs; the answer says whether there was anything."""
+        self._stops += 1
         series = self._series
         if series is None or not series.running:
             return {"stopping": False}
@@ -323,7 +400,9 @@ class Service:
 
     async def watch(self) -> None:
         """See whether the rig is well between sessions."""
-        if self._doing or not self._rig.connected or self.state not in (State.READY, State.FAULT):
+        # A check asks nothing of the rig, and the thread of its calls is free.
+        busy = self._doing not in ("", "check")
+        if busy or not self._rig.connected or self.state not in (State.READY, State.FAULT):
             return
         try:
             await self._call(self._rig.watch)
@@ -343,14 +422,59 @@ class Service:
             self.controller = peer
             _log.info("control: taken by %s", peer)
 
+    async def _wait_until_opened(self, peer: Peer) -> None:
+        """Wait for the devices of a daemon that has just been started."""
+        if self._doing != "connecting":
+            return
+        stops = self._stops
+        await self._opened.wait()
+        if self._stops > stops or self.controller != peer:
+            raise CommandError("It was stopped before it began.")
+
     def _check(self, command: str) -> None:
         if self._closing:
             raise CommandError(_SHUTTING_DOWN)
         refusal = self._states.refusal(command)
         if refusal:
             raise CommandError(refusal)
+        self._refuse_if_busy()
+
+    def _refuse_if_busy(self) -> None:
         if self._doing:
             raise CommandError(f"The rig is busy ({self._doing}); try again in a moment.")
+
+    async def _predict(self, request: protocol.Predict) -> Document:
+        """Predict a session, whatever else is being done."""
+        if self._predictions >= _MOST_PREDICTIONS:
+            raise CommandError("Several predictions are being made; try again in a moment.")
+        job = aside.PredictionJob(
+            self._profile,
+            request.excitation,
+            request.parameters,
+            request.force,
+            request.notes.specimen,
+        )
+        self._predictions += 1
+        try:
+            async with self._predicting:
+                return await _aside(job)
+        finally:
+            self._predictions -= 1
+
+    async def _check_rig(self) -> Document:
+        if self.state in (State.RUNNING, State.STOPPING):
+            raise CommandError(
+                "check is for a rig on which no session runs: wait for the session to end, or end "
+                "it with rigd stop."
+            )
+        self._refuse_if_busy()
+        self._doing = "check"
+        try:
+            told = await _aside(aside.CheckJob(self._profile, self._rig.calibration))
+        finally:
+            self._doing = ""
+        self._last_check = {"utc_ns": time.time_ns(), "verdict": told["verdict"]}
+        return told
 
     async def _start(self, request: protocol.Start) -> Document:
         self._check("start")
@@ -451,14 +575,15 @@ class Service:
 
     def _plan(self, request: protocol.Start) -> Series:
         """Make the excitation and see that it may be run; in the second thread."""
-        profile = self._profile
+        notes = request.notes.as_metadata()
         try:
+            profile = with_specimen(self._profile, notes.get("specimen", ""))
             return Series(
                 profile,
                 excitation_for(profile, request.excitation, request.parameters),
                 self._folder,
                 repeat=request.repeat,
-                notes={str(name): text for name, text in request.notes.items()},
+                notes=notes,
                 force=request.force,
             )
         except NoRoomError as error:  # the same request may succeed later
@@ -514,7 +639,14 @@ class Service:
 
         told = _Told(series, publish, self._listens)
         try:
-            planned.run(self._rig, series.stop, told, live=self._live, listens=self._listens)
+            planned.run(
+                self._rig,
+                series.stop,
+                told,
+                live=self._live,
+                listens=self._listens,
+                looks=self._looks,
+            )
         except SessionFailedError as error:
             told.ended(error.result())
             raise
@@ -555,8 +687,27 @@ class Service:
         )
         self._publish({"event": "state", **transition_document(transition)})
 
+    def _tell_look(self, look: QuickLook) -> None:
+        """Tell of a quick look; called in either thread."""
+        if self._series is not None:
+            look.note(self._series.results)
+        for line in look.lines:
+            _log.info("%s", line)
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(
+                self._publish, {"event": "quick_look", **look.as_dict()}
+            )
+
     async def _call(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, function)
+
+
+async def _aside(job: aside.PredictionJob | aside.CheckJob) -> Document:
+    """Have a job done in a process of its own."""
+    try:
+        return await aside.perform(job)
+    except aside.AsideError as error:
+        raise CommandError(str(error), wrong_use=error.wrong_use) from None
 
 
 class _Told:
@@ -569,7 +720,9 @@ class _Told:
 
     def begins(self, number: int, path: Path) -> None:
         if not self._listens():
-            raise RigError("The daemon hears nobody: no further session is begun.")
+            raise RigError(
+                "The daemon does not respond to requests: no further session is started."
+            )
         self._series.session, self._series.path = number, path
 
     def shown(self, where: str) -> None:
@@ -583,26 +736,14 @@ class _Told:
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
-        counts = {
-            "ticks scheduled": result.scheduled,
-            "recorded": result.recorded,
-            "missed": result.missed,
-            "late": result.late,
-            "lost": result.lost,
-            "stale angles": result.stale_angles,
-            "stale wrenches": result.stale_wrenches,
-            "not shown live": result.live_dropped,
-        }
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
-            "series %d: session %d of %d: %s, %s: %s%s",
+            "series %d: session %d of %d, %s: %s",
             series.number,
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            result.outcome,
-            ", ".join(f"{'unknown' if n is None else n} {name}" for name, n in counts.items()),
-            f": {result.reason}" if result.reason else "",
+            result_line(result.as_dict()),
         )
         self._publish({"event": "session", "number": series.session, **result.as_dict()})
 

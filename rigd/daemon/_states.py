@@ -1,5 +1,6 @@
 """States of the daemon, their transitions, and the daemon's status as JSON documents."""
 
+import base64
 import os
 import pwd
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 from rigd.engine import PROCESSES, Phase
 from rigd.live import LiveAddress
-from rigd.runner import ProcessStatus, RigStatus
+from rigd.runner import ProcessStatus, RigStatus, SignalBlock
 
 _REMEMBERED = 50
 
@@ -135,7 +136,7 @@ class StateMachine:
             return ""
         why = f" ({self.reason.rstrip('.')})" if self.state is State.FAULT else ""
         return (
-            f"{command} is for a rig that is {_ADJECTIVES[wanted]}, and this one is "
+            f"{command} needs a rig that is {_ADJECTIVES[wanted]}; this one is "
             f"{_ADJECTIVES[self.state]}{why}: {_REMEDIES[self.state]}."
         )
 
@@ -232,6 +233,41 @@ def rig_document(look: RigStatus, rates: Mapping[str, float | None]) -> Document
     }
 
 
+def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | None) -> Document:
+    """Tell what the signals were over some ticks.
+
+    Parameters
+    ----------
+    block
+        Signals and gauges.
+    rate_hz
+        Ticks a second.
+    frequency_hz
+        Frequency of the excitation at the last of them.
+    """
+    return {
+        "event": "signals",
+        "first_tick": block.first_tick,
+        "count": block.count,
+        "rate_hz": rate_hz,
+        "t_ns": block.t_ns,
+        **{
+            name: base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
+            for name, values in block.signals.items()
+        },
+        "gauges": {
+            name: {
+                "value": gauge.value,
+                "limit": gauge.limit,
+                "unit": gauge.unit,
+                "fraction": gauge.fraction,
+            }
+            for name, gauge in block.gauges.items()
+        },
+        "frequency_hz": frequency_hz,
+    }
+
+
 def _finite(values: Mapping[str, float]) -> Document:
     """Return numbers as JSON can have them."""
     return {name: value if isfinite(value) else None for name, value in values.items()}
@@ -283,6 +319,9 @@ def daemon_document(
     told: str,
     fast: bool,
     live: bool,
+    web: str | None,
+    calibration: Mapping[str, Any] | None,
+    quick_looks: bool,
     began_utc_ns: int,
 ) -> Document:
     """Tell which daemon this is."""
@@ -298,6 +337,14 @@ def daemon_document(
         "output": output,
         "fast": fast,
         "live": live,
+        "web": web,
+        "calibration": None
+        if calibration is None
+        else {
+            "serial": str(calibration.get("serial_number", "")),
+            "age": str(calibration.get("calibration_date", "")),
+        },
+        "quick_looks": quick_looks,
         "since_utc_ns": began_utc_ns,
     }
 

@@ -9,7 +9,6 @@ means that the supervisor is gone. Its standard output brings its answers (`_mes
 """
 
 import contextlib
-import ctypes
 import os
 import select
 import signal
@@ -23,12 +22,11 @@ from typing import Any
 from rigd.engine._messages import MessageReader, encode, is_ready
 from rigd.engine._shared_state import Word
 from rigd.errors import FailureError
-from rigd.runtime import SINGLE_THREADED, held_back
+from rigd.runtime import SINGLE_THREADED, held_back, signal_when_orphaned
 
 _WRITE_PATIENCE_S = 5.0
 _SILENT_GRACE_S = 1.0
 _KILLED_GRACE_S = 2.0
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 # Both ends
@@ -192,7 +190,9 @@ class Parent:
     def __init__(self) -> None:
         self._messages = MessageReader(sys.stdin.fileno())
         self._pid = int(sys.argv[1])
-        _go_on_when_orphaned()
+        # A recorder that is suspended has samples to write down, a control process devices to let
+        # go of.
+        signal_when_orphaned(signal.SIGCONT)
 
     def receive_job(self) -> Any:  # noqa: ANN401 - the child knows what it was sent
         """Wait for the job; ends the process quietly if the supervisor ends without one."""
@@ -219,15 +219,6 @@ class Parent:
     def alive(self) -> bool:
         """Whether the supervisor still runs; cheap enough for the loop."""
         return os.getppid() == self._pid
-
-
-def _go_on_when_orphaned() -> None:
-    """Have the system end a suspension when the supervisor ends, for nobody else would then.
-
-    A recorder has samples to write down; a control process has devices to let go of.
-    """
-    with contextlib.suppress(AttributeError):  # Linux has it, others do without
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
 # Table of processes
@@ -315,7 +306,7 @@ class Pulse:
         Parameters
         ----------
         beat
-            Count that the process adds to while it is at work.
+            Count that the process adds to while it is running.
         now_s
             Time of a monotonic clock.
         """

@@ -9,4 +9,5 @@ from ._signals import ExcitationError as ExcitationError
 from ._signals import chirp as chirp
 from ._signals import hold as hold
 from ._signals import multisine as multisine
+from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step

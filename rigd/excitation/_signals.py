@@ -47,6 +47,30 @@ class Excitation:
     segments: Mapping[str, tuple[int, int]]
 
 
+def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
+    """Return the frequency that a chirp has at a tick; None of others, and before and after it.
+
+    Parameters
+    ----------
+    excitation
+        Any excitation.
+    tick
+        Tick of the record.
+
+    Examples
+    --------
+    >>> from rigd.excitation import chirp, present_frequency_hz
+    >>> sweep = chirp(rate_hz=1000, start_hz=0, stop_hz=50, duration_s=100, rest_s=1)
+    >>> present_frequency_hz(sweep, 51_000), present_frequency_hz(sweep, 0)
+    (25.0, None)
+    """
+    first, end = excitation.segments["sweep"]
+    if excitation.kind != "chirp" or not first <= tick < end:
+        return None
+    start_hz, stop_hz = (float(excitation.parameters[name]) for name in ("start_hz", "stop_hz"))
+    return start_hz + (stop_hz - start_hz) * (tick - first) / (end - first)
+
+
 # Checks of options
 
 

@@ -6,10 +6,14 @@ from ._load import load_profile as load_profile
 from ._places import WORKING_FOLDER as WORKING_FOLDER
 from ._places import ProfileFile as ProfileFile
 from ._places import profile_files as profile_files
+from ._places import specimen_files as specimen_files
 from ._places import user_folder as user_folder
 from ._schema import Profile as Profile
 from ._schema import RealtimeSettings as RealtimeSettings
 from ._schema import SessionSettings as SessionSettings
+from ._schema import Specimen as Specimen
+from ._specimen import load_specimen as load_specimen
+from ._specimen import with_specimen as with_specimen
 from ._write import check_new as check_new
 from ._write import copy_profile as copy_profile
 from ._write import write_new as write_new

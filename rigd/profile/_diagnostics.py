@@ -19,6 +19,7 @@ from rigd.devices.ati import RECORD_BITS
 from rigd.devices.cia402 import ACCEPTABLE, parse_assignment
 from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
 from rigd.safety import BUFFERED_S
+from rigd.session import NOTES, MetadataError, check_name
 from rigd.units import UNITS, suffix_of, unit_of
 
 _UNITS_OF_SIX = {
@@ -74,7 +75,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     if peak >= rated and continuous > peak:
         yield (
             f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
-            f"{peak:g} N·m; what a motor bears for ever is at most its peak."
+            f"{peak:g} N·m; continuous torque must not exceed peak torque."
         )
     asked = values["limits.torque_command_nm"]
     if asked < peak:
@@ -96,6 +97,27 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"limits.tare_drift_nm = {drift:g} N·m, which ends a session, is below "
             f"session.tare_drift_nm = {warning:g} N·m, which warns; it has to be the greater one."
         )
+    yield from first_mode(values)
+    if not any(values["sensor.projection"]):
+        yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
+    for name in values["metadata.required"]:
+        try:
+            if name not in NOTES:
+                check_name(name)
+        except MetadataError as error:
+            yield f"metadata.required: {error}"
+    try:
+        design_pid(
+            values["motor.inertia_kg_m2"],
+            values["motor.viscous_nm_s_per_rad"],
+            values["control.pole_rad_s"],
+        )
+    except ControlDesignError as error:
+        yield str(error)
+
+
+def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is wrong with a beam whose numbers are each in range: a unit, as a rule."""
     first_mode_hz = float(
         undamped_frequencies_rad_s(
             Beam(
@@ -113,16 +135,6 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"mode at {first_mode_hz:.3g} Hz, outside {low_hz:g} to {high_hz:g} Hz; check their "
             "units."
         )
-    if not any(values["sensor.projection"]):
-        yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
-    try:
-        design_pid(
-            values["motor.inertia_kg_m2"],
-            values["motor.viscous_nm_s_per_rad"],
-            values["control.pole_rad_s"],
-        )
-    except ControlDesignError as error:
-        yield str(error)
 
 
 def _not_beside_air(values: Mapping[str, Any]) -> Iterator[str]:

@@ -7,7 +7,7 @@ reported at once.
 """
 
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -62,13 +62,23 @@ def load_profile(name_or_path: str | Path) -> Profile:
     (1000.0, 0.98)
     """
     path = _find(name_or_path)
+    return profile_of(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises
+    ------
+    ProfileError
+        If it cannot be read, or is no text.
+    """
     try:
-        text = path.read_bytes().decode("utf-8")
+        return path.read_bytes().decode("utf-8")
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read ({error.strerror}).") from error
     except UnicodeDecodeError as error:
         raise ProfileError(f"{path}: is not a text file in UTF-8; save it as one.") from error
-    return profile_of(text, path)
 
 
 def profile_of(text: str, path: Path) -> Profile:
@@ -79,21 +89,19 @@ def profile_of(text: str, path: Path) -> Profile:
     ProfileError
         As :func:`load_profile`.
     """
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
-
+    document = parse(text, path)
     problems: list[str] = []
-    values, sources = _flatten(document, problems)
-    values = _validate(values, problems)
+    values, sources = flatten(document, problems)
+    absent = {
+        name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in values)
+    }
+    values = validate(values, problems, frozenset(absent))
     if not problems:
         problems.extend(_find_eds(path, values))
         problems.extend(diagnostics.contradictions(values))
         problems.extend(diagnostics.wiring_contradictions(values))
     if problems:
-        # An array that is too short is found once for each number it lacks.
-        raise ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
+        raise complaint(path, problems)
 
     section = {name: _build(name, values) for name in SECTIONS if _present(name, document)}
     return Profile(
@@ -122,8 +130,30 @@ def profile_of(text: str, path: Path) -> Profile:
         limits=section["limits"],
         session=section["session"],
         realtime=section["realtime"],
+        metadata=section["metadata"],
+        uncertainty=section["uncertainty"],
         sources=sources,
     )
+
+
+def parse(text: str, path: Path) -> dict[str, Any]:
+    """Return the document of a TOML text.
+
+    Raises
+    ------
+    ProfileError
+        If it is none.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(f"{path}: is not valid TOML: {error}.") from error
+
+
+def complaint(path: Path, problems: Iterable[str]) -> ProfileError:
+    """Return the error with one line a problem of a file."""
+    # An array that is too short is found once for each number it lacks.
+    return ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
 
 
 def _find(name_or_path: str | Path) -> Path:
@@ -167,7 +197,7 @@ def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _flatten(
+def flatten(
     document: Mapping[str, Any], problems: list[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Take the document apart into dotted keys, and the sources off the numbers."""
@@ -209,15 +239,24 @@ def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]
             yield dotted, entry
 
 
-def _validate(values: Mapping[str, Any], problems: list[str]) -> dict[str, Any]:
-    """Check types and ranges; returns the values as their dataclasses take them."""
+def validate(
+    values: Mapping[str, Any], problems: list[str], absent: frozenset[str]
+) -> dict[str, Any]:
+    """Check types and ranges; returns the values as their dataclasses take them.
+
+    Parameters
+    ----------
+    values
+        Values by their dotted keys.
+    problems
+        Gets a sentence for each of them.
+    absent
+        Sections that the file does without; the top, with its texts, is an empty name.
+    """
     # TOML knows only arrays, and strict validation wants tuples.
     given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    absent = {
-        name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in given)
-    }
     try:
-        model = _schema(frozenset(absent)).model_validate(given)
+        model = _schema(absent).model_validate(given)
     except ValidationError as error:
         details = error.errors(include_url=False)
         missing = [str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]]
@@ -237,7 +276,7 @@ def _schema(absent: frozenset[str]) -> type[BaseModel]:
     definitions: dict[str, Any] = {
         f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
         for index, (key, annotation) in enumerate(keys().items())
-        if key.partition(".")[0] not in absent
+        if key.rpartition(".")[0] not in absent
     }
     config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     return create_model("Profile", __config__=config, **definitions)

@@ -1,4 +1,4 @@
-"""Places of named profiles: the working folder, the user's own folder, those shipped."""
+"""Places of named profiles and specimens: the working folder, the user's own, those shipped."""
 
 import os
 from collections.abc import Iterator
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 WORKING_FOLDER: Final = Path("hw_profiles")
+SPECIMENS_HERE: Final = Path("specimens")
 _PACKAGE: Final = Path(__file__).resolve().parent
 _IN_WHEEL: Final = _PACKAGE / "shipped"
 """Where the build puts the project's profiles (see pyproject.toml)."""
@@ -50,6 +51,20 @@ def profile_files() -> dict[str, list[ProfileFile]]:
     for origin, folder in _folders():
         for path in folder.glob("*.toml"):
             found.setdefault(path.stem, []).append(ProfileFile(path.stem, path, origin))
+    return dict(sorted(found.items()))
+
+
+def specimen_files() -> dict[str, Path]:
+    """Return the file of each specimen by name, in alphabetical order.
+
+    It is that of ``specimens`` in the working folder, or else that of the user's own folder
+    (``$XDG_CONFIG_HOME/rigd/specimens``).
+    """
+    own = user_folder()
+    found: dict[str, Path] = {}
+    for folder in (SPECIMENS_HERE, *([own.with_name("specimens")] if own else [])):
+        for path in folder.glob("*.toml"):
+            found.setdefault(path.stem, path)
     return dict(sorted(found.items()))
 
 

@@ -1,7 +1,7 @@
 """Schema of a profile: its sections, and the settings that no other module declares."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -23,7 +23,7 @@ from rigd.devices import (
     ServoDrive,
     Simulation,
 )
-from rigd.devices.parameters import WrenchSensor
+from rigd.devices.parameters import OPTIONAL, WrenchSensor
 from rigd.safety import Limits
 
 
@@ -69,12 +69,46 @@ class RealtimeSettings:
         return self.priority // 4
 
 
+_RelativePercent = Annotated[float, Ge(0), Le(50)]
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleUncertainty:
+    """Relative standard uncertainties (k = 1) of what all sessions of a rig have in common.
+
+    They do not average out, and no session shows them: an analysis adds them to its statistical
+    intervals. Zero: not stated.
+    """
+
+    torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Scale of the torque over the angle: calibration and mounting of the sensor."""
+    length_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Length of the beam."""
+    density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
+    """Mass per length of the beam, such as from weighing it."""
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """Those that the profile states, by the names of the fields."""
+        return {
+            each.name: value for each in fields(self) if (value := getattr(self, each.name)) > 0
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class MetadataSettings:
+    """Metadata of the sessions."""
+
+    required: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
+    """Names of what a session must be given: metadata, ``operator``, ``specimen`` or ``note``."""
+
+
 @dataclass(frozen=True, slots=True)
 class RigSection:
     """Settings of the rig as a whole."""
 
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
-    """Slower loops look too seldom at who else is at work."""
+    """Slower loops check the other processes too seldom."""
 
 
 SECTIONS: dict[str, type] = {
@@ -89,6 +123,7 @@ SECTIONS: dict[str, type] = {
     "limits": Limits,
     "session": SessionSettings,
     "realtime": RealtimeSettings,
+    "metadata": MetadataSettings,
     "devices": Selection,
     "can": CanBus,
     "acquisition": Acquisition,
@@ -96,6 +131,7 @@ SECTIONS: dict[str, type] = {
     "ati_can": AtiCan,
     "ati_serial": AtiSerial,
     "simulation": Simulation,
+    "uncertainty": ScaleUncertainty,
 }
 WIRING = {
     "cia402": ("can", "acquisition", "cia402"),
@@ -154,6 +190,26 @@ def fields_of(section: str) -> list[tuple[str, str]]:
 
 
 @dataclass(frozen=True, slots=True)
+class Specimen:
+    """One specimen, as a file of its own describes it."""
+
+    name: str
+    """Name of the file without ``.toml``, by which sessions name the specimen."""
+    path: Path
+    """The file."""
+    text: str
+    """The file as read, for the session that uses it."""
+    beam: Beam
+    """Its beam."""
+    damping: Damping | None
+    """Its nominal damping; None: that of the profile."""
+    uncertainty: ScaleUncertainty
+    """How well its length and density are known; the torque's scale is the rig's."""
+    note: str
+    """Whatever else is to be known of it."""
+
+
+@dataclass(frozen=True, slots=True)
 class Profile:
     """One rig, as its profile describes it."""
 
@@ -175,10 +231,18 @@ class Profile:
     """Settings round a record."""
     realtime: RealtimeSettings
     """What its processes ask of the operating system."""
+    metadata: MetadataSettings
+    """What its sessions must be given."""
+    uncertainty: ScaleUncertainty
+    """How well the scales are known that no session shows."""
     sources: Mapping[str, str]
     """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None
     """The motor that the controller is designed for, where that is not the profile's."""
+    specimen: Specimen | None = None
+    """Specimen that is mounted, where a file describes it: the rig's beam is its own then."""
+    specimen_in_words: str = ""
+    """The same for the operator, with what is otherwise than the profile has it."""
 
     @property
     def control_motor(self) -> Motor:

@@ -12,6 +12,8 @@ from ._planning import plan_document as plan_document
 from ._planning import plan_session as plan_session
 from ._planning import predict_session as predict_session
 from ._process_group import ProcessGroup as ProcessGroup
+from ._quick_looks import QuickLook as QuickLook
+from ._quick_looks import QuickLooks as QuickLooks
 from ._request import NoRoomError as NoRoomError
 from ._request import Order as Order
 from ._request import load_rig as load_rig
@@ -24,5 +26,7 @@ from ._series import SessionRig as SessionRig
 from ._session import SessionFailedError as SessionFailedError
 from ._session import SessionProgress as SessionProgress
 from ._session import SessionResult as SessionResult
+from ._signals import Gauge as Gauge
+from ._signals import SignalBlock as SignalBlock
 from ._status import ProcessStatus as ProcessStatus
 from ._status import RigStatus as RigStatus

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from rigd.engine import Phase
+from rigd.printable import BAR_STYLES, counts_text
 
 _PATIENCE_S: Final = 2.0
 """Longest wait for a terminal that was stopped, at the end of a session."""
@@ -27,18 +28,19 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     limits = plan.get("limits", {})
 
     def peak(name: str, unit: str) -> str:
-        limit = f" of {limits[name]:g}" if name in limits else ""
-        return f"{plan[f'peak_{name}']:.3g}{limit} {unit}"
+        limit = f" (limit {limits[name]:g})" if name in limits else ""
+        return f"{plan[f'peak_{name}']:.3g} {unit}{limit}"
 
-    what = f"{plan['excitation']} on {plan['profile']}: " if "profile" in plan else ""
+    what = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
     sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
-    yield f"{what}{sweep}{plan['record_s']:g} s of record."
+    yield f"{what}{sweep}record of {plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
     )
-    if words := plan.get("tip_in_words"):
-        yield words
+    for words in ("specimen_in_words", "tip_in_words"):
+        if plan.get(words):
+            yield plan[words]
     for warning in plan["warnings"]:
         yield f"Warning: {warning}"
 
@@ -51,17 +53,13 @@ def result_line(session: Mapping[str, Any]) -> str:
     session
         As :meth:`rigd.runner.SessionResult.as_dict` gives it.
     """
+    outcome = session["outcome"].capitalize()
     reason = f" {session['reason']}" if session["reason"] else ""
     if session["part"] is not None:
-        return f"{session['outcome']}: no whole record, but {session['part']}.{reason}"
+        return f"{outcome}: file incomplete, {session['part']}.{reason}"
     if session["path"] is None:
-        return f"{session['outcome']}: no record.{reason}"
-    return (
-        f"{session['outcome']}: {session['scheduled']} ticks scheduled = {session['recorded']} "
-        f"recorded + {session['missed']} missed + {session['lost']} lost; "
-        f"{session['late']} late; {session['stale_angles']} stale angles, "
-        f"{session['stale_wrenches']} stale wrenches.{reason}"
-    )
+        return f"{outcome}: no record.{reason}"
+    return f"{outcome}: {counts_text(session)}.{reason}"
 
 
 class ProgressLine:
@@ -75,6 +73,7 @@ class ProgressLine:
         # Only now: the processes of the session are on their way.
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.theme import Theme
 
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -82,7 +81,7 @@ class ProgressLine:
             TextColumn("{task.percentage:3.0f} %"),
             TimeRemainingColumn(),
             TextColumn("{task.fields[counts]}"),
-            console=Console(stderr=True),
+            console=Console(stderr=True, theme=Theme(BAR_STYLES)),
             transient=True,
             auto_refresh=False,
         )
@@ -91,6 +90,7 @@ class ProgressLine:
         self._state: dict[str, Any] = {}
         self._messages: list[str] = []
         self._closed = False
+        self._recorded = False
         self._changed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -111,9 +111,11 @@ class ProgressLine:
         number
             Number of the session in its series, such as ``2/5``; empty if it is the only one.
         """
+        # Before tick 0 the count is the last session's.
+        self._recorded |= phase is Phase.RUNNING
         self._state = {
             "description": f"{phase.words} {number}".rstrip(),
-            "completed": tick,
+            "completed": tick if self._recorded else 0,
             "total": total,
             "counts": f"{missed} missed, {late} late" if missed else "",
         }

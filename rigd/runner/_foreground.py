@@ -1,10 +1,11 @@
 """Sessions in the foreground: plan, tell the operator, run with progress, tell how it ended."""
 
 import contextlib
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 import typer
 
@@ -12,14 +13,19 @@ from rigd.devices import WhatMoves, simulated_differently, what_moves
 from rigd.engine import Event
 from rigd.errors import FailureError, RigdError
 from rigd.excitation import Excitation
-from rigd.profile import Profile
+from rigd.profile import Profile, with_specimen
 from rigd.runner._console import ProgressLine, plan_lines, result_line
 from rigd.runner._process_group import ProcessGroup
+from rigd.runner._quick_looks import QuickLook, QuickLooks
 from rigd.runner._request import load_rig, what_is_kept
 from rigd.runner._rig import Rig
 from rigd.runner._series import Series
 from rigd.runner._session import SessionFailedError, SessionProgress, SessionResult
 from rigd.runtime import RigLock, StopRequest
+
+_LOOK_PATIENCE_S: Final = 10.0
+"""Longest wait for the last quick look at the end."""
+_POLL_S: Final = 0.05
 
 _Tell = Callable[[str], None]
 
@@ -60,6 +66,7 @@ def run_in_foreground(
     force: bool,
     quiet_stdout: bool,
     hardware: bool = False,
+    look: bool = False,
     prepare: Callable[[Profile], Profile] | None = None,
 ) -> list[SessionResult]:
     """Run `repeat` sessions, up to a stop or the first that does not end well.
@@ -81,6 +88,8 @@ def run_in_foreground(
         waits until the beam has come to rest.
     quiet_stdout
         Tell the operator on standard error, because standard output is for a document.
+    look
+        Take a quick look at each session, and wait some seconds for the last one.
     prepare
         Changes the profile before it is planned with.
 
@@ -93,6 +102,13 @@ def run_in_foreground(
     """
     tell: _Tell = partial(_tell, err=quiet_stdout)
     results: list[SessionResult] = []
+
+    def told(look: QuickLook) -> None:
+        look.note(results)
+        for line in look.lines:
+            tell(line)
+
+    looks = QuickLooks(told) if look else None
     try:
         # The rig is given up last, when nobody has hold of the devices any more.
         with contextlib.ExitStack() as reserved, crew:
@@ -105,8 +121,9 @@ def run_in_foreground(
             alone = not (fast and moving is WhatMoves.SIMULATED)
             shared = moving is WhatMoves.HARDWARE
             reserved.enter_context(RigLock(profile.name, "rigd run", hardware=shared, alone=alone))
+            mounted = with_specimen(profile, notes.get("specimen", ""))
             series = Series(
-                profile, build(profile), folder, repeat=repeat, notes=notes, force=force
+                mounted, build(mounted), folder, repeat=repeat, notes=notes, force=force
             )
             results = series.results
             for line in plan_lines(series.plan_document()):
@@ -115,9 +132,11 @@ def run_in_foreground(
             if not stop.requested:
                 rig.connect(moving)
             with _Operator(series.ticks, repeat, tell) as operator:
-                series.run(rig, stop, operator, live=live)
+                series.run(rig, stop, operator, live=live, looks=looks)
         if stop.requested:
             _tell_stop(results, repeat)
+        if looks is not None:
+            _await_looks(looks, stop)
     except SessionFailedError as error:
         # Its processes have ended, so that what they have left can be told.
         results.append(error.result())
@@ -126,6 +145,9 @@ def run_in_foreground(
         if error.wrong_use and not results:
             raise
         raise SeriesFailedError(str(error), results) from error
+    finally:
+        if looks is not None:
+            looks.close()
     return results
 
 
@@ -174,9 +196,7 @@ class _Operator:
         self._tell(result_line(result.as_dict()))
         if result.path is not None:
             if result.live_dropped:
-                self._tell(
-                    f"The live view missed {result.live_dropped} samples; the file has them."
-                )
+                self._tell(f"The viewer dropped {result.live_dropped} samples; the file has them.")
             self._tell(str(result.path))
 
     def _close(self) -> None:
@@ -190,9 +210,30 @@ def _tell(text: str, *, err: bool) -> None:
         typer.echo(text, err=err)
 
 
+def _await_looks(looks: QuickLooks, stop: StopRequest) -> None:
+    """Give the last quick looks their time; another Ctrl-C skips them."""
+    before, skipped = stop.requested, False
+
+    def skip() -> None:
+        nonlocal skipped
+        skipped = True
+
+    stop.on_request = skip
+    looks.attend()
+    if looks.busy:
+        _tell("Quick look at the session; Ctrl-C skips it.", err=True)
+    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+    while looks.busy and not skipped and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        looks.attend()
+    if looks.busy and not skipped:
+        _tell("The quick look takes too long and is left out.", err=True)
+    stop.requested = before  # what was skipped is no session
+
+
 def _tell_stop(results: Sequence[SessionResult], repeat: int) -> None:
     """Tell of a stop between two sessions or before the first; within one, the session tells."""
     if len(results) == repeat or any(not result.went_well for result in results):
         return
     after = f" after {len(results)} of {repeat} sessions" if results else ""
-    _tell(f"stopped: no record{after}. Stopped by the operator before the session began.", err=True)
+    _tell(f"Stopped: no record{after}. Stopped by the operator before the session began.", err=True)

@@ -85,7 +85,7 @@ class LiveView:
         return f"Live view: {self.address.viewer_url}"
 
     def look(self) -> None:
-        """See whether it is at work; if it died or hangs, start it again."""
+        """See whether it is running; if it died or hangs, start it again."""
         if not self._lost:
             self._listen(0.0)
         if not self._lost:

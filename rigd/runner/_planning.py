@@ -239,15 +239,23 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
         "excitation": excitation.kind,
         "sweep": _sweep_in_words(excitation),
         "profile": profile.name,
+        "parameters": dict(excitation.parameters),
+        "segments": {name: list(ends) for name, ends in excitation.segments.items()},
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
         **asdict(plan.prediction),
         "limits": {
             "angle_rad": profile.limits.angle_rad,
             "velocity_rad_s": profile.limits.velocity_rad_s,
             "torque_nm": profile.rig.motor.peak_torque_nm,
+            "tracking_error_rad": profile.limits.tracking_error_rad,
+            "coupling_torque_nm": _sensor_limit_nm(profile),
+            "tip_slope_rad": SMALL_SLOPE_RAD,
         },
         "refused": plan.refused or None,
         "tip_in_words": plan.tip_in_words,
+        "beam": asdict(profile.rig.beam),
+        "damping": asdict(profile.rig.damping),
+        "specimen_in_words": profile.specimen_in_words,
         "warnings": list(plan.warnings),
     }
 
@@ -293,25 +301,56 @@ def _peaks(reference_rad: Real, response: LoopResponse, tip: TipMotion | None = 
     )
 
 
+def predicted_metadata(profile: Profile, predicted: Prediction) -> dict[str, str]:
+    """Return the predicted peaks and their limits as a session's file has them.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig, with its limits.
+    predicted
+        What the session is predicted to do.
+
+    Returns
+    -------
+    dict of str to str
+        ``predicted_peak_…`` and ``limit_…``, their units in the names.
+    """
+    firm, forcible = _limited(profile, predicted)
+    metadata = {}
+    for peak in (*firm, *forcible):
+        metadata[f"predicted_peak_{_KEYS[peak.name]}"] = repr(peak.value)
+        metadata[f"limit_{_KEYS[peak.name]}"] = repr(peak.limit)
+    return metadata
+
+
 def _tip_in_words(predicted: Prediction, beam: Beam) -> str:
     tip = predicted.tip
     if tip is None:
         return ""
     share = tip.deflection_m / beam.length_m
     motion = (
-        f"Predicted tip motion: {tip.deflection_m:.3g} m from the line of the root "
-        f"({100 * share:.2g} % of the length), {tip.speed_m_s:.3g} m/s through the air, slope "
-        f"{tip.slope_rad:.2g} rad."
+        f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * share:.2g} % of the length), "
+        f"tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
     )
     if not tip.slope_rad > SMALL_SLOPE_RAD:
         return motion
     lower = math.floor(100 * SMALL_SLOPE_RAD / tip.slope_rad) / 100
     within = f"; {lower:g} times the amplitude stays within" if lower > 0 else ""
     return (
-        f"{motion} Slopes beyond {SMALL_SLOPE_RAD:g} rad are not small: the linear model leaves "
-        f"out up to {100 * tip.slope_rad**2 / 3:.2g} % of what bends and moves, and air drag may "
-        f"limit the motion{within}."
+        f"{motion} At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error "
+        f"up to {100 * tip.slope_rad**2 / 3:.2g} %), and air drag may limit the motion{within}."
     )
+
+
+_KEYS = {
+    "angle": "angle_rad",
+    "speed": "velocity_rad_s",
+    "tracking error": "tracking_error_rad",
+    "coupling torque": "coupling_torque_nm",
+    "torque": "torque_nm",
+}
+"""Names of the limited peaks as keys of metadata."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,12 @@ import os
 import platform
 import shlex
 import shutil
+import subprocess
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 from rigd import __version__
@@ -31,11 +33,13 @@ from rigd.printable import printable
 from rigd.profile import Profile, load_profile
 from rigd.runner._planning import RefusedError
 from rigd.safety import Limits
-from rigd.session import PART_SUFFIX
+from rigd.session import META_PREFIX, NOTES, PART_SUFFIX
+from rigd.units import unit_of
 
 # Uncompressed: sample, ages, the controller's terms and the index; a file never takes more.
 _BYTES_PER_TICK = 260
 _BYTES_SPARE = 1_000_000
+_GIT_PATIENCE_S = 2.0
 
 
 class NoRoomError(RefusedError):
@@ -53,7 +57,9 @@ class Order:
     path: Path
     """Final name of the session file."""
     notes: tuple[tuple[str, str], ...] = ()
-    """Operator, specimen, note, number in a series: metadata as given."""
+    """Operator, specimen, note, number in a series, added metadata: metadata as given."""
+    predicted: tuple[tuple[str, str], ...] = ()
+    """Predicted peaks and their limits, as metadata."""
 
 
 def load_rig(
@@ -80,6 +86,7 @@ def load_rig(
         If its devices cannot share their bus, an option does not go with what would move, or a
         simulated rig is running that cannot be reached, so that the hardware may not be meant.
     """
+    software_commit()  # which takes its time: not while the motor is held for the file's header
     profile = load_profile(name)
     check_selection(profile.rig.devices, profile.path)
     refusals = objections(profile.rig)
@@ -127,6 +134,41 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
             f"not reach, and the hardware would move instead. Either {remedy}, or end it, or give "
             "--hardware if the hardware is meant."
         )
+
+
+def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
+    """See that a session is given all that its profile requires.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    notes
+        What was given, by its keys in the session file.
+
+    Raises
+    ------
+    RefusedError
+        Naming what is missing, and the options for it.
+    """
+    missing = [
+        name
+        for name in profile.metadata.required
+        if not notes.get(name if name in NOTES else META_PREFIX + name)
+    ]
+    if missing:
+        options = (
+            f"--{name} …" if name in NOTES else f"--meta {name}=…{_in_unit(name)}"
+            for name in missing
+        )
+        raise RefusedError(
+            f"{profile.path}: metadata.required asks each session for {', '.join(missing)}; add "
+            f"{' '.join(options)}."
+        )
+
+
+def _in_unit(name: str) -> str:
+    return f" ({unit_of(name)})" if unit_of(name) else ""
 
 
 def make_folder(folder: Path) -> None:
@@ -266,11 +308,13 @@ def file_header(order: Order, connected: Connected, tare: Mapping[str, str]) -> 
     tare
         Metadata of the tare.
     """
+    specimen = order.profile.specimen
     return FileHeader(
         metadata=_metadata(order, connected, tare),
         segments=dict(order.excitation.segments),
         attachments={
             "profile.toml": order.profile.text,
+            **({} if specimen is None else {"specimen.toml": specimen.text}),
             "calibration.json": json.dumps(connected.calibration, indent=1),
         },
     )
@@ -290,18 +334,24 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
         "angle_delay_s": repr(rig.encoder.delay_s),
         "torque_delay_s": repr(rig.sensor.delay_s),
         "actuation_delay_s": repr(rig.actuation.delay_s),
+        **{f"uncertainty_{k}": repr(v) for k, v in order.profile.uncertainty.stated.items()},
         "sensor_projection": ",".join(map(repr, rig.sensor.projection)),
         "drive": rig.devices.drive,
         "sensor": rig.devices.sensor,
         "simulated": str(connected.simulated).lower(),
         "profile": order.profile.name,
         "software": f"rigd {__version__}",
+        **software_commit(),
         "host": platform.node(),
         **{f"realtime_{name}": value for name, value in connected.realtime.items()},
         **connected.drive,
         **tare,
+        **dict(order.predicted),
         **dict(order.notes),
     }
+    serial_number = connected.calibration.get("serial_number")
+    if isinstance(serial_number, str):
+        metadata["sensor_serial_number"] = serial_number
     differences = simulated_differently(rig)
     if differences:
         metadata["simulated_differently"] = "; ".join(differences)
@@ -317,6 +367,27 @@ def _metadata(order: Order, connected: Connected, tare: Mapping[str, str]) -> di
     if rig.devices.drive == "sim" and rig.simulation is not None:
         metadata["simulation_seed"] = str(rig.simulation.seed)
     return metadata
+
+
+@cache
+def software_commit() -> dict[str, str]:
+    """Return the commit of the checkout that this program runs from, as metadata; else nothing.
+
+    It is asked for once: what runs is what was there then.
+    """
+    checkout = Path(__file__).resolve().parents[2]
+    if not (checkout / ".git").exists():
+        return {}
+    command = ["git", "--no-optional-locks", "-C", str(checkout), "describe"]
+    command += ["--always", "--dirty", "--abbrev=12"]
+    try:
+        found = subprocess.run(
+            command, capture_output=True, text=True, timeout=_GIT_PATIENCE_S, check=True
+        )
+    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
+        return {}
+    commit = found.stdout.strip()
+    return {"software_commit": commit} if commit.isprintable() and commit else {}
 
 
 def _text(value: float | str) -> str:

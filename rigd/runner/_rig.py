@@ -4,7 +4,7 @@ import contextlib
 import gc
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -32,6 +32,7 @@ from rigd.runner._live_view import LiveView
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._request import Order
 from rigd.runner._session import Session, SessionFailedError, SessionResult, Watcher, always
+from rigd.runner._signals import SignalBlock, SignalReader
 from rigd.runner._status import RigStatus, StatusWatch
 from rigd.runtime import StopRequest
 
@@ -88,6 +89,7 @@ class Rig:
         self._precedence: Precedence | None = None
         self._looking = threading.Lock()
         self._statuses = StatusWatch(profile.rig.rate_hz)
+        self._signals = SignalReader(profile)
         self.connected = False
         self.zero_lost = False
 
@@ -95,6 +97,11 @@ class Rig:
     def simulated(self) -> bool:
         """Whether no motor moves; known once connected."""
         return self._told is not None and self._told.simulated
+
+    @property
+    def calibration(self) -> Mapping[str, Any] | None:
+        """Identity and calibration of the connected sensor; None while not connected."""
+        return None if self._told is None or not self.connected else self._told.calibration
 
     def connect(self, moving: WhatMoves | None = None, *, reset_fault: bool = False) -> None:
         """Start the processes and connect the devices; the torque stays off.
@@ -276,6 +283,17 @@ class Rig:
                 return None
             address = None if view is None else view.address
             return replace(self._statuses.look(crew), live_view=address)
+
+    def signals(self) -> list[SignalBlock]:
+        """Return what has come of the record since the last call, from any thread.
+
+        It begins with the first call, or anew where the last one is more than 1 s ago.
+        """
+        with self._looking:
+            crew = self._crew
+            if crew is None or not crew.laid_out:
+                return []
+            return self._signals.take(crew.channels)
 
     def disconnect(self) -> None:
         """Disable the drive, close the devices, end the processes; harmless when repeated."""

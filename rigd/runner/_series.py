@@ -4,17 +4,25 @@
 (`SeriesWatcher`).
 """
 
+import contextlib
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from rigd.engine import Event
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
-from rigd.runner._planning import plan_document, plan_session
-from rigd.runner._request import Order, choose_path, make_room
+from rigd.runner._planning import plan_document, plan_session, predicted_metadata
+from rigd.runner._quick_looks import QuickLooks
+from rigd.runner._request import Order, check_required, choose_path, make_room
 from rigd.runner._session import SessionProgress, SessionResult, Watcher, always
 from rigd.runtime import StopRequest
+
+_LOOK_PATIENCE_S: Final = 8.0
+"""Longest pause between two sessions of a series for the quick look at the first: two or three
+seconds are enough for most. What is not done by then is suspended."""
+_POLL_S: Final = 0.05
 
 
 class SessionRig(Protocol):
@@ -57,6 +65,9 @@ class SessionRig(Protocol):
             Its address, or why there is none, for the operator.
         """
 
+    def watch(self) -> None:
+        """See whether the rig is well; called some times a second between sessions."""
+
 
 class SeriesWatcher(Protocol):
     """Whoever is told of a series, in the order of these methods for each of its sessions."""
@@ -86,7 +97,8 @@ class Series:
     repeat
         Number of sessions.
     notes
-        Operator, specimen, note; what is empty is left out.
+        Operator, specimen, note and added metadata; what is empty is left out. The beam of a
+        specimen that has a file is in the profile already.
     force
         See :func:`rigd.runner._planning.plan_session`.
 
@@ -100,7 +112,8 @@ class Series:
     Raises
     ------
     RefusedError, ControlDesignError, RealisationError
-        If the sessions would leave the limits, or cannot be predicted.
+        If the sessions would leave the limits, cannot be predicted, or lack metadata that the
+        profile requires.
     NoRoomError
         If there is no room for the first one.
     """
@@ -120,6 +133,7 @@ class Series:
         self._folder = folder
         self._repeat = repeat
         self._notes = {name: text for name, text in (notes or {}).items() if text}
+        check_required(profile, self._notes)
         self.plan = plan_session(profile, excitation, force=force)
         self.results: list[SessionResult] = []
         self._make_room()
@@ -128,6 +142,10 @@ class Series:
     def ticks(self) -> int:
         """Ticks of each session's record."""
         return int(self._excitation.reference_rad.size)
+
+    def frequency_hz(self, tick: int) -> float | None:
+        """Return the frequency of the excitation at a tick, where it has one."""
+        return present_frequency_hz(self._excitation, tick)
 
     def plan_document(self) -> dict[str, Any]:
         """Return the plan as JSON documents have it."""
@@ -141,6 +159,7 @@ class Series:
         *,
         live: bool,
         listens: Callable[[], bool] = always,
+        looks: QuickLooks | None = None,
     ) -> None:
         """Run the sessions, up to a stop or the first that does not end well.
 
@@ -158,6 +177,8 @@ class Series:
             Show each session in a live view.
         listens
             See :class:`rigd.runner._session.Session`.
+        looks
+            Takes a quick look at each session; the next one waits some seconds for it.
 
         Raises
         ------
@@ -167,6 +188,8 @@ class Series:
             If a session cannot be run, or failed; it is not among the results.
         """
         for number in range(1, self._repeat + 1):
+            if looks is not None and number > 1:
+                _await_look(looks, rig, stop)
             if stop.requested:
                 return
             self._make_room()
@@ -174,14 +197,32 @@ class Series:
             path = choose_path(self._folder, self._excitation.kind, number if counted else None)
             notes = self._notes | ({"series": f"{number} of {self._repeat}"} if counted else {})
             watcher.begins(number, path)
-            order = Order(self._profile, self._excitation, path, tuple(notes.items()))
-            if live:
-                watcher.shown(rig.show(order, stop))
-            result = rig.run(order, stop, watcher.update, listens)
+            order = Order(
+                self._profile,
+                self._excitation,
+                path,
+                tuple(notes.items()),
+                tuple(predicted_metadata(self._profile, self.plan.prediction).items()),
+            )
+            with contextlib.nullcontext() if looks is None else looks.held():
+                if live:
+                    watcher.shown(rig.show(order, stop))
+                result = rig.run(order, stop, watcher.update, listens)
             self.results.append(result)
             watcher.ended(result)
+            if looks is not None and result.path is not None:
+                looks.begin(result.path)
             if not result.went_well:
                 return
 
     def _make_room(self) -> None:
         make_room(self._folder, self._excitation, self._profile.limits)
+
+
+def _await_look(looks: QuickLooks, rig: SessionRig, stop: StopRequest) -> None:
+    """Give the quick look at the last session its time, before the next one suspends it."""
+    deadline_s = time.monotonic() + _LOOK_PATIENCE_S
+    while looks.busy and not stop.requested and time.monotonic() < deadline_s:
+        rig.watch()
+        looks.attend()
+        time.sleep(_POLL_S)

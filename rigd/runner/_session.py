@@ -1,7 +1,7 @@
 """One session in the processes of a rig, watched from its start to its file.
 
 It moves nothing itself. It has the file opened before the drive is enabled, lets tick 0 happen when
-the recorder is ready, shows the progress, passes a stop on, sees that every process is at work, and
+the recorder is ready, shows the progress, passes a stop on, sees that every process is running, and
 has the file closed with the outcome.
 """
 
@@ -102,6 +102,7 @@ class SessionFailedError(FailureError):
             fault=True,
             part=part,
             hardware=self.hardware,
+            look=None,
             **self.counts,
         )
 
@@ -142,6 +143,8 @@ class SessionResult:
     """Path of an incomplete file that could not be completed."""
     hardware: bool | None = None
     """Whether it was the hardware that moved, and nothing simulated; None: not known."""
+    look: Path | None = None
+    """Path of the quick look at it; None: there is none, or none yet."""
 
     @property
     def went_well(self) -> bool:
@@ -163,6 +166,7 @@ class SessionResult:
             "stale_angles": self.stale_angles,
             "stale_wrenches": self.stale_wrenches,
             "hardware": self.hardware,
+            "look": None if self.look is None else str(self.look),
         }
 
 

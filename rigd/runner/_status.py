@@ -113,7 +113,7 @@ class ProcessStatus:
     pid: int
     """Process id."""
     state: str
-    """``at work``, ``waiting`` (for a session), ``hung`` or ``ended``."""
+    """``running``, ``waiting`` (for a session), ``hung`` or ``ended``."""
     still_s: float
     """Time without a heartbeat, as far as somebody looked."""
 
@@ -227,7 +227,7 @@ class StatusWatch:
         for process in PROCESSES:
             still_s = self._pulses[process].look(board[process.beat], now_s)
             if process is SUPERVISOR:
-                yield ProcessStatus(process.name, os.getpid(), "at work", still_s)
+                yield ProcessStatus(process.name, os.getpid(), "running", still_s)
                 continue
             if process not in crew:
                 continue
@@ -239,5 +239,5 @@ class StatusWatch:
             elif process.hung_after_s is not None and still_s > process.hung_after_s:
                 state = "hung"
             else:
-                state = "at work"
+                state = "running"
             yield ProcessStatus(process.name, child.pid, state, still_s)

@@ -16,3 +16,4 @@ from ._signals import held_back as held_back
 from ._signals import ignore as ignore
 from ._signals import let_pass as let_pass
 from ._signals import raise_on as raise_on
+from ._signals import signal_when_orphaned as signal_when_orphaned

@@ -7,6 +7,8 @@ process would leave its last torque on. The recorder and the live publisher let 
 (`ignore`): they end when the supervisor has no more use for them.
 """
 
+import contextlib
+import ctypes
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -15,6 +17,7 @@ from types import FrameType
 from typing import Final, NoReturn
 
 _REPEAT_S: Final = 0.01
+_PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 
 class Interruption(KeyboardInterrupt):
@@ -64,6 +67,15 @@ def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
     (number,) = lost.args
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
     signal.setitimer(signal.ITIMER_REAL, _REPEAT_S)
+
+
+def signal_when_orphaned(number: int) -> None:
+    """Have the system send this process a signal when the one that started it ends.
+
+    A process that is suspended gets it too; nobody would wake it otherwise.
+    """
+    with contextlib.suppress(AttributeError):  # Linux has it, others do without
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 # In the processes of a rig

@@ -14,8 +14,10 @@ from ._format import field_tag as field_tag
 from ._format import pack_control_into as pack_control_into
 from ._format import pack_sample_into as pack_sample_into
 from ._format import pack_timing_into as pack_timing_into
+from ._info import LOOK_SUFFIX as LOOK_SUFFIX
 from ._info import SessionInfo as SessionInfo
 from ._info import describe as describe
+from ._info import look_path as look_path
 from ._info import readable_texts as readable_texts
 from ._reader import Event as Event
 from ._reader import Session as Session
@@ -31,6 +33,14 @@ from ._schema import SAMPLE_SCHEMA as SAMPLE_SCHEMA
 from ._schema import SAMPLE_TOPIC as SAMPLE_TOPIC
 from ._schema import message_class as message_class
 from ._schema import schema_data as schema_data
+from ._summary import SessionSummary as SessionSummary
+from ._summary import read_summary as read_summary
+from ._user_metadata import META_PREFIX as META_PREFIX
+from ._user_metadata import NOTES as NOTES
+from ._user_metadata import MetadataError as MetadataError
+from ._user_metadata import added_metadata as added_metadata
+from ._user_metadata import check_name as check_name
+from ._user_metadata import metadata_keys as metadata_keys
 from ._writer import PART_SUFFIX as PART_SUFFIX
 from ._writer import SessionWriter as SessionWriter
 from ._writer import rename_new as rename_new

@@ -45,7 +45,7 @@ from rigd.session._mcap_limits import (
 )
 from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD
 
-_RECORD_HEAD: Final = struct.Struct("<BQ")
+RECORD_HEAD: Final = struct.Struct("<BQ")
 # Opcode, length and channel, which are equal throughout a run: 11 bytes as two words that overlap.
 _RUN_HEAD: Final = struct.Struct("<BQH")
 _RUN_KEY: Final = np.dtype(
@@ -54,7 +54,7 @@ _RUN_KEY: Final = np.dtype(
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
 _DECLARATIONS: Final = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _CHANNEL_ID: Final = struct.Struct("<H")
-_FOOTER: Final = struct.Struct("<BQ QQI")
+FOOTER: Final = struct.Struct("<BQ QQI")
 _FOOTER_CONTENT_SIZE: Final = 20
 _BARE_MESSAGES: Final = 250
 """Messages outside of chunks that belong together."""
@@ -195,18 +195,18 @@ def read_mcap(
 
 def _has_end(data: memoryview) -> bool:
     """Tell whether the file ends with a footer and the magic."""
-    start = len(data) - len(MAGIC) - _FOOTER.size
+    start = len(data) - len(MAGIC) - FOOTER.size
     if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
         return False
-    return _RECORD_HEAD.unpack_from(data, start) == (Opcode.FOOTER, _FOOTER_CONTENT_SIZE)
+    return RECORD_HEAD.unpack_from(data, start) == (Opcode.FOOTER, _FOOTER_CONTENT_SIZE)
 
 
 def _record_at(data: Buffer, position: int, where: str) -> tuple[int, int, int]:
     """Return the opcode of the record at `position`, where its content begins and where it ends."""
-    content = position + _RECORD_HEAD.size
+    content = position + RECORD_HEAD.size
     if content > len(data):
         raise _torn(position, where)
-    opcode, length = _RECORD_HEAD.unpack_from(data, position)
+    opcode, length = RECORD_HEAD.unpack_from(data, position)
     if opcode == 0:
         raise _no_record(position, where)
     end = content + length
@@ -342,24 +342,24 @@ class _Reader:
             return
         self._allowance.declare(opcode, content, where)
         if opcode == Opcode.SCHEMA:
-            schema = _parsed(Schema.read, content, where)
+            schema = parsed(Schema.read, content, where)
             if contents.schemas.setdefault(schema.id, schema) != schema:
                 raise McapDamageError(f"declares schema {schema.id} twice, differently{where}")
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.CHANNEL:
-            channel = _parsed(Channel.read, content, where)
+            channel = parsed(Channel.read, content, where)
             if contents.channels.setdefault(channel.id, channel) != channel:
                 raise McapDamageError(f"declares channel {channel.id} twice, differently{where}")
             self._wanted[channel.id] = self._topics is None or channel.topic in self._topics
             self._declarations[number] = bytes(content)
         elif opcode == Opcode.METADATA:
-            contents.metadata.append(_parsed(Metadata.read, content, where))
+            contents.metadata.append(parsed(Metadata.read, content, where))
         elif opcode == Opcode.ATTACHMENT:
             if len(content) >= 4:
                 (crc,) = struct.unpack_from("<I", content, len(content) - 4)
                 if crc not in (0, zlib.crc32(content[:-4])):
                     raise McapDamageError(f"has an attachment with a wrong checksum{where}")
-            contents.attachments.append(_parsed(Attachment.read, content, where))
+            contents.attachments.append(parsed(Attachment.read, content, where))
 
     def _read_chunk(self, content: memoryview, start: int) -> None:
         self._allowance.spend(CHUNK_STEPS)
@@ -431,7 +431,7 @@ class _Reader:
             if self._wanted.get(channel, True) and self._is_short(length, where):
                 return 0
             self.contents.message_counts[channel] += 1
-        return int(length) + _RECORD_HEAD.size
+        return int(length) + RECORD_HEAD.size
 
     def _is_short(self, length: int, where: str) -> bool:
         """Tell whether a message can be taken; what cannot is left out to save the others."""
@@ -457,12 +457,12 @@ class _Reader:
             end, count = self._read_messages(records, start, len(records), unit, where)
             if count:
                 continue
-            if start + _RECORD_HEAD.size > len(records):
+            if start + RECORD_HEAD.size > len(records):
                 return start
-            opcode, length = _RECORD_HEAD.unpack_from(records, start)
+            opcode, length = RECORD_HEAD.unpack_from(records, start)
             if opcode == 0:
                 raise _no_record(base + start, where)
-            content = start + _RECORD_HEAD.size
+            content = start + RECORD_HEAD.size
             end = content + length
             if end > len(records):
                 return start
@@ -498,7 +498,7 @@ class _Reader:
             while position + MESSAGE_HEAD.size <= limit and passed < _MOST_RUNS:
                 key = unpack(records, position)
                 opcode, length, channel = key
-                size = length + _RECORD_HEAD.size
+                size = length + RECORD_HEAD.size
                 if opcode != Opcode.MESSAGE or size < MESSAGE_HEAD.size or position + size > limit:
                     break
                 is_wanted = wanted.get(channel)
@@ -545,20 +545,20 @@ class _Reader:
             raise McapDamageError(
                 "ends in the middle of its summary, or something was appended to it"
             )
-        footer = len(data) - len(MAGIC) - _FOOTER.size
-        *_, summary_start, _, crc = _FOOTER.unpack_from(data, footer)
+        footer = len(data) - len(MAGIC) - FOOTER.size
+        *_, summary_start, _, crc = FOOTER.unpack_from(data, footer)
         if summary_start not in (0, start) or (summary_start == 0 and footer != start):
             raise McapDamageError(
                 f"has a footer that contradicts its data section at byte {footer}"
             )
-        if crc not in (0, self._crc_of(start, footer + _FOOTER.size - 4)):
+        if crc not in (0, self._crc_of(start, footer + FOOTER.size - 4)):
             raise McapDamageError("has a wrong checksum over its summary")
         for opcode, content in self._summary_records(start, footer):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # Those of channels without messages may stand here only.
                 self._read_other(opcode, content, " in the summary")
             elif opcode == Opcode.STATISTICS:
-                statistics = _parsed(Statistics.read, content, " in the summary")
+                statistics = parsed(Statistics.read, content, " in the summary")
                 found = self.contents.message_counts
                 counts = statistics.channel_message_counts
                 if any(found[channel] != count for channel, count in counts.items()):
@@ -580,23 +580,23 @@ class _Reader:
     def stated_counts(self) -> dict[int, int]:
         """Return the statistics' message counts, if the summary has a checksum that is right."""
         data = self._data
-        footer = len(data) - len(MAGIC) - _FOOTER.size
-        *_, start, _, crc = _FOOTER.unpack_from(data, footer)
+        footer = len(data) - len(MAGIC) - FOOTER.size
+        *_, start, _, crc = FOOTER.unpack_from(data, footer)
         if not len(MAGIC) <= start <= footer:
             return {}
-        if crc == 0 or crc != self._crc_of(start, footer + _FOOTER.size - 4):
+        if crc == 0 or crc != self._crc_of(start, footer + FOOTER.size - 4):
             return {}
         try:
             for opcode, content in self._summary_records(start, footer):
                 if opcode == Opcode.STATISTICS:
-                    statistics = _parsed(Statistics.read, content, "")
+                    statistics = parsed(Statistics.read, content, "")
                     return dict(statistics.channel_message_counts)
         except McapDamageError:
             pass
         return {}
 
 
-def _parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
+def parsed(read: Callable[[ReadDataStream], _Record], content: Buffer, where: str) -> _Record:
     """Parse a record with the ``mcap`` package."""
     try:
         stream = ReadDataStream(BytesIO(content))

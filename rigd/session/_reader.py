@@ -362,11 +362,16 @@ def _load(path: Path, topics: Sequence[str], take: Taker) -> McapContents:
     if contents.damage is not None:
         raise SessionError(_damage_message(path, contents))
     if SAMPLE_TOPIC not in {channel.topic for channel in contents.channels.values()}:
-        raise SessionError(
-            f"{path} is an MCAP file without the channel {SAMPLE_TOPIC}, so it is no session. "
-            "Give a file that `rigd run` or a program following docs/session_format.md recorded."
-        )
+        raise no_session(path)
     return contents
+
+
+def no_session(path: Path) -> SessionError:
+    """Return the error of an MCAP file without samples' channel."""
+    return SessionError(
+        f"{path} is an MCAP file without the channel {SAMPLE_TOPIC}, so it is no session. "
+        "Give a file that `rigd run` or a program following docs/session_format.md recorded."
+    )
 
 
 def load_contents(
@@ -389,7 +394,7 @@ def load_contents(
     SessionError
         If the file is missing, empty, too large or not an MCAP file.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
             memoryview(mapped), topics, take=take, salvage=salvage, on_progress=on_progress
@@ -404,12 +409,12 @@ def check_beginning(path: Path) -> None:
     SessionError
         If it is missing, empty or not an MCAP file.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         read_mcap(memoryview(file.read(len(MAGIC))), ())
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
+def opened(path: Path) -> Iterator[BinaryIO]:
     """Open a file, and say of it what goes wrong while it is read as MCAP."""
     try:
         _refuse_no_file(path)

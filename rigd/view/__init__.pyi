@@ -16,6 +16,7 @@ from ._frequency_charts import COHERENCE_KEY as COHERENCE_KEY
 from ._frequency_charts import MEASURED_KEY as MEASURED_KEY
 from ._frequency_charts import PHASE_AXIS as PHASE_AXIS
 from ._frequency_charts import LastResponse as LastResponse
+from ._frequency_charts import SweepResponse as SweepResponse
 from ._frequency_charts import magnitude_axis as magnitude_axis
 from ._frequency_charts import magnitude_db as magnitude_db
 from ._frequency_charts import phase_deg as phase_deg
@@ -32,8 +33,10 @@ from ._plots import OF_REAL_TIME as OF_REAL_TIME
 from ._plots import ORANGE as ORANGE
 from ._plots import PURPLE as PURPLE
 from ._plots import SKY_BLUE as SKY_BLUE
+from ._plots import TIMELINE as TIMELINE
 from ._plots import VERMILION as VERMILION
 from ._plots import Color as Color
+from ._plots import send_columns as send_columns
 from ._recorded import draw_session as draw_session
 from ._recorded import recorded_blueprint as recorded_blueprint
 from ._rrd_file import SUFFIX as SUFFIX

@@ -30,8 +30,8 @@ _BLOCK_S: Final = 1.0
 _MOST_SPAN: Final = 10
 """Ticks per sample: what lies between few samples would be made up, and fill the disk."""
 _LAST_UTC_NS: Final = 2**63 - 1
-_PROFILE: Final = "profile.toml"
-"""Attachment that tells the nominal damping."""
+_DESCRIPTIONS: Final = ("specimen.toml", "profile.toml")
+"""Attachments that tell the nominal damping; the first that does counts."""
 
 
 def subject_of_session(session: Session, timings: Records | None = None) -> Subject:
@@ -66,6 +66,7 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
             f"{session.path}: only {len(ticks)} of the {end - first} ticks from {first} to "
             f"{end - 1} have a sample, too few to be shown as a session."
         )
+    attached = [session.attachments.get(name, b"") for name in _DESCRIPTIONS]
     return Subject(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_within(session, "rate_hz", 1.0, 1e5),
@@ -76,14 +77,14 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
             _within(session, "beam_density_kg_per_m", 1e-6, 1e3),
             _within(session, "beam_bending_stiffness_n_m2", 1e-9, 1e9),
         ),
-        damping=nominal_damping(session.attachments.get(_PROFILE, b"")),
+        damping=next(filter(None, map(nominal_damping, attached)), None),
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
         excitation=session.metadata.get("excitation", ""),
         sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
         specimen=session.metadata.get("specimen", ""),
-        limits=_stated_limits(session.attachments.get(_PROFILE, b"")),
+        limits=_stated_limits(session.attachments.get("profile.toml", b"")),
         absent=_absent(session, timings),
         recorded=True,
     )
@@ -125,7 +126,7 @@ def _absent(session: Session, timings: Records | None) -> frozenset[str]:
 
 
 def nominal_damping(profile: bytes) -> Damping | None:
-    """Return the nominal damping that a profile states; None if it states none that can be used.
+    """Return the nominal damping of a profile or specimen; None if there is none of use.
 
     Only these numbers are looked for: the profile of an older or of a newer program serves as well.
     """

@@ -14,7 +14,8 @@ def test_arrays_units_and_segments_come_through(tmp_path, write_session, short_s
     path = write_session(
         tmp_path / "a.mcap", short_signals,
         metadata={"angle_delay_s": "0.001", "torque_delay_s": "-2e-4",
-                  "tool_inertia_kg_m2": "1e-5"},
+                  "tool_inertia_kg_m2": "1e-5", "uncertainty_torque_scale_percent": "0.5",
+                  "uncertainty_length_percent": "0"},
     )  # fmt: skip
     record = load_record(path)
     np.testing.assert_array_equal(record.angle_rad, short_signals.angle_rad)
@@ -25,6 +26,7 @@ def test_arrays_units_and_segments_come_through(tmp_path, write_session, short_s
     assert record.beam.bending_stiffness_n_m2 == pytest.approx(0.0902750)
     assert (record.angle_delay_s, record.torque_delay_s) == (0.001, -2e-4)
     assert record.tool_inertia_kg_m2 == 1e-5
+    assert record.uncertainty == {"torque_scale": 0.005}
     assert record.sweep == slice(500, 4500)
     assert record.sweep_samples == 4000
     assert record.rest_angle_rad == np.median(short_signals.angle_rad[:500])
@@ -156,7 +158,8 @@ def test_values_that_are_not_finite_are_refused_by_field_and_tick(
      ("beam_bending_stiffness_n_m2", "stiff"), ("beam_length_m", "1e300"),
      ("beam_length_m", "980"), ("beam_length_m", "0.01"), ("beam_density_kg_per_m", "1e300"),
      ("beam_bending_stiffness_n_m2", "1e-300"), ("beam_bending_stiffness_n_m2", "1e300"),
-     ("torque_delay_s", "300"), ("angle_delay_s", "-1e300"), ("tool_inertia_kg_m2", "1e300")],
+     ("torque_delay_s", "300"), ("angle_delay_s", "-1e300"), ("tool_inertia_kg_m2", "1e300"),
+     ("uncertainty_length_percent", "-1"), ("uncertainty_density_percent", "80")],
 )  # fmt: skip
 def test_absurd_metadata_is_refused_by_key(tmp_path, write_session, short_signals, key, value):
     path = write_session(tmp_path / "a.mcap", short_signals, metadata={key: value})

@@ -106,7 +106,7 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     names = {path.name for path in tmp_path.iterdir()}
     for figure in (
         "figure5_signals", "figure6_nominal", "figure7_indices", "figure8_best", "pooled",
-        "validation",
+        "validation", "damping", "pooled_response",
     ):  # fmt: skip
         assert np.asarray(Image.open(tmp_path / f"{figure}.png").convert("L")).std() > 5
         assert ET.parse(tmp_path / f"{figure}.svg").getroot().tag.endswith("svg")
@@ -132,7 +132,7 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert "torn.mcap" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     text = (tmp_path / "tables.txt").read_text()
-    for words in ("Table 3", "Table 4", "Table 5", "Pooled", "predicted from the others", "torn"):
+    for words in ("Table 3", "Table 4", "Table 5", "Pooled", "Leave-one-out", "torn"):
         assert words in text
     assert {f"{name}.csv" for name in ("table5", "pooled", "validation", "session_list")} <= names
 

@@ -35,7 +35,7 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
     assert "nosuch.mcap cannot be read: No such file" in error
     assert "ok.mcap is reported by itself" in result.stderr
     assert "Warning" not in result.stderr
-    assert "ok.mcap: verdict" in result.stdout
+    assert "Report of ok.mcap: ok.report/report.html" in result.stdout
     assert (tmp_path / "ok.report" / "report.html").exists()
     assert not (tmp_path / "campaign.report").exists()
     content = json.loads((tmp_path / "all.json").read_text())
@@ -50,7 +50,7 @@ def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
     result = run_here("ok.mcap", "./ok.mcap", "--method", "welch", "--report", "r")
     assert result.returncode == 1
     assert errors(result) == ["Error: ok.mcap: the file is given more than once, and counts once."]
-    assert (tmp_path / "r" / "frf.png").exists()
+    assert (tmp_path / "r" / "figures" / "welch_frf.png").exists()
 
 
 def test_one_whole_record_of_several_sessions_is_ranked_by_itself(make_estimate, make_session):

@@ -288,7 +288,9 @@ class Scene:
             wait_for(lambda: self.state == "ready", _STARTED_S, "daemon that is ready")
             self.session = self._start("start", "chirp", *options)
         else:
-            self.session = self.supervisor = self._start("run", "chirp", *self._where, *options)
+            self.session = self.supervisor = self._start(
+                "run", "chirp", "--no-look", *self._where, *options
+            )
 
     @property
     def _where(self) -> list[object]:
@@ -296,7 +298,7 @@ class Scene:
         return ["--profile", self._profile, "--output", self.sessions, *self._live, *fast]
 
     def _serve(self) -> subprocess.Popen[str]:
-        return self._start("serve", *self._where)
+        return self._start("serve", "--no-look", *self._where)
 
     def start_simulator(self) -> None:
         """Start `rigd simulate`, with a log of its own."""
@@ -452,7 +454,7 @@ class Scene:
             # Nobody looks at this one.
             where = [word for word in self._where if word != "--live"]
             where[3] = self.folder / "next"
-            done = self._command("run", *hold, *where)
+            done = self._command("run", *hold, "--no-look", *where)
         (self.folder / "next.txt").write_text(done.stderr, encoding="utf-8")
         if done.returncode == 0:
             (session,) = json.loads(done.stdout)["sessions"]
@@ -653,7 +655,7 @@ def _judge_end(verdict: Verdict, scene: Scene) -> None:
         verdict.complaints.append(f"exit code {verdict.exit_code} instead of {sorted(expected)}")
     if "Traceback" in verdict.said:
         verdict.complaints.append("a traceback")
-    words = ("Error: ", "fault: ", "stopped: ", "After the record: ")
+    words = ("Error: ", "Fault: ", "Stopped: ", "After the record: ")
     if verdict.exit_code == 1 and not any(word in verdict.said for word in words):
         verdict.complaints.append("no message")
 

@@ -127,20 +127,20 @@ def test_before_the_devices_are_connected_it_says_that_there_is_no_record(stoppe
     assert done.returncode == 130
     assert json.loads(done.stdout) == {"sessions": []}
     *_, last = done.stderr.splitlines()
-    assert last == "stopped: no record. Stopped by the operator before the session began."
+    assert last == "Stopped: no record. Stopped by the operator before the session began."
     assert not list(tmp_path.glob("sessions/*"))
 
 
 def test_so_does_identify(stopped_early):
     done = stopped_early("identify", "motor", "--fast")
     assert done.returncode == 130
-    assert done.stderr.count("stopped: no record. Stopped by the operator") == 1
+    assert done.stderr.count("Stopped: no record. Stopped by the operator") == 1
 
 
 @pytest.mark.parametrize(
     ("outcomes", "said"),
     [
-        (["complete"], "stopped: no record after 1 of 3 sessions."),
+        (["complete"], "Stopped: no record after 1 of 3 sessions."),
         (["complete", "stopped"], ""),  # that one has told
         (["complete"] * 3, ""),
     ],

@@ -82,6 +82,42 @@ def test_every_excitation_runs(rigd, tmp_path, arguments, ticks):
     assert record.metadata["excitation"] == arguments[0]
 
 
+def test_each_session_gets_a_quick_look(rigd, tmp_path, monkeypatch):
+    monkeypatch.delenv("RIGD_NO_LOOK")
+    options = ("--duration", "4", "--rest", "0.2", "--ring-down", "0.3", "--repeat", "2")
+    done = rigd("run", "chirp", "--fast", "--json", *options)
+    assert done.returncode == 0, done.stderr
+    for session in json.loads(done.stdout)["sessions"]:
+        look = json.loads((tmp_path / session["look"]).read_text())
+        assert look["file"] == Path(session["path"]).name
+        assert "\n".join(look["text"]) in done.stderr
+        assert len(look["modes"]) == 3
+    assert look["against_last"] is not None
+    assert "Ctrl-C skips it" in done.stderr
+    session = the_session(rigd("run", "hold", "--fast", "--duration", "1", "--json", "--no-look"))
+    assert session["look"] is None
+
+
+def test_ctrl_c_skips_a_quick_look_and_stops_nothing(start_rigd, tmp_path, monkeypatch):
+    monkeypatch.delenv("RIGD_NO_LOOK")
+    (tmp_path / "analysis").mkdir()  # found before the real one
+    (tmp_path / "analysis" / "quick_look.py").write_text("import time; time.sleep(600)\n")
+    process = start_rigd("run", "hold", "--fast", "--duration", "1", "--json")
+    while "Ctrl-C skips it" not in (said := process.stderr.readline()):
+        assert said
+    look = child_running(process.pid, "analysis.quick_look")
+    to_all(process, signal.SIGINT)
+    session = the_session(finished(process))
+    assert session["outcome"] == "complete"
+    assert session["look"] is None
+    assert has_ended(look)
+
+
+def finished(process):
+    output, errors = process.communicate(timeout=300)
+    return subprocess.CompletedProcess(process.args, process.returncode, output, errors)
+
+
 def test_a_reference_from_a_file_is_followed(rigd, tmp_path):
     (tmp_path / "reference.csv").write_text(
         "time_s,angle_rad\n" + "".join(f"{t / 100},{0.01 * (t / 100)}\n" for t in range(201))

@@ -193,6 +193,22 @@ def test_a_day_with_the_daemon(serve, ask, ask_here, profile, tmp_path):
     assert not socket_path("sim").exists()
 
 
+def test_each_session_of_a_daemon_gets_a_quick_look(serve, ask, tmp_path, monkeypatch):
+    monkeypatch.delenv("RIGD_NO_LOOK")
+    daemon = serve("--fast")
+    assert request("status")["daemon"]["quick_looks"] is True
+    code, out, err = ask("start", "chirp", *SHORT, "--repeat", "2", "--json")
+    assert code == 0, err
+    for session in json.loads(out)["sessions"]:
+        look = json.loads(Path(session["look"]).read_text())
+        assert look["file"] == Path(session["path"]).name
+        assert "\n".join(look["text"]) in err
+    assert request("status")["series"]["sessions"] == json.loads(out)["sessions"]
+    daemon.send_signal(signal.SIGTERM)
+    _, said = daemon.communicate(timeout=300.0)
+    assert f"INFO {look['text'][0]}" in said
+
+
 def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, rigd):
     daemon = serve()
     client = rigd("start", "hold", *LONG, "--repeat", "3")
@@ -233,7 +249,7 @@ def test_a_session_survives_its_client_and_ends_by_stop_or_ctrl_c(serve, ask, ri
     client.send_signal(signal.SIGINT)
     out, err = client.communicate(timeout=300.0)
     assert client.returncode == 130
-    assert "stopped:" in err
+    assert "Stopped:" in err
 
     client = rigd("start", "hold", *LONG, "--json")
     until(recording, daemon)

@@ -87,12 +87,27 @@ def test_what_is_no_request_is_refused_by_name(line, named):
         ({"repeat": 1.0}, "repeat"),
         ({"notes": {"operator": "two\nlines"}}, "operator"),
         ({"notes": {"weather": "fine"}}, "weather"),
+        ({"notes": {"meta": {"temperature_c": "warm"}}}, "notes.meta: .*temperature_c"),
+        ({"notes": {"meta": {"temperature_c": None}}}, "notes.meta: .*temperature_c"),
+        ({"notes": {"meta": {"__class__": 1}}}, "notes.meta: .*__class__"),
+        ({"notes": {"meta": {"operator": "Ada"}}}, "give it as operator"),
+        ({"notes": {"meta": ["temperature_c"]}}, "notes.meta"),
+        ({"notes": {"meta": {f"n{i}": "x" for i in range(40)}}}, "40 names"),
         ({"force": "yes"}, "force"),
     ],
 )
 def test_a_start_that_is_wrong_is_refused_by_name(fields, named):
     with pytest.raises(RequestError, match=named):
         parse(START | fields)
+
+
+def test_notes_are_metadata_by_the_keys_of_the_file():
+    meta = {"temperature_c": 21, "humidity_percent": "40", "batch": "B 7"}
+    request = parse(START | {"notes": {"operator": "Ada", "note": "", "meta": meta}})
+    assert request.notes.as_metadata() == {
+        "operator": "Ada", "meta_temperature_c": "21.0", "meta_humidity_percent": "40.0",
+        "meta_batch": "B 7",
+    }  # fmt: skip
 
 
 def test_an_overflowing_number_is_refused():

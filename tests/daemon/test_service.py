@@ -11,6 +11,8 @@ from rigd.devices._registry import WhatMoves
 from rigd.devices.contracts import DeviceError, LineHealth
 from rigd.engine._ipc import ChildError
 from rigd.engine._shared_state import Word
+from rigd.session import read_session
+from rigd.view._recorded import subject_of_session
 
 SHORT = {
     "excitation": "hold",
@@ -45,6 +47,48 @@ def test_a_session_goes_from_ready_over_running_to_ready(operated, tmp_path):
     assert operated.world.highest_nm > 0.0
     assert operated.world.drives[0].safe
     assert operated.world.wrong == []
+
+
+SPECIMEN = """
+[beam]
+length_m = { value = 0.95, source = "measured" }
+density_kg_per_m = { value = 4.7e-3, source = "paper" }
+bending_stiffness_n_m2 = { value = 0.090275, source = "paper" }
+[beam.damping]
+alpha = { value = 1.0, source = "assumed" }
+zeta = { value = 8.0e-5, source = "assumed" }
+lambda = { value = 0.6, source = "assumed" }
+gamma = { value = 5.0e-2, source = "assumed" }
+"""
+
+
+def test_specimen_metadata_and_predictions_of_a_start_stand_in_the_file(
+    operated, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "specimens").mkdir()
+    (tmp_path / "specimens" / "antenna 4.toml").write_text(SPECIMEN)
+    notes = {"specimen": "antenna 4", "meta": {"temperature_c": 21.4, "batch": "7"}}
+    plan = operated.ask("start", **SHORT, notes=notes)["plan"]
+    assert "length 0.95 m (profile: 0.98)" in plan["specimen_in_words"]
+    session = read_session(operated.last["sessions"][0]["path"])
+    metadata = session.metadata
+    assert (metadata["specimen"], metadata["beam_length_m"]) == ("antenna 4", "0.95")
+    assert (metadata["meta_temperature_c"], metadata["meta_batch"]) == ("21.4", "7")
+    assert session.number("predicted_peak_torque_nm") == plan["peak_torque_nm"]
+    assert session.number("limit_torque_nm") == plan["limits"]["torque_nm"]
+    assert session.attachments["specimen.toml"].decode() == SPECIMEN
+    assert subject_of_session(session).damping.zeta == 8e-5
+    # The next one that names none has the profile's beam again.
+    operated.ask("start", **SHORT)
+    session = read_session(operated.last["sessions"][0]["path"])
+    assert session.metadata["beam_length_m"] == "0.98"
+    assert "specimen.toml" not in session.attachments
+    assert subject_of_session(session).damping.zeta == 7.1e-5
+    (tmp_path / "specimens" / "antenna 4.toml").write_text("[beam]")
+    refused = operated.ask("start", **SHORT, notes=notes)
+    assert str(refused) == "specimens/antenna 4.toml: section [beam] is missing."
+    assert refused.wrong_use
 
 
 def test_a_series_runs_on_one_connection_and_stops_at_the_first_that_fails(operated):
@@ -331,6 +375,42 @@ def test_what_nobody_foresaw_in_connecting_is_a_fault_that_can_be_reset(operate,
     assert operated.state is State.READY
 
 
+def test_a_request_waits_until_the_devices_of_a_new_daemon_are_connected(operate):
+    operated = operate()
+
+    async def ask():
+        opening = asyncio.create_task(operated.service.open())
+        await asyncio.sleep(0)
+        assert operated.service.status()["doing"] == "connecting"
+        reply = await operated.handle("zero")
+        await opening
+        return reply
+
+    assert "moved_rad" in operated.loop.run_until_complete(ask())
+    assert operated.state is State.READY
+
+
+def test_a_start_that_waits_for_the_devices_is_stopped_by_a_stop(operate):
+    operated = operate()
+    line = protocol.json.dumps({"command": "start", **SHORT}).encode()
+
+    async def ask():
+        opening = asyncio.create_task(operated.service.open())
+        await asyncio.sleep(0)
+        started = asyncio.create_task(
+            operated.service.handle(protocol.parse_request(line), operated.peer)
+        )
+        await asyncio.sleep(0)
+        assert await operated.handle("stop", peer=OTHER) == {"stopping": False}
+        with pytest.raises(CommandError, match="stopped before it began"):
+            await started
+        await opening
+
+    operated.loop.run_until_complete(ask())
+    assert operated.state is State.READY
+    assert operated.world.highest_nm == 0.0
+
+
 def test_a_process_that_cannot_be_started_is_a_fault_that_can_be_reset(operated, monkeypatch):
     assert operated.ask("start", **SHORT)["series"] == 1
     crew = operated.rig._crew
@@ -373,7 +453,7 @@ def test_a_session_whose_daemon_hears_nobody_is_given_no_sign_of_life(operated, 
     operated.ask("start", **SHORT, repeat=2)
     assert board(operated)[Word.SUPERVISOR_BEAT] == beats[0]
     assert len(operated.last["sessions"]) == 1
-    assert "hears nobody" in operated.last["reason"]
+    assert "does not respond" in operated.last["reason"]
 
 
 def board(operated):
@@ -419,7 +499,7 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     assert health["sensor_status"] == 0
     protocol.json.dumps(status, allow_nan=False)
     assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
-        "control": "at work", "recorder": "at work", "supervisor": "at work",
+        "control": "running", "recorder": "running", "supervisor": "running",
     }  # fmt: skip
     assert [t["name"] for t in status["rig"]["topics"]][-1] == "/rig/sample"
     assert [(h["from"], h["to"]) for h in status["history"]] == [
@@ -453,11 +533,10 @@ def test_the_log_tells_of_refusals_and_results(operated, caplog):
     assert [line.partition(":")[0] for line in refused] == ["start", "reset", "tare"]
     assert "amplitude_rad = 9" in refused[0]
     assert "is controlled by" in refused[2]
-    (result,) = [line for line in told if "scheduled" in line]
+    (result,) = [line for line in told if "samples" in line]
     path = operated.last["sessions"][0]["path"]
     assert result == (
-        f"series 2: session 1 of 1: {path}, complete: 300 ticks scheduled, 300 recorded, 0 missed, "
-        "0 late, 0 lost, 0 stale angles, 0 stale wrenches, 0 not shown live"
+        f"series 2: session 1 of 1, {path}: Complete: 300 of 300 samples, 0 missed, 0 late."
     )
 
 

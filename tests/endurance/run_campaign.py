@@ -254,7 +254,7 @@ class Campaign:
         self._said = (folder / "said.txt").open("w+", encoding="utf-8")
         self._process = subprocess.Popen(
             [
-                *(BIN / "rigd", "run", *map(str, arguments)),
+                *(BIN / "rigd", "run", *map(str, arguments), "--no-look"),
                 *("--repeat", str(sessions), "--output", str(folder / "sessions")),
             ],
             stdin=subprocess.DEVNULL,

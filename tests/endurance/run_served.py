@@ -113,7 +113,16 @@ def follow(minutes: float, seconds: float, folder: Path) -> list[str]:
     with contextlib.ExitStack() as ending:
         log = ending.enter_context((folder / "serve.txt").open("w"))
         stdout, stderr = (ending.enter_context(path.open("w")) for path in (out, said))
-        serve = [RIGD, "serve", "--profile", RIG, "--live", "--output", folder / "sessions"]
+        serve = [
+            RIGD,
+            "serve",
+            "--no-look",
+            "--profile",
+            RIG,
+            "--live",
+            "--output",
+            folder / "sessions",
+        ]
         daemon = subprocess.Popen(serve, stdout=log, stderr=log)
         ending.callback(daemon.wait)
         ending.callback(daemon.terminate)

@@ -129,7 +129,9 @@ def run(seconds: float, folder: Path, *, live: bool) -> Outcome:
     arguments += ["--output", str(folder / "sessions"), *(("--live",) if live else ())]
     out, said = folder / "out.json", folder / "said.txt"
     with out.open("w") as stdout, said.open("w") as stderr:
-        process = subprocess.Popen([RIGD, "run", *arguments], stdout=stdout, stderr=stderr)
+        process = subprocess.Popen(
+            [RIGD, "run", *arguments, "--no-look"], stdout=stdout, stderr=stderr
+        )
         deadline = time.monotonic() + seconds + _BEYOND_S
         try:
             while process.poll() is None and time.monotonic() < deadline:

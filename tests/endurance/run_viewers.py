@@ -182,7 +182,9 @@ def run(name: str, seconds: float) -> Outcome:
 @contextmanager
 def session(*options: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run ``rigd run chirp``."""
-    with subprocess.Popen([RIGD, "run", "chirp", "--profile", RIG, *options]) as process:
+    with subprocess.Popen(
+        [RIGD, "run", "chirp", "--no-look", "--profile", RIG, *options]
+    ) as process:
         try:
             yield process
         finally:

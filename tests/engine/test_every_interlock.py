@@ -299,7 +299,7 @@ def test_what_keeps_coming_near_its_limit_is_told_once_and_flagged_each_time(mak
     assert (flagged == near).all()
     warnings = [event for event in session.events if event.level == "warning"]
     assert 1 <= len(warnings) <= 3
-    assert all(re.match(r"The angle of .* is above its warning level", w.message) for w in warnings)
+    assert all(re.match(r"Angle .* rad above warning level", w.message) for w in warnings)
 
 
 def test_the_motor_stays_warm_through_the_sessions_of_a_connection(make_session):

@@ -97,6 +97,24 @@ def test_a_file_that_cannot_be_imported_is_explained(analyze, arguments, tmp_pat
     assert not list(tmp_path.glob("*.mcap*"))
 
 
+def test_a_wrong_unit_of_the_time_is_refused_where_the_beam_shows_it(analyze, csv_of, arguments):
+    csv_of(t=1.0 * np.arange(N), q=np.sin(np.arange(N) / 50), T=np.cos(np.arange(N) / 9))
+    result = analyze(*arguments, *MAPPING)
+    assert result.exit_code == 1
+    for words in (
+        "the record lasts 3000 s at 1 Hz", "2.55 Hz, beyond the Nyquist frequency of 0.5 Hz",
+        "state the unit of 't', which was taken to be s, with --time t:UNIT",
+    ):  # fmt: skip
+        assert words in result.stderr
+    assert analyze(*arguments, *MAPPING, "--time", "t:ms").exit_code == 0
+
+
+def test_a_record_shorter_than_a_period_of_the_beam_is_doubted(analyze, arguments):
+    result = analyze(*arguments, *MAPPING, "--time", "t:ms")
+    assert result.exit_code == 0
+    assert "lasts 0.003 s at 1e+06 Hz, less than one period of the first mode" in result.stderr
+
+
 def test_a_session_has_its_ending(analyze, source, profile, tmp_path):
     result = analyze("import", source, tmp_path / "a.csv", "--profile", profile, *MAPPING)
     assert result.exit_code == 2
@@ -167,7 +185,9 @@ def test_a_disk_that_fills_up_leaves_no_part_of_a_file(analyze, session, tmp_pat
 def test_the_analysis_stands_beside_its_subcommands(analyze):
     text = analyze("--help").stdout
     assert "[OPTIONS] {FILE}..." in text or "[OPTIONS] FILE..." in text
-    assert "analyze import --help" in " ".join(text.split())
+    commands = text[text.index("Commands:") :]
+    for name in ("import", "export record", "export frf"):
+        assert f"\n  {name} " in commands
     assert analyze().exit_code == 2
     assert "FILE" in analyze().stderr
     for name in ("import", "export", "default"):

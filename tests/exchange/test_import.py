@@ -271,9 +271,11 @@ def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
     path.write_text(
         "[beam]\nlength_m = 1\ndensity_kg_per_m = 5e-3\nbending_stiffness_n_m2 = 0.1\n"
         "[sensor]\ntool_inertia_kg_m2 = { value = 1e-5, source = 'measured' }\n"
+        "[uncertainty]\nlength_percent = 0.1\n"
     )
     specimen = read_specimen(path)
     assert (specimen.beam.length_m, specimen.tool_inertia_kg_m2) == (1.0, 1e-5)
+    assert specimen.uncertainty_percent == {"length": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -286,6 +288,11 @@ def test_the_specimen_of_a_profile_or_of_three_lines(profile, tmp_path):
         ("[beam]\nlength_m = 0", ("beam.length_m is 0 m", "positive")),
         ("[beam]\nlength_m = nan", ("beam.length_m is nan",)),
         ("[beam]\nlength_m = {value = 1}\ndensity_kg_per_m = {}", ("beam.density_kg_per_m",)),
+        (
+            "[beam]\nlength_m = 1\ndensity_kg_per_m = 1\nbending_stiffness_n_m2 = 1\n"
+            "[uncertainty]\nlength_percent = 51",
+            ("uncertainty.length_percent is 51 %", "50"),
+        ),
         ("[sensor]\ntool_inertia_kg_m2 = -1.0", ("sensor.tool_inertia_kg_m2", "negative")),
         ("[beam", ("not a TOML file",)),
         ("a = " + "[" * 100_000, ("not a TOML file",)),

@@ -142,7 +142,7 @@ def test_the_response_as_mat(simulated, response, tmp_path):
     np.testing.assert_array_equal(contents["response_nm_per_rad"], response.response)
     information = contents["information"]
     assert information["estimator"] == "h1"
-    assert information["segment_length_samples"] == "6000"
+    assert information["segment_length_samples"] == 6000
     assert information["session_file"] == simulated.name
 
 
@@ -160,4 +160,17 @@ def test_a_record_as_mat_keeps_integers_and_what_the_session_says(simulated, tmp
         np.testing.assert_array_equal(contents[field], samples[field])
     assert contents["tick"].dtype == np.uint32
     assert contents["information"]["excitation"] == "chirp"
-    assert contents["information"]["segment_sweep_ticks"] == "500,20500"
+    information, stated = contents["information"], read_session(simulated).metadata
+    assert information["segment_sweep_ticks"].item().tolist() == [500, 20500]
+    assert information["beam_density_kg_per_m"] == float(stated["beam_density_kg_per_m"])
+    assert information["start_utc_ns"] == int(stated["start_utc_ns"])
+    assert information["id"] == stated["id"]
+
+
+def test_what_users_wrote_stays_a_text_in_mat(make_session, tmp_path):
+    added = {"note": "12", "specimen": "7", "meta_batch": "007", "meta_length_m": "0.98"}
+    path = make_session("a.mcap", metadata=added, **regular(3))
+    export_record(path, tmp_path / "r.mat")
+    information = scipy.io.loadmat(tmp_path / "r.mat", squeeze_me=True)["information"]
+    told = {key: information[key].item() for key in added}
+    assert told == {"note": "12", "specimen": "7", "meta_batch": "007", "meta_length_m": 0.98}

@@ -59,6 +59,24 @@ def test_columns_are_found_by_name_or_number(text, content):
     assert values(path, "#2").tolist() == [1.5, -2e-3]
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        "t;angle\n0;1,5\n1;-2e-3\n2;;\n",
+        "t;angle\r\n0,0;1,5\r\n1,0;-0,2e-2\r\n2;;\r\n",
+        "t\tangle\n0\t1,5\n1\t-,002\n2\t\n",
+    ],
+)
+def test_decimal_commas_are_read_where_the_separator_is_another(text, content):
+    np.testing.assert_array_equal(values(text(content), "angle"), [1.5, -2e-3, np.nan])
+
+
+def test_a_first_line_of_numbers_with_decimal_commas_is_data(text):
+    path = text("0,5;1\n1,5;2\n")
+    assert values(path, "#1").tolist() == [0.5, 1.5]
+    assert values(path, "#2").tolist() == [1.0, 2.0]
+
+
 def test_a_csv_without_names_has_numbers(text):
     assert values(text("0,1\n1,2\n2,3\n"), "#2").tolist() == [1, 2, 3]
     assert "'#1', '#2'" in refused(text("0,1\n1,2\n"), "angle")
@@ -104,7 +122,10 @@ def test_an_empty_cell_is_not_a_number(text):
         ("a,b\n1,2\n3\n", "b", ("sample 2 of the column 'b'", "1 columns")),
         ("a,b\n1,2\n3,x\n", "b", ("sample 2 of the column 'b'", "'x'", "not a number")),
         ("a,b\ns,deg\n1,2\n", "b", ("sample 1", "'deg'", "below the line with the names")),
-        ("a;b\n1;2,5\n3;4,5\n", "b", ("'2,5'", "decimal comma")),
+        ("a;b\n1;2,5\n3;4.5\n", "b", ("sample 2 of the column 'b' is '4.5'", "decimal commas")),
+        ("a;b\n1;2.5\n3;4,5\n", "b", ("sample 1 of the column 'b' is '2.5'", "decimal commas")),
+        ("a;b\n1;2,5\n3;1.234,5\n", "b", ("'1.234,5'", "not a number")),
+        ("a;b\n1;2,5\n3;1,234,5\n", "b", ("'1,234,5'", "not a number")),
         ("a b\n1 2\n3\n", "b", ("sample 2 of the column 'b'", "1 columns")),
         ("my a b\n1 2\n3 4\n", "b", ("no channel 'b'", "'#1', '#2'")),
         ('a,b\n1,"2\n' + "3,4\n" * 40_000, "b", ("not a CSV file",)),

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,9 +50,9 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert result.stderr == ""
     report = tmp_path / "session.report"
     assert sorted(path.name for path in report.iterdir()) == [
-        "analysis.json", "figures", "frf.png", "report.html", "tables", "tables.txt",
+        "SHA256SUMS", "analysis.json", "figures", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
-    for picture in (report / "frf.png", *(report / "figures").glob("*.png")):
+    for picture in (report / "figures").glob("*.png"):
         assert np.asarray(Image.open(picture).convert("L")).std() > 10
     content = json.loads((tmp_path / "fits.json").read_text())
     assert content == json.loads((report / "analysis.json").read_text())
@@ -59,11 +60,20 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert len(of_paper) == 12
     best = min(of_paper, key=lambda fit: fit["indices"]["wmse"])
     assert (best["type"], best["weighting"]) == ("VI", "omega")
-    for word in ("verdict", "Fits", "Resonant peaks", "Modes with", "session.report", "fits.json"):
-        assert word in result.stdout
-    assert (report / "tables.txt").read_text().splitlines()[0] in result.stdout
-    # Welch's windows bias the damping by a third; the whole record tells the plant's.
+    lines = result.stdout.splitlines()
+    assert len(lines) <= 25
     (of_record,) = content["records"]
+    assert lines[0] in of_record["verdict"][0]
+    modes = [line.split() for line in lines if line[:4].strip().isdigit()]
+    assert [float(cells[1]) for cells in modes] == pytest.approx(
+        [mode["frequency_hz"] for mode in content["modes"] if mode["estimator"] == "record"],
+        rel=1e-4,
+    )
+    assert lines[-2:] == [
+        "All results as JSON: fits.json", "Report of session.mcap: session.report/report.html",
+    ]  # fmt: skip
+    assert "Resonant peaks" not in result.stdout
+    # Welch's windows bias the damping by a third; the whole record tells the plant's.
     (selected,) = (
         fit for fit in content["fits"] if fit.get("candidate") == of_record["selected"]
     )  # fmt: skip
@@ -86,8 +96,8 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
     assert names == [
         (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
     ]  # fmt: skip
-    assert "Resonant peaks" in result.stderr
-    assert (tmp_path / "out" / "signals.png").exists()
+    assert "Fits to Welch's estimate" in result.stderr
+    assert (tmp_path / "out" / "figures" / "welch_signals.png").exists()
 
 
 def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
@@ -108,8 +118,8 @@ def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
     # A report never lands on one that is there.
     assert (before / "frf.png").read_text() == "mine"
     assert [path.name for path in before.iterdir()] == ["frf.png"]
-    assert (tmp_path / "session.report-2" / "frf.png").stat().st_size > 10_000
-    assert (tmp_path / "other.report" / "frf.png").stat().st_size > 10_000
+    assert (tmp_path / "session.report-2" / "figures" / "welch_frf.png").stat().st_size > 10_000
+    assert (tmp_path / "other.report" / "figures" / "welch_frf.png").stat().st_size > 10_000
 
 
 def broken_file(kind, path, good):
@@ -181,7 +191,6 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
         (("--weights", "omega^1e308"), ("omega^1e308",)),
         (("--method", "recrod"), ("there is no 'recrod'; choose from welch, record, all.",)),
         (("--method", "record", "b.mcap"), ("--method", "Tables 3 to 5", "add --each")),
-        (("--method", "record", "--rerun", "a.rrd"), ("--rerun", "take --method all")),
         (("--frf", "h3"), ("there is no 'h3'; choose from h1, h2, hv, iv, fft.",)),
         (("--band", "nan,50"), ("--band", "nan,50")),
         (("--band", "50,1"), ("--band", "0 <= F0 < F1")),
@@ -252,7 +261,7 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
     assert (process.returncode, stdout, stderr) == (130, "", "Stopped.\n")
     for folder in out.iterdir():
         assert not folder.name.startswith("."), "a half-written report was left"
-        assert len(list(folder.iterdir())) == 5
+        assert len(list(folder.iterdir())) == 6
 
 
 STOPPED = (
@@ -305,6 +314,45 @@ def test_ctrl_c_while_options_are_made_ready_ends_with_130_and_without_traceback
     assert run_as_is("early", tmp_path) == (130, "", "")
 
 
+def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("analysis.cli.app.session_command", lambda files, *_: asked.append(files))
+    monkeypatch.setattr(
+        "analysis.cli.campaign.campaign_command", lambda files, *_, **__: asked.append(files) or 0
+    )
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    (folder / "torn.mcap.part").touch()
+    refused = CliRunner().invoke(app, [str(folder)])
+    assert refused.exit_code == 1
+    assert f"{folder}: there is no session" in refused.stderr
+    assert "rigd recover" in refused.stderr
+    for name in ("b.mcap", "a.mcap"):
+        (folder / name).touch()
+        CliRunner().invoke(app, [str(folder)])
+    CliRunner().invoke(app, ["first.mcap", str(folder), "--each"])
+    of_folder = [folder / "a.mcap", folder / "b.mcap"]
+    assert asked == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
+
+
+def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, analyze_here):
+    look = (session.name, "--json", "fits.json", "--report", "out", "--overwrite")
+    assert analyze_here(*look, *QUICK).returncode == 0
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    quick = ("--method", "welch", "--types", "II", "--weights", "const")
+    assert analyze_here(*look, *quick).returncode == 0
+    for path in ("fits.json", "out/analysis.json"):
+        (fit,) = json.loads((tmp_path / path).read_text())["fits"]
+        assert fit["type"] == "II"
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+    # Without a name it is the report beside the file, under the same name again.
+    for _ in range(2):
+        assert analyze_here(session.name, "--overwrite", *quick).returncode == 0
+    assert [path.name for path in tmp_path.glob("session.report*")] == ["session.report"]
+    (tmp_path / "fits.json").write_text('{"mine": 1}')
+    refused(analyze_here(*look, *quick), 2, "fits.json", "does not hold results")
+
+
 def test_help_has_an_example_and_the_choices(tmp_path):
     result = run("--help", cwd=tmp_path)
     assert result.returncode == 0
@@ -324,15 +372,17 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
 
 
 @pytest.mark.parametrize("files", [["a.mcap"], ["a.mcap", "b.mcap"]])
-def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, files):
-    fixed = []
+def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
+    fixed, formats = [], []
 
     def run(_files, routes, *_):
         fixed.append(routes.fixed)
+        formats.append(routes.figures)
         return 0
 
     def campaign(*_, **options):
         fixed.append(options["fixed"])
+        formats.append(options["formats"])
         return 0
 
     monkeypatch.setattr("analysis.cli.app.session_command", run)
@@ -340,6 +390,13 @@ def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, fil
     result = CliRunner().invoke(app, [*files, "--fix", "tool_inertia_kg_m2, delay_s"])
     assert result.exit_code == 0, result.output
     assert fixed == [("delay_s", "tool_inertia_kg_m2")]
+    assert formats == [("png", "svg")]
+    result = CliRunner().invoke(app, [*files, "--figures", "pdf, png"])
+    assert formats[1:] == [("png", "pdf")], result.output
+    for wrong in ("tiff", ","):
+        result = CliRunner().invoke(app, [*files, "--figures", wrong])
+        assert result.exit_code == 2
+        assert "choose from png, svg, pdf" in result.output
     result = CliRunner().invoke(app, [*files, "--fix", "inertia"])
     assert result.exit_code == 2
     assert "there is no inertia; choose from density_over_stiffness" in result.output

@@ -1,6 +1,11 @@
+import shutil
+import subprocess
+from pathlib import Path
+
 import pytest
 
 from analysis.report._folder import (
+    LIST,
     OutputError,
     OutputExistsError,
     check_new_file,
@@ -72,3 +77,113 @@ def test_a_new_file_is_new(tmp_path):
     assert path.read_text() == "1"
     with pytest.raises(OutputError, match="written"):
         write_new(path / "below.json", "3")
+
+
+def write_report(folder, overwrite=True, **files):
+    with new_folder(folder, overwrite=overwrite) as part:
+        for name, text in files.items():
+            write_new(part / name.replace("_in_", "/"), text)
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_text()
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != LIST
+    }
+
+
+def test_a_report_lists_its_files_as_sha256sum_does(tmp_path):
+    out = tmp_path / "out"
+    write_report(out, overwrite=False, a="1", sub_in_b="2")
+    check = [shutil.which("sha256sum"), "--check", "--strict", LIST]
+    assert subprocess.run(check, cwd=out, capture_output=True, check=True).stderr == b""
+    assert len((out / LIST).read_text().splitlines()) == 2
+
+
+def test_a_report_is_replaced_and_what_others_put_there_stays(tmp_path):
+    out = tmp_path / "out"
+    write_report(out, a="1", sub_in_b="2", gone_in_c="3")
+    (out / "notes").write_text("mine")
+    (out / "sub" / "notes").write_text("mine, too")
+    with pytest.raises(OutputExistsError, match="--overwrite"):
+        report_folders([tmp_path / "x.mcap"], out)
+    assert report_folders([tmp_path / "x.mcap"], out, overwrite=True) == [out]
+    write_report(out, a="4", d="5")
+    mine = {"notes": "mine", "sub/notes": "mine, too"}
+    assert contents(out) == {"a": "4", "d": "5", **mine}
+    assert not (out / "gone").exists()
+    assert len((out / LIST).read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("change", ["edited", "a link", "a folder", "foreign"])
+def test_a_file_that_is_not_as_it_was_written_stops_the_replacement(tmp_path, change):
+    out, other = tmp_path / "out", tmp_path / "other"
+    write_report(out, a="1", b="2")
+    other.write_text("1")
+    if change == "edited":
+        (out / "a").write_text("mine")
+    elif change == "foreign":
+        (out / "c").write_text("mine")
+    else:
+        (out / "a").unlink()
+        (out / "a").symlink_to(other) if change == "a link" else (out / "a").mkdir()
+    before = contents(out)
+    with pytest.raises(OutputExistsError, match="left as it was"):
+        write_report(out, a="3", b="4", c="5")
+    assert contents(out) == before
+    assert other.read_text() == "1"
+
+
+def test_a_list_cannot_reach_beyond_its_folder(tmp_path):
+    out, outside = tmp_path / "out", tmp_path / "mine"
+    write_report(out, a="1")
+    outside.write_text("1")
+    checksum = (out / LIST).read_text().split()[0]
+    (out / LIST).write_text(f"{checksum}  ../mine\n{checksum}  {outside}\n")
+    (out / "a").unlink()
+    write_report(out, b="2")
+    assert outside.read_text() == "1"
+
+
+def test_a_replacement_that_was_cut_short_is_taken_up_again(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    write_report(out, a="1", b="2")
+    replace, calls = Path.replace, []
+
+    def killed(path, target):
+        calls.append(target)
+        if target == out / "b":
+            raise KeyboardInterrupt
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_report(out, a="3", b="4")
+    monkeypatch.undo()
+    assert contents(out) == {"a": "3", "b": "2"}
+    write_report(out, a="5", b="6")
+    assert contents(out) == {"a": "5", "b": "6"}
+
+
+def test_a_folder_that_is_no_report_is_not_replaced(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "a").write_text("mine")
+    with pytest.raises(OutputExistsError, match=f"no list of its files .{LIST}"):
+        report_folders([tmp_path / "x.mcap"], out, overwrite=True)
+    (tmp_path / "x.report").write_text("a file")
+    with pytest.raises(OutputExistsError, match=r"x\.report is none"):
+        report_folders([tmp_path / "x.mcap"], None, overwrite=True)
+
+
+def test_earlier_results_are_replaced_and_nothing_else(tmp_path):
+    path = tmp_path / "a.json"
+    write_new(path, '{"versions": {}, "headlines": [], "fits": []}', overwrite=True)
+    write_new(path, '{"versions": {}, "headlines": [], "fits": [1]}', overwrite=True)
+    assert "[1]" in path.read_text()
+    for text in ('{"fits": []}', "[]", "not JSON"):
+        path.write_text(text)
+        with pytest.raises(OutputExistsError, match="does not hold results"):
+            check_new_file(path, "--json", overwrite=True)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.json"]

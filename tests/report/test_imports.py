@@ -25,7 +25,7 @@ def imported(names):
 @pytest.mark.parametrize(
     "names",
     [
-        "analysis_tables, record_text, summary_table, campaign_tables",
+        "analysis_tables, record_text, result_text, summary_table, campaign_tables",
         "document, document_text, campaign_document",
         "write_rerun_file, check_rerun_file",
         "illustrations, frf_figure",
@@ -42,13 +42,13 @@ MOST = 30
 ANALYZE = """
 import sys
 from pathlib import Path
-from analysis.cli.sessions import session_command
+from analysis.cli.sessions import Outputs, session_command
 from analysis.models import WelchSettings
 from analysis.results import Routes
 from contextlib import redirect_stdout
 routes = Routes(WelchSettings(), paper=True, whole_record=True, fixed=())
 with redirect_stdout(sys.stderr):
-    assert session_command([Path(sys.argv[1])], routes, Path(sys.argv[2]), None) == 0
+    assert session_command([Path(sys.argv[1])], routes, Outputs(Path(sys.argv[2]))) == 0
 print(*sys.modules)
 """
 

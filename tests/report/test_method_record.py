@@ -42,7 +42,7 @@ def test_the_file_is_described_without_settings_of_the_paper(done):
 def test_the_report_has_no_figure_of_the_paper(done):
     report = done[1] / "a.report"
     assert sorted(path.name for path in report.iterdir()) == [
-        "analysis.json", "figures", "report.html", "tables", "tables.txt",
+        "SHA256SUMS", "analysis.json", "figures", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
     assert "a.mcap: verdict" in (report / "tables.txt").read_text()
 

@@ -70,7 +70,7 @@ def test_status_tells_of_every_process_and_topic(rig, run):
     assert first.phase is Phase.OFF
     assert first.torque_command_nm == 0.0
     assert {p.name: p.state for p in first.processes} == {
-        "control": "at work", "recorder": "waiting", "supervisor": "at work",
+        "control": "running", "recorder": "waiting", "supervisor": "running",
     }  # fmt: skip
     result = run(rig)
     second = rig.status()

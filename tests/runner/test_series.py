@@ -1,17 +1,21 @@
 """Sessions of a series, and what a terminal shows of them, without processes."""
 
+import contextlib
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner._console import ProgressLine, plan_lines, result_line
+from rigd.runner._planning import RefusedError
 from rigd.runner._request import NoRoomError
-from rigd.runner._series import Series
+from rigd.runner._series import Series, _await_look
 from rigd.runner._session import SessionResult
 from rigd.runtime import StopRequest
+from rigd.testing import write_profile
 
 WELL = SessionResult(None, "complete", "", 1200, 1200, 0, 0, 0, fault=False)
 
@@ -73,6 +77,8 @@ def test_a_lone_session_is_not_numbered(make_series):
     make_series().run(rig, StopRequest(), Watcher(), live=False)
     (order,) = rig.orders
     assert order.notes == ()
+    assert dict(order.predicted)["limit_angle_rad"] == "1.57"
+    assert float(dict(order.predicted)["predicted_peak_velocity_rad_s"]) >= 0.0
     assert order.path.stem.endswith("-hold")
 
 
@@ -97,28 +103,79 @@ def test_a_disk_that_fills_up_keeps_what_there_is(make_series, tmp_path):
     assert series.results == [WELL]
 
 
+class Looks:
+    """Quick looks that take three attempts each."""
+
+    def __init__(self, told):
+        self.told, self.left = told, 0
+
+    @property
+    def busy(self):
+        return self.left > 0
+
+    def begin(self, path):
+        self.told.append(("look", path.stem[-2:]))
+        self.left = 3
+
+    def attend(self):
+        self.left -= 1
+
+    @contextlib.contextmanager
+    def held(self):
+        self.told.append("held")
+        yield
+        self.told.append("let go")
+
+
+def test_a_quick_look_is_held_in_a_session_and_waited_for_between_two(make_series):
+    watcher = Watcher()
+
+    class Watched(Rig):
+        def watch(self):
+            watcher.told.append("watch")
+
+        def run(self, *order):
+            watcher.told.append("run")
+            return super().run(*order)
+
+    stopped = replace(WELL, path=None)
+    results = (replace(WELL, path=Path(f"a-0{number}.mcap")) for number in (1, 2))
+    looks = Looks(watcher.told)
+    series = make_series(repeat=3)
+    series.run(Watched(*results, stopped), StopRequest(), watcher, live=False, looks=looks)
+    session = ["held", "run", "let go", "ended"]
+    pause = ["look", "watch", "watch", "watch"]
+    told = [each if isinstance(each, str) else each[0] for each in watcher.told]
+    assert told == ["begins", *session, *pause] * 2 + ["begins", *session]
+
+    stop = StopRequest()
+    stop.request()
+    watcher.told.clear()
+    _await_look(looks, Watched(), stop)
+    assert watcher.told == []
+
+
 def test_a_plan_is_told_with_its_limits_from_a_document_as_well(make_series):
     document = json.loads(json.dumps(make_series().plan_document()))
     first, peaks, *_ = plan_lines(document)
-    assert first == "hold on sim: 1.2 s of record."
-    assert " of 0.9 N·m." in peaks
+    assert first == "hold on sim, record of 1.2 s."
+    assert " N·m (limit 0.9)." in peaks
     for name in ("excitation", "profile", "limits", "tip_in_words"):  # of before an update
         del document[name]
     first, peaks = plan_lines(document)
-    assert first == "1.2 s of record."
-    assert " of " not in peaks
+    assert first == "record of 1.2 s."
+    assert "limit" not in peaks
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, "complete: no record."),
-        ({"outcome": "fault", "reason": "Gone."}, "fault: no record. Gone."),
-        ({"part": "a.mcap.part"}, "complete: no whole record, but a.mcap.part."),
+        ({}, "Complete: no record."),
+        ({"outcome": "fault", "reason": "Gone."}, "Fault: no record. Gone."),
+        ({"part": "a.mcap.part"}, "Complete: file incomplete, a.mcap.part."),
         (
-            {"path": "a.mcap", "missed": 1, "lost": 2},
-            "complete: 1200 ticks scheduled = 1200 recorded + 1 missed + 2 lost; 0 late; 0 stale "
-            "angles, 0 stale wrenches.",
+            {"path": "a.mcap", "scheduled": 136_000, "recorded": 135_997, "missed": 1, "lost": 2},
+            "Complete: 135 997 of 136 000 samples, 1 missed, 0 late, 2 lost.",
         ),
     ],
 )
@@ -133,3 +190,23 @@ def test_what_was_said_last_is_written(capsys):
         line.say(f"last {number}")
         line.close()
         assert capsys.readouterr().err == f"[first]\nlast {number}\n"
+
+
+def test_metadata_that_the_profile_requires_is_asked_for(tmp_path):
+    required = ["operator", "temperature_c", "batch"]
+    path = write_profile(tmp_path, {"session.tare_s": 0.5})
+    path.write_text(f"{path.read_text()}\n[metadata]\nrequired = {json.dumps(required)}\n")
+    profile = load_profile(path)
+    excitation = hold(rate_hz=1000.0, duration_s=1.0, rest_s=0.2, ring_down_s=0.0)
+    given = {"operator": "Ada", "meta_batch": "7"}
+    with pytest.raises(RefusedError) as refusal:
+        Series(profile, excitation, tmp_path, notes=given)
+    assert str(refusal.value) == (
+        f"{path}: metadata.required asks each session for temperature_c; add "
+        "--meta temperature_c=… (°C)."
+    )
+    with pytest.raises(
+        RefusedError, match=r"--operator … --meta temperature_c=… \(°C\) --meta batch=…\."
+    ):
+        Series(profile, excitation, tmp_path)
+    Series(profile, excitation, tmp_path, notes=given | {"meta_temperature_c": "21.4"})

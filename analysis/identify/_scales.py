@@ -1,0 +1,169 @@
+"""Uncertainty of what no session shows: the scales of torque and length, combined with its own.
+
+A wrong scale of the torque or a wrong length of the beam leaves no trace in the residual: other
+parameters make up for it exactly. With z = beta L the response (Eq. 25) is::
+
+    G = -(EI/L) (1 + zeta s^alpha) F(z),    z^4 = -(rho/EI L^4 s² + gamma L^4 s^lambda) / (1 + ...)
+
+so that a session shows EI/L, rho/EI L^4, gamma L^4, zeta and both orders, and nothing else of the
+beam. A torque that is read too large by a factor enlarges EI by it, the inertia of the clamp and
+the mass at the tip with it, and lessens the clamp's compliance; the drag of the air goes with the
+torque and with the square of the speed, which goes with the length, times the square of the length
+that it acts over. So every parameter goes with a power of each scale (`SCALE_EXPONENTS`), and the
+relative variances add (JCGM 100:2008, GUM, 5.1.6).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._plant import LOGARITHMIC
+from analysis.statistics import NORMAL_95
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.identify._headline import Quantity
+    from analysis.identify._result import RecordFit
+
+_RATIO: Final = "density_over_stiffness"
+_STIFFNESS: Final = "bending_stiffness_n_m2"
+_TOOL: Final = "tool_inertia_kg_m2"
+_ABSORBING: Final = (_RATIO, _STIFFNESS)
+
+SCALE_EXPONENTS: Final[Mapping[str, Mapping[str, int]]] = MappingProxyType(
+    {
+        "gamma": {"length": -4},
+        _RATIO: {"length": -4},
+        _STIFFNESS: {"torque_scale": 1, "length": 1},
+        _TOOL: {"torque_scale": 1},
+        "root_compliance_rad_per_nm": {"torque_scale": -1},
+        "tip_mass_kg": {"torque_scale": 1, "length": -2},
+        "drag": {"torque_scale": 1, "length": -4},
+    }
+)
+"""Powers of the scales that a parameter goes with; what is not named depends on none: zeta, the
+orders, delays and filters, frequencies, damping ratios and loss factors."""
+
+_OF_DENSITY: Final = {"torque_scale": 1, "length": -3}
+"""The same of the mass per length, rho/EI times EI."""
+
+
+def scales_absorbed(fit: RecordFit) -> bool:
+    """Whether the parameters make up for a wrong scale: not if some are held at given values.
+
+    Parameters
+    ----------
+    fit : RecordFit
+    """
+    held_tool = _TOOL not in fit.interval and fit.parameters[_TOOL] != 0
+    return all(name in fit.interval for name in _ABSORBING) and not held_tool
+
+
+def with_scales(
+    parameters: Mapping[str, Quantity], uncertainty: Mapping[str, float]
+) -> dict[str, Quantity]:
+    """Combine statistical uncertainties with those of the scales.
+
+    Parameters
+    ----------
+    parameters : mapping of str to Quantity
+        By the names of `RecordFit`, with statistical uncertainties.
+    uncertainty : mapping of str to float
+        Relative standard uncertainties by scale: "torque_scale", "length".
+
+    Returns
+    -------
+    dict of str to Quantity
+        Those that depend on a scale whose uncertainty is given and that have an interval, with the
+        combined standard uncertainty and 95 % interval.
+    """
+    return {
+        name: _combined(each, relative, logarithmic=name in LOGARITHMIC)
+        for name, each in parameters.items()
+        if each.interval_95 is not None
+        and (relative := _relative(SCALE_EXPONENTS.get(name, {}), uncertainty))
+    }
+
+
+def _relative(exponents: Mapping[str, int], uncertainty: Mapping[str, float]) -> float:
+    return math.hypot(*(power * uncertainty.get(scale, 0.0) for scale, power in exponents.items()))
+
+
+def _combined(told: Quantity, relative: float, *, logarithmic: bool) -> Quantity:
+    """Widen an interval on either side by what the scales add, in quadrature."""
+    assert told.interval_95 is not None
+    value, (low, high) = told.value, told.interval_95
+    std = math.hypot(told.std or 0.0, value * relative)
+    if logarithmic:
+        below, above = (
+            math.hypot(math.log(end / value), NORMAL_95 * relative) for end in (low, high)
+        )
+        ends = value * math.exp(-below), value * math.exp(min(above, 300.0))
+    else:
+        half = NORMAL_95 * relative * value
+        ends = value - math.hypot(value - low, half), value + math.hypot(high - value, half)
+        # What cannot be negative ends at 0.
+        ends = max(ends[0], 0.0), ends[1]
+    return replace(told, std=std, interval_95=ends)
+
+
+@dataclass(frozen=True, slots=True)
+class DensityCheck:
+    """Mass per length of the beam from the record, beside that of the file.
+
+    Only where torque scale and length are right do they agree.
+
+    Attributes
+    ----------
+    found_kg_per_m, found_std_kg_per_m : float
+        rho/EI times EI, with the combined standard uncertainty.
+    stated_kg_per_m, stated_std_kg_per_m : float
+        That of the file.
+    """
+
+    found_kg_per_m: float
+    found_std_kg_per_m: float
+    stated_kg_per_m: float
+    stated_std_kg_per_m: float
+
+    @property
+    def agree(self) -> bool:
+        """Whether they differ by no more than 95 % of chance."""
+        apart = abs(self.found_kg_per_m - self.stated_kg_per_m)
+        return apart <= NORMAL_95 * math.hypot(self.found_std_kg_per_m, self.stated_std_kg_per_m)
+
+
+def density_check(
+    fit: RecordFit, stated_kg_per_m: float, uncertainty: Mapping[str, float]
+) -> DensityCheck | None:
+    """Compare the mass per length that a record shows with the stated one.
+
+    Parameters
+    ----------
+    fit : RecordFit
+    stated_kg_per_m : float
+        As the file has it.
+    uncertainty : mapping of str to float
+        Relative standard uncertainties of "torque_scale", "length" and "density".
+
+    Returns
+    -------
+    DensityCheck or None
+        None unless all three are stated and the fit determines rho/EI and EI.
+    """
+    determined = all(name in fit.determined for name in _ABSORBING)
+    if not determined or not uncertainty.keys() >= {*_OF_DENSITY, "density"}:
+        return None
+    places = [fit.determined.index(name) for name in _ABSORBING]
+    own = float(fit.covariance[np.ix_(places, places)].sum())
+    found = fit.parameters[_RATIO] * fit.parameters[_STIFFNESS]
+    relative = math.sqrt(own + _relative(_OF_DENSITY, uncertainty) ** 2)
+    return DensityCheck(
+        found, found * relative, stated_kg_per_m, stated_kg_per_m * uncertainty["density"]
+    )

@@ -1,0 +1,552 @@
+"""Quick look at one session: its modes, the coherence, what is flagged, against the last session.
+
+As a program, ``python -m analysis.quick_look FILE``, it writes the look beside the session file, as
+``STEM.look.json``, and prints its text. `rigd run` and the daemon start it after each session, at
+the lowest priority there is. The report of `analyze` says more and takes longer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from rigd.runtime import raise_on, signal_when_orphaned, use_one_thread
+from rigd.session import LOOK_SUFFIX, SessionError, look_path
+from rigd.units import decimals
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from analysis.identify import Finding, Headline, Mode
+    from analysis.record import Record
+    from rigd.spectral import RunningEstimate, Segmentation
+
+    Real = NDArray[np.float64]
+
+VERSION: Final = 1
+"""Version of the file's layout."""
+
+_JUDGED_S: Final = 300.0
+"""Longest record to which every structure is fitted: that takes 15 ms per second of record at
+1 kHz, the freest structure alone 2 ms."""
+
+_LAST_HZ: Final = 60.0
+_FIRST_HZ: Final = 0.5
+"""Band of the response: that of the live view."""
+
+_POINTS: Final = 400
+"""Most points of the response in the file."""
+
+_COHERENT: Final = 0.8
+"""Coherence below which a band is named."""
+
+_NEAR: Final = 0.1
+"""Distance of two such bands, relative to their frequency, below which they are told as one."""
+
+_SIGNIFICANT_STD: Final = 3.0
+"""A change counts from so many standard deviations of the difference on: six are looked at."""
+
+_MOST_LOOKS: Final = 200
+_MOST_BYTES: Final = 1_000_000
+
+
+class LookError(ValueError):
+    """A look cannot be made or written; the message says why, and what to do."""
+
+
+# The look
+
+
+def look_at(path: Path, last: Path | None = None) -> dict[str, Any]:
+    """Look at a session.
+
+    Parameters
+    ----------
+    path : Path
+        Session file.
+    last : Path, optional
+        Session to compare with, by its look; by default the last one of the same specimen among
+        the looks beside the file.
+
+    Returns
+    -------
+    dict
+        The document of docs/quick_look.md, as `json.dumps` takes it.
+
+    Raises
+    ------
+    rigd.session.SessionError, LookError
+        There is no session file, or no look of `last`.
+    """
+    from analysis.record import RecordError, load_record
+
+    began_s = time.monotonic()
+    modes: list[dict[str, Any]] = []
+    response, coherence = _no_response(), _no_coherence()
+    specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
+    flags: list[str] = []
+    compared = None
+    try:
+        record = load_record(path)
+    except RecordError as error:
+        flags.append(_without_name(str(error), path))
+    else:
+        about = record.metadata
+        specimen, excitation = about.get("specimen", ""), about.get("excitation", "")
+        session_id = about.get("id", path.stem)
+        start_utc_ns = _whole_number(about.get("start_utc_ns", ""))
+        flags += record.warnings
+        modes, more = _modes(record)
+        flags += more
+        response, coherence, more = _response(record)
+        flags += more
+    before = _look_of(last) if last is not None else _last_look(path, specimen, start_utc_ns)
+    if before is not None and any(mode["shown"] for mode in modes):
+        compared = _against(modes, before)
+    document = {
+        "version": VERSION,
+        "file": path.name,
+        "session_id": session_id,
+        "start_utc_ns": start_utc_ns,
+        "made_utc_ns": time.time_ns(),
+        "took_s": round(time.monotonic() - began_s, 2),
+        "specimen": specimen,
+        "excitation": excitation,
+        "modes": modes,
+        "coherence": coherence,
+        "flags": flags,
+        "against_last": compared,
+        "response": response,
+    }
+    document["text"] = list(_text(document))
+    plain = _plain(document)
+    assert isinstance(plain, dict)
+    return plain
+
+
+def _modes(record: Record) -> tuple[list[dict[str, Any]], list[str]]:
+    """Estimate the modes; return them, and what is to be said of them."""
+    from analysis.identify import Measurement, MeasurementError, freest_alone
+    from analysis.results import whole_record
+    from analysis.suited import record_band_hz
+
+    said = []
+    length_s = record.time_s.size / record.rate_hz
+    try:
+        told: Headline
+        found: tuple[Finding, ...]
+        if length_s <= _JUDGED_S:
+            selection = whole_record(record).selection
+            told, found = selection.headline, selection.verdict.findings
+        else:
+            told, found = freest_alone(Measurement.of_record(record), record_band_hz(record))
+            said.append(
+                f"The record is long ({length_s:.0f} s): type {told.name} alone was fitted; "
+                "non-uniform beams, air drag, nonlinear forces and changes along the record were "
+                "not tried. analyze tries them."
+            )
+    except MeasurementError as error:
+        return [], [f"No modes: {_without_name(str(error), record.path)}"]
+    said += [each.sentence for each in found]
+    if not told.modes:
+        said.append("No modes: the band that was excited holds none.")
+    return [_mode(each) for each in told.modes], said
+
+
+def _mode(mode: Mode) -> dict[str, Any]:
+    return {
+        "mode": mode.number,
+        "frequency_hz": mode.frequency_hz.as_json(),
+        "damping_ratio": mode.damping_ratio.as_json(),
+        "shown": mode.shown,
+    }
+
+
+def _response(record: Record) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
+    """Estimate response and coherence as the live view does, where the reference has excited it."""
+    import numpy as np
+
+    from analysis.models import LARGEST_SHARE_OF_RATE
+    from analysis.suited import against_welch
+    from rigd.spectral import SpectralError, segmentation_of
+
+    last_hz = min(_LAST_HZ, LARGEST_SHARE_OF_RATE * record.rate_hz)
+    segments = segmentation_of(record.sweep_samples, record.rate_hz)
+    try:
+        estimate = _estimate(record, segments, last_hz)
+        # Of steps, multisines and narrow sweeps it would tell of the segments, not of the rig.
+        coherence = None
+        if estimate is not None and against_welch(record, (_FIRST_HZ, last_hz)) is None:
+            coherence, segments = _coherence(record, estimate, segments, last_hz)
+    except SpectralError as error:
+        return _no_response(), _no_coherence(), [str(error)]
+    if estimate is None:
+        return _no_response(), _no_coherence(), []
+    found = estimate.response.without_delays(
+        input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
+    )
+    shown = estimate.excited & (found.frequency_hz >= _FIRST_HZ) & np.isfinite(found.response)
+    hz, values = found.frequency_hz[shown], found.response[shown]
+    kept = _thinned(hz, np.abs(values))
+    response = {
+        "frequency_hz": _rounded(hz[kept]),
+        "magnitude": _rounded(np.abs(values[kept])),
+        "phase_rad": _rounded(np.angle(values[kept])),
+        "coherence": None if coherence is None else _rounded(coherence[shown][kept]),
+    }
+    if coherence is None or hz.size == 0:
+        return response, _no_coherence(), []
+    coherent = coherence[shown]
+    low = _bands(hz, coherent < _COHERENT, record.rate_hz / segments.segment_length)
+    bands = [[round(edge, 3) for edge in band] for band in low]
+    return response, {"mean": round(float(coherent.mean()), 4), "low_bands": bands}, []
+
+
+def _estimate(record: Record, segments: Segmentation, last_hz: float) -> RunningEstimate | None:
+    import numpy as np
+
+    from rigd.spectral import RunningResponse
+
+    swept, rest_rad = record.sweep, record.rest_angle_rad or 0.0
+    running = RunningResponse(
+        record.rate_hz, record.sweep_samples, last_hz=last_hz, segmentation=segments
+    )
+    running.feed(
+        np.arange(record.sweep_samples),
+        record.reference_rad[swept] - rest_rad,
+        record.angle_rad[swept] - rest_rad,
+        record.torque_nm[swept],
+    )
+    return running.estimate()
+
+
+def _coherence(
+    record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
+) -> tuple[Real | None, Segmentation]:
+    """Return the coherence, and the segments that it is of: of a single one there is none."""
+    from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
+
+    if estimate.response.coherence is None:
+        length, overlap = segment_lengths(
+            record.sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
+        )
+        segments = replace(segments, segment_length=length, overlap=overlap)
+        shorter = _estimate(record, segments, last_hz)
+        return None if shorter is None else shorter.response.coherence, segments
+    return estimate.response.coherence, segments
+
+
+def _thinned(frequency_hz: Real, magnitude: Real) -> NDArray[np.intp]:
+    """Choose the least and the largest magnitude of groups even on a logarithmic axis.
+
+    So resonances and antiresonances keep their heights.
+    """
+    import numpy as np
+
+    if frequency_hz.size <= _POINTS:
+        return np.arange(frequency_hz.size)
+    edges = np.geomspace(frequency_hz[0], frequency_hz[-1], _POINTS // 2 + 1)
+    starts = np.unique(np.searchsorted(frequency_hz, edges[:-1]))
+    ends = [*starts[1:], frequency_hz.size]
+    kept = [
+        first + place
+        for first, end in zip(starts, ends, strict=True)
+        for place in (np.argmin(magnitude[first:end]), np.argmax(magnitude[first:end]))
+    ]
+    return np.unique(kept)
+
+
+def _bands(
+    frequency_hz: Real, low: NDArray[np.bool_], resolved_hz: float
+) -> Iterator[tuple[float, float]]:
+    """Join bins to bands: what is nearer than a tenth of its frequency is one band.
+
+    A band narrower than segments resolve is left out.
+    """
+    import numpy as np
+
+    hz = frequency_hz[low]
+    apart = np.flatnonzero(np.diff(hz) > np.maximum(_NEAR * hz[:-1], resolved_hz)) + 1
+    for first, end in pairwise([0, *apart, hz.size]):
+        if end > first and hz[end - 1] - hz[first] >= resolved_hz:
+            yield float(hz[first]), float(hz[end - 1])
+
+
+def _no_response() -> dict[str, Any]:
+    return {"frequency_hz": [], "magnitude": [], "phase_rad": [], "coherence": None}
+
+
+def _no_coherence() -> dict[str, Any]:
+    return {"mean": None, "low_bands": []}
+
+
+# Against the last session
+
+
+def _last_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str, Any] | None:
+    """Find the last session of a specimen before a time, by the looks beside its file."""
+    looks: list[tuple[float, Path]] = []
+    with suppress(OSError):
+        for found in path.parent.glob(f"*{LOOK_SUFFIX}"):
+            with suppress(OSError):
+                looks.append((found.stat().st_mtime, found))
+    # Those made last suffice: reading all of some thousand would take as long as the look.
+    newest = sorted(looks, reverse=True)[:_MOST_LOOKS]
+    read = (_read_look(found) for _, found in newest if found != look_path(path))
+    alike = [
+        each
+        for each in read
+        if each is not None
+        and each["specimen"] == specimen
+        and each["start_utc_ns"] < before_utc_ns
+        and any(mode["shown"] for mode in each["modes"])
+    ]
+    return max(alike, key=lambda each: each["start_utc_ns"], default=None)
+
+
+def _look_of(last: Path) -> dict[str, Any]:
+    look = _read_look(look_path(last))
+    if look is None:
+        raise LookError(
+            f"--last {last}: there is no quick look beside it that can be read; make one with "
+            f"python -m analysis.quick_look {last}."
+        )
+    return look
+
+
+def _read_look(path: Path) -> dict[str, Any] | None:
+    """Read a look; None if it is none, or of another version."""
+    try:
+        with path.open("rb") as file:
+            document = json.loads(file.read(_MOST_BYTES))
+        known = {
+            "file": str(document["file"]),
+            "specimen": str(document["specimen"]),
+            "start_utc_ns": int(document["start_utc_ns"]),
+            "made_utc_ns": int(document["made_utc_ns"]),
+            "modes": [
+                {
+                    "mode": int(mode["mode"]),
+                    "shown": mode["shown"] is True,
+                    **{name: _read_quantity(mode[name]) for name in _QUANTITIES},
+                }
+                for mode in document["modes"]
+            ],
+        }
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return known if document.get("version") == VERSION else None
+
+
+_QUANTITIES: Final = ("frequency_hz", "damping_ratio")
+
+
+def _read_quantity(quantity: Mapping[str, Any]) -> dict[str, Any]:
+    std = quantity["std"]
+    return {
+        "value": float(quantity["value"]),
+        "std": None if std is None else float(std),
+        "flag": quantity["flag"],
+    }
+
+
+def _against(modes: list[dict[str, Any]], before: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare the modes that both sessions show."""
+    theirs = {mode["mode"]: mode for mode in before["modes"] if mode["shown"]}
+    compared, changed, same = [], [], []
+    for mode in modes:
+        other = theirs.get(mode["mode"])
+        if other is None or not mode["shown"]:
+            continue
+        hz, damping = mode["frequency_hz"], mode["damping_ratio"]
+        change_hz = hz["value"] - other["frequency_hz"]["value"]
+        was = other["damping_ratio"]["value"]
+        percent = 100 * (damping["value"] / was - 1) if was else math.nan
+        significant = [_differs(mode[name], other[name]) for name in _QUANTITIES]
+        compared.append(
+            {
+                "mode": mode["mode"],
+                "frequency_hz_change": change_hz,
+                "damping_ratio_change_percent": percent,
+                "significant": any(significant),
+            }
+        )
+        digits = decimals(hz["std"]) if hz["std"] else 4
+        texts = (f"{change_hz:+.{digits}f} Hz", f"damping {percent:+.2g} %")
+        moved = [text for text, differs in zip(texts, significant, strict=True) if differs]
+        if moved:
+            changed.append(f"mode {mode['mode']} {', '.join(moved)}")
+        else:
+            same.append(f"mode {mode['mode']} {', '.join(texts)}")
+    name = Path(before["file"]).stem
+    if not compared:
+        sentence = f"No mode can be compared with {name}."
+    elif changed:
+        sentence = f"Significant change against {name}: {'; '.join(changed)}."
+    else:
+        sentence = f"No significant change against {name} ({'; '.join(same)})."
+    return {"file": before["file"], "sentence": sentence, "modes": compared}
+
+
+def _differs(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two estimates differ by more than their uncertainties explain."""
+    if one["flag"] or other["flag"] or one["std"] is None or other["std"] is None:
+        return False
+    limit = _SIGNIFICANT_STD * math.hypot(one["std"], other["std"])
+    return bool(abs(one["value"] - other["value"]) > limit > 0)
+
+
+# Text
+
+
+def _text(document: Mapping[str, Any]) -> Iterator[str]:
+    """Say it in a few lines for a terminal."""
+    specimen = f" ({document['specimen']})" if document["specimen"] else ""
+    # What it leaves out: scale of the torque, length and density of the beam.
+    yield f"Quick look at {document['session_id']}{specimen}; ± 95 %, statistical only:"
+    shown = [mode for mode in document["modes"] if mode["shown"]]
+    for mode in shown:
+        hz, damping = mode["frequency_hz"], mode["damping_ratio"]
+        yield (
+            f"  mode {mode['mode']}: {_with_half_width(hz)} Hz, "
+            f"damping {_with_half_width(damping, 100.0)} %"
+        )
+    doubts = dict.fromkeys(
+        flag for mode in shown for name in _QUANTITIES if (flag := mode[name]["flag"])
+    )
+    yield from (f"  doubtful: {doubt}" for doubt in doubts)
+    unseen = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
+    if unseen:
+        yield f"  not shown by this record: mode {' and '.join(unseen)}"
+    coherence = document["coherence"]
+    if coherence["mean"] is not None:
+        bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])
+        low = f", below {_COHERENT:g} from {bands} Hz" if bands else ""
+        yield f"  mean coherence {coherence['mean']:.2f}{low}"
+    yield from (f"  {flag}" for flag in document["flags"])
+    if document["against_last"] is not None:
+        yield f"  {document['against_last']['sentence']}"
+
+
+def _with_half_width(quantity: Mapping[str, Any], scale: float = 1.0) -> str:
+    """Write a number with half of its 95 % interval."""
+    if quantity["interval_95"] is None:
+        return f"{scale * quantity['value']:.5g}"
+    low, high = quantity["interval_95"]
+    half = scale * (high - low) / 2
+    if not 0 < half < math.inf:
+        return f"{scale * quantity['value']:.5g}"
+    digits = decimals(half)
+    return f"{scale * quantity['value']:.{digits}f} ± {half:.{digits}f}"
+
+
+def _rounded(values: Real) -> list[float]:
+    """Six digits: more than an estimate has."""
+    return [float(f"{value:.6g}") for value in values]
+
+
+def _whole_number(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() else 0
+
+
+def _without_name(sentence: str, path: Path) -> str:
+    return sentence.removeprefix(f"{path}: ")
+
+
+def _plain(value: object) -> object:
+    """As JSON can have it: what is not finite becomes null."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# The file
+
+
+def write_look(document: Mapping[str, Any], path: Path) -> Path:
+    """Write a look beside its session file, whole or not at all.
+
+    An older look at the same session is replaced; one that was made later stays.
+
+    Parameters
+    ----------
+    document : mapping
+        As `look_at` gives it.
+    path : Path
+        Session file.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    LookError
+        It cannot be written, or something else has its name.
+    """
+    place = look_path(path)
+    there = _read_look(place)
+    if there is not None and there["made_utc_ns"] > document["made_utc_ns"]:
+        return place
+    new = place.with_name(f".{place.name}.{os.getpid()}")
+    try:
+        if there is None and place.exists() and place.stat().st_size > 0:
+            raise LookError(f"{place} is no quick look of this version; move it away.")
+        new.write_text(json.dumps(document, allow_nan=False), "utf-8")
+        new.replace(place)
+    except OSError as error:
+        raise LookError(f"{place} cannot be written ({error.strerror}).") from None
+    finally:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
+    return place
+
+
+# The program
+
+
+def main() -> None:
+    """Look at the session that the command line names."""
+    raise_on(signal.SIGINT)
+    parser = argparse.ArgumentParser(prog="python -m analysis.quick_look", description=__doc__)
+    parser.add_argument("file", type=Path, metavar="FILE", help="Session file.")
+    parser.add_argument(
+        "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
+    )
+    parser.add_argument("--parent", type=int, help="End with the process of this number.")
+    asked = parser.parse_args()
+    if asked.parent is not None:
+        signal_when_orphaned(signal.SIGKILL)
+        if os.getppid() != asked.parent:  # it was gone before
+            sys.exit(1)
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    use_one_thread()
+    try:
+        document = look_at(asked.file, asked.last)
+        write_look(document, asked.file)
+    except (SessionError, LookError) as error:
+        sys.exit(f"Error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
+    sys.stdout.write("\n".join(document["text"]) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+"""Figures of a campaign's pooled estimate: damping against frequency, frequency response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.campaigns import title
+from analysis.models import ESTIMATOR_WORDS, STRUCTURES
+from analysis.report import _style as style
+from analysis.report._bands import dense_grid, loss_factors, response_band
+from analysis.report._pooled_tables import used
+from analysis.statistics import NORMAL_95, student_t_quantile
+from rigd.view import magnitude_db, phase_deg
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from analysis.campaigns import CampaignResult, PooledEstimate, PooledMode
+    from analysis.identify import ModeEstimate, Plant
+    from analysis.models import Structure
+
+_BAND: Final = "#C3DCED"
+"""Of an interval: the blue of the pooled line, but light and opaque."""
+_SESSION: Final = "#A8A8A8"
+_POINTS: Final = 400
+_COLUMNS: Final = 1500
+_MOST_LINES: Final = 40
+"""Most sessions drawn: more would not be told apart."""
+_BESIDE: Final = 1.6
+"""Ratio of the axis's ends to the outermost modes."""
+
+
+@dataclass(frozen=True, slots=True)
+class _PooledFit:
+    """Pooled estimate as `analysis.report._bands` takes an estimate."""
+
+    structure: Structure
+    plant: Plant
+    parameters: Mapping[str, float]
+    determined: tuple[str, ...]
+    covariance: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, pooled: PooledEstimate) -> _PooledFit:
+        # Bands are 1.96 standard deviations wide, and Student's t of few sessions is more.
+        widened = student_t_quantile(0.95, pooled.sessions - 1) / NORMAL_95
+        return cls(
+            structure=STRUCTURES[pooled.structure],
+            plant=pooled.plant,
+            parameters={
+                **pooled.plant.parameters, **{each.name: each.value for each in pooled.parameters},
+            },
+            determined=tuple(each.name for each in pooled.parameters),
+            covariance=widened**2 * pooled.covariance,
+        )  # fmt: skip
+
+
+# Damping
+
+
+def damping_figure(campaign: CampaignResult) -> Figure:
+    """Draw the damping ratios of all sessions' modes against frequency, with the pooled ones.
+
+    On top all modes, and between them half the loss factor of the pooled estimate with its 95 %
+    band; below each mode enlarged.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    pooled = campaign.headline
+    assert pooled is not None
+    modes = pooled.modes
+    width_in, height_in = 11.0, 6.6
+    figure = style.new_figure(
+        width_in, height_in,
+        title(f"Damping against frequency, {used(pooled, campaign)}", campaign.homogeneity),
+        f"type {pooled.name}  ·  curve: half the pooled loss factor between the modes  ·  below: "
+        "each mode, frequency from the pooled mean",
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        2, len(modes), left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
+        height_ratios=(1.25, 1.0), hspace=0.32, wspace=0.28,
+    )  # fmt: skip
+    axes = figure.add_subplot(grid[0, :])
+    _curve(axes, pooled)
+    of_sessions = _modes_of_sessions(campaign, pooled)
+    for column, mode in enumerate(modes):
+        own = [each[column] for each in of_sessions]
+        axes.plot(
+            [each.frequency_hz for each in own], [100 * each.damping_ratio for each in own], "o",
+            color=style.INK, markersize=3.0,
+        )  # fmt: skip
+        _pooled_mode(axes, mode, pooled.sessions)
+        _enlarged(figure.add_subplot(grid[1, column]), mode, own, pooled.sessions)
+    figure.axes[1].set_ylabel("Damping ratio (%)")
+    style.frequency_axis(axes, (modes[0].frequency_hz / _BESIDE, modes[-1].frequency_hz * _BESIDE))
+    axes.set_ylim(bottom=0.0)
+    axes.margins(y=0.1)
+    axes.set_ylabel("Damping ratio (%)")
+    axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    figure.legend(
+        handles=[
+            Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
+                   label="session, ± 1.96 of its standard deviation"),
+            Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
+            Patch(facecolor=_BAND, label="its 95 % interval"),
+        ],
+        loc="upper left", ncols=3, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
+    )  # fmt: skip
+    return figure
+
+
+def _modes_of_sessions(
+    campaign: CampaignResult, pooled: PooledEstimate
+) -> list[tuple[ModeEstimate, ...]]:
+    """Modes of every session by the structure pooled, those that all have."""
+    count = len(pooled.modes)
+    return [
+        each.modes[:count]
+        for session in campaign.sessions
+        for each in session.record_estimates
+        if each.name == pooled.name and len(each.modes) >= count
+    ]
+
+
+def _curve(axes: Axes, pooled: PooledEstimate) -> None:
+    """Draw half the loss factor between the first and the last mode: a damping ratio there."""
+    if len(pooled.modes) < 2:
+        return
+    frequency_hz = np.geomspace(
+        pooled.modes[0].frequency_hz, pooled.modes[-1].frequency_hz, _POINTS
+    )
+    total = loss_factors(_PooledFit.of(pooled), frequency_hz).total
+    low, high = total.limits()
+    axes.fill_between(frequency_hz, 50 * low, 50 * high, color=_BAND, linewidth=0)
+    axes.plot(frequency_hz, 50 * total.value, color=style.BLUE)
+
+
+def _pooled_mode(axes: Axes, mode: PooledMode, sessions: int, *, origin_hz: float = 0.0) -> None:
+    """Draw a pooled mode with the 95 % interval of its damping ratio."""
+    half = 100 * student_t_quantile(0.95, sessions - 1) * mode.damping_ratio_std
+    axes.errorbar(
+        [mode.frequency_hz - origin_hz], [100 * mode.damping_ratio], yerr=[half], fmt="D",
+        color=style.BLUE, markersize=4.0, capsize=3.0, elinewidth=1.0, zorder=4,
+    )  # fmt: skip
+
+
+def _enlarged(axes: Axes, mode: PooledMode, own: Sequence[ModeEstimate], sessions: int) -> None:
+    """Draw one mode of every session, with both deviations, over the pooled intervals."""
+    from matplotlib.patches import Rectangle
+
+    t = student_t_quantile(0.95, sessions - 1)
+    half_mhz, half = 1e3 * t * mode.frequency_std_hz, 100 * t * mode.damping_ratio_std
+    axes.add_patch(
+        Rectangle(
+            (-half_mhz, 100 * mode.damping_ratio - half), 2 * half_mhz, 2 * half,
+            facecolor=_BAND, edgecolor="none", zorder=1,
+        )
+    )  # fmt: skip
+    axes.errorbar(
+        [1e3 * (each.frequency_hz - mode.frequency_hz) for each in own],
+        [100 * each.damping_ratio for each in own],
+        xerr=[1e3 * NORMAL_95 * each.frequency_std_hz for each in own],
+        yerr=[100 * NORMAL_95 * each.damping_ratio_std for each in own],
+        fmt="o", color=style.INK, markersize=2.6, linewidth=0.8, zorder=3,
+    )  # fmt: skip
+    axes.plot([0.0], [100 * mode.damping_ratio], "D", color=style.BLUE, markersize=4.0, zorder=4)
+    axes.ticklabel_format(axis="both", useOffset=False)
+    axes.locator_params(nbins=4)
+    axes.set_facecolor("#FCFAF4")
+    axes.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
+    axes.set_xlabel(f"Frequency less {mode.frequency_hz:.6g} Hz (mHz)", labelpad=1)
+
+
+# Frequency response
+
+
+def response_figure(campaign: CampaignResult) -> Figure:
+    """Draw the pooled estimate's frequency response with its 95 % band over the sessions'.
+
+    Those are measured ones where Welch's method suits the sessions, otherwise those of the
+    sessions' own whole-record fits.
+    """
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    pooled = campaign.headline
+    assert pooled is not None
+    peaks_hz = [mode.frequency_hz for mode in pooled.modes]
+    first_hz, last_hz = _band_hz(campaign, peaks_hz)
+    band = response_band(_PooledFit.of(pooled), dense_grid(first_hz, last_hz, peaks_hz))
+    measured = bool(campaign.sessions[0].frequency_hz.size)
+    width_in, height_in = 11.0, 6.6
+    figure = style.new_figure(
+        width_in, height_in,
+        title(f"Pooled frequency response, {used(pooled, campaign)}", campaign.homogeneity),
+        f"coupling torque over motor angle, without delays  ·  pooled: type {pooled.name}"
+        + (
+            f"  ·  sessions: {ESTIMATOR_WORDS[campaign.settings.estimator]}, which a fast sweep "
+            "biases at the resonances"
+            if measured
+            else ""
+        ),
+    )  # fmt: skip
+    grid = figure.add_gridspec(
+        3, 1, left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
+        height_ratios=(2.4, 1.0, 0.8), hspace=0.1,
+    )  # fmt: skip
+    magnitude, phase, width = (figure.add_subplot(grid[row]) for row in range(3))
+    lowest_db = _draw_sessions(campaign, pooled, magnitude, phase, band.frequency_hz)
+    low, high = (magnitude_db(each.astype(complex)) for each in band.magnitude_limits())
+    modelled_db = magnitude_db(band.response)
+    magnitude.fill_between(band.frequency_hz, low, high, color=_BAND, linewidth=0)
+    magnitude.plot(band.frequency_hz, modelled_db, color=style.BLUE)
+    magnitude.set_ylim(min(lowest_db, float(np.quantile(modelled_db, 0.02))) - 5,
+                       float(modelled_db.max()) + 5)  # fmt: skip
+    magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
+    phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
+    phase.set_ylim(-60, 240)
+    phase.set_yticks((0, 90, 180))
+    phase.set_ylabel("Phase (°)")
+    width.plot(band.frequency_hz, 100 * NORMAL_95 * band.log_magnitude_std, color=style.BLUE)
+    width.set_ylim(bottom=0.0)
+    width.set_ylabel("Band (± %)")
+    width.set_xlabel("Frequency (Hz)", labelpad=1)
+    for axes in (magnitude, phase, width):
+        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
+    figure.align_ylabels()
+    figure.legend(
+        handles=[
+            Line2D([], [], color=_SESSION, linewidth=1.5,
+                   label=f"sessions, {'measured' if measured else 'each by its own fit'}"),
+            Line2D([], [], color=style.BLUE, label="pooled"),
+            Patch(facecolor=_BAND, label="its 95 % band"),
+        ],
+        loc="upper left", ncols=3, borderaxespad=0.0,
+        bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
+    )  # fmt: skip
+    return figure
+
+
+def _band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tuple[float, float]:
+    """Axis of the response: the band of the fits, from well below the first mode on."""
+    first_hz, last_hz = campaign.record_band_hz
+    lowest_hz = min([last_hz / 4, *(peak / 4 for peak in peaks_hz)])
+    return max(first_hz, lowest_hz), last_hz
+
+
+def _draw_sessions(
+    campaign: CampaignResult,
+    pooled: PooledEstimate,
+    magnitude: Axes,
+    phase: Axes,
+    grid_hz: NDArray[np.float64],
+) -> float:
+    """Draw what each session has; return the least magnitude worth showing, in dB."""
+    from analysis.identify import ResponseGrid
+
+    sessions = campaign.sessions
+    chosen = np.unique(np.linspace(0, len(sessions) - 1, _MOST_LINES).round().astype(int))
+    lowest = np.inf
+    for session in (sessions[number] for number in chosen):
+        frequency_hz, response = session.frequency_hz, session.response
+        if not frequency_hz.size:
+            own = [each for each in session.record_estimates if each.name == pooled.name]
+            if not own:
+                continue
+            frequency_hz = grid_hz
+            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(own[0].plant, ())[0]
+        db = magnitude_db(response)
+        lowest = min(lowest, float(np.quantile(db, 0.005)))
+        magnitude.plot(
+            *style.envelope(frequency_hz, db, _COLUMNS, logarithmic=True), color=_SESSION,
+            linewidth=0.5, rasterized=True,
+        )  # fmt: skip
+        few = style.spread(frequency_hz, _COLUMNS)
+        # Dots: a line would run up and down wherever noise wraps the phase.
+        phase.plot(
+            frequency_hz[few], phase_deg(response[few]), ".", markersize=0.8, color=_SESSION,
+            rasterized=True,
+        )  # fmt: skip
+    return lowest

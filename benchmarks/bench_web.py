@@ -1,0 +1,246 @@
+"""What the operator's page costs: processor time, memory, and how late the loop wakes up.
+
+    python benchmarks/bench_web.py [SECONDS] [ROUNDS]
+
+In each round, in turn, a daemon with its page runs a chirp at 1 kHz with no page open, with one,
+and with ten of which one is suspended. Processor time and memory (PSS) are those of the daemon's
+process and of the page's; the delay of a strip is from the last tick that a point stands for to its
+arrival. The ratio is the median over the rounds.
+"""
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+from bench_live import cpu_s
+
+from rigd.daemon import Client, find, page_address
+from rigd.session import read_session
+
+RIGD = Path(sys.executable).parent / "rigd"
+MOST_CPU_PERCENT = 6.0
+MOST_PSS_MB = 150.0
+MOST_DELAY_S = 0.3
+MOST_RATIO = 1.2
+MOST_LOAD_S = 1.0
+_PATIENCE_S = 60.0
+_SETTLED_S = 3.0
+
+
+@dataclass
+class Found:
+    """What one session showed."""
+
+    late_p99_us: float
+    missed: int
+    lost: int
+    cpu_percent: tuple[float, float]
+    """Of the daemon's process and of the page's."""
+    pss_mb: tuple[float, float]
+    """Likewise."""
+    delays_s: list[float]
+    """Of the strips, as the first page got them."""
+
+
+def pss_mb(pid: int) -> float:
+    """Return the memory of a process, what it shares counted in parts."""
+    for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+        if line.startswith("Pss:"):
+            return int(line.split()[1]) * 1024e-6
+    raise ValueError("no PSS")
+
+
+def page_process(daemon: int) -> int:
+    """Return the process of the page that a daemon has started."""
+    for task in Path(f"/proc/{daemon}/task").iterdir():
+        for child in (task / "children").read_text().split():
+            if b"rigd.web" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return int(child)
+    raise ValueError("no page")
+
+
+async def look_on(address: str, pages: int) -> None:
+    """Be some open pages; print when each strip came to the first one, and what it ended with."""
+    async with aiohttp.ClientSession() as session:
+
+        async def follow(*, told: bool) -> None:
+            async with session.ws_connect(f"{address}api/live") as socket:
+                async for message in socket:
+                    if told and message.data.startswith('{"type":"strip"'):
+                        strip = json.loads(message.data)
+                        end_s = strip["t0_s"] + strip["dt_s"] * len(strip["angle_min"])
+                        print(time.time(), end_s, flush=True)
+
+        await asyncio.gather(*(follow(told=number == 0) for number in range(pages)))
+
+
+@contextmanager
+def looking_on(address: str, pages: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Have pages open, in a process of their own."""
+    with out.open("wb") as stream:
+        process = subprocess.Popen(
+            [sys.executable, __file__, "--look-on", address, str(pages)], stdout=stream
+        )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+def run(seconds: float, folder: Path, pages: int) -> Found:
+    """Run one chirp with so many pages open; of more than one, another one is suspended."""
+    daemon = find("sim")
+    address = str(page_address("sim")).partition("#")[0]
+    came = folder / "strips.txt"
+    came.touch()
+    with Client(daemon) as client:
+        pid = client.ask("status")["daemon"]["pid"]
+        watched = (pid, page_process(pid))
+        suspended = None
+        openings = [looking_on(address, max(1, pages - 1), came)] if pages else []
+        if pages > 1:
+            openings.append(looking_on(address, 1, folder / "suspended.txt"))
+        entered = [opening.__enter__() for opening in openings]
+        try:
+            time.sleep(_SETTLED_S)
+            if pages > 1:
+                suspended = entered[-1]
+                suspended.send_signal(signal.SIGSTOP)
+            parameters = {"amplitude_rad": 0.005, "start_hz": 0.5, "duration_s": seconds}
+            parameters |= {"rest_s": 0.0, "ring_down_s": 0.0}
+            client.ask("watch")
+            client.ask("start", excitation="chirp", parameters=parameters)
+            while client.ask("status")["rig"]["phase"] != "running":
+                time.sleep(0.1)
+            began_s, before = time.monotonic(), [cpu_s(each) for each in watched]
+            time.sleep(seconds - 2.0)
+            took_s = time.monotonic() - began_s
+            percent = [
+                100.0 * (cpu_s(each) - at) / took_s
+                for each, at in zip(watched, before, strict=True)
+            ]
+            memory = [pss_mb(each) for each in watched]
+            while (event := client.event(_PATIENCE_S)) is None or event.get("event") != "series":
+                pass
+        finally:
+            for opening in reversed(openings):
+                opening.__exit__(None, None, None)
+    ended = event["sessions"][-1]
+    session = read_session(Path(ended["path"]))
+    began_s = int(session.metadata["start_utc_ns"]) * 1e-9
+    delays = [
+        float(at) - began_s - float(end)
+        for at, end in (line.split() for line in came.read_text().splitlines())
+        if float(at) > began_s
+    ]
+    return Found(
+        late_p99_us=float(np.percentile(session.samples["lateness_ns"], 99)) * 1e-3,
+        missed=ended["missed"],
+        lost=ended["lost"],
+        cpu_percent=(percent[0], percent[1]),
+        pss_mb=(memory[0], memory[1]),
+        delays_s=delays,
+    )
+
+
+async def load_s(address: str) -> float:
+    """Return the time in which the page and all that it names are loaded."""
+    began_s = time.monotonic()
+    async with aiohttp.ClientSession() as session:
+        async with session.get(address) as answer:
+            text = await answer.text()
+        names = [part.partition('"')[0] for part in text.split("/static/")[1:]]
+        for name in names:
+            async with session.get(f"{address}static/{name}") as answer:
+                await answer.read()
+        async with session.ws_connect(f"{address}api/live") as socket:
+            await socket.receive()
+    return time.monotonic() - began_s
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[None]:
+    """Have a daemon with its page, on the simulated rig."""
+    with (folder / "serve.txt").open("wb") as log:
+        command = [RIGD, "serve", "--profile", "sim", "--web", "--output", folder / "out"]
+        daemon = subprocess.Popen([str(each) for each in command], stdout=log, stderr=log)
+        try:
+            deadline_s = time.monotonic() + _PATIENCE_S
+            while page_address("sim") is None and time.monotonic() < deadline_s:
+                time.sleep(0.2)
+            with Client(find("sim")) as client:
+                while client.ask("status")["state"] != "ready":
+                    time.sleep(0.2)
+            yield
+        finally:
+            daemon.terminate()
+            daemon.wait()
+
+
+def main() -> None:
+    """Print every round, then what it comes to."""
+    if sys.argv[1:2] == ["--look-on"]:
+        asyncio.run(look_on(sys.argv[2], int(sys.argv[3])))
+        return
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 30.0
+    rounds = int(sys.argv[2]) if len(sys.argv) > 2 else 5
+    folder = Path(tempfile.mkdtemp(prefix="rigd-web-"))
+    os.environ["XDG_RUNTIME_DIR"] = str(folder)
+    ratios, costs, memories, delays = [], [], [], []
+    lost = 0
+    try:
+        with served(folder):
+            loaded_s = asyncio.run(load_s(str(page_address("sim")).partition("#")[0]))
+            for _ in range(rounds):
+                p99 = {}
+                for pages in (0, 1, 10):
+                    found = run(seconds, folder, pages)
+                    p99[pages] = found.late_p99_us
+                    lost += found.lost
+                    worst = max(found.delays_s, default=float("nan"))
+                    print(
+                        f"{pages:2d} pages: late p99 {found.late_p99_us:6.0f} µs, missed "
+                        f"{found.missed}, lost {found.lost}; daemon {found.cpu_percent[0]:.1f} % "
+                        f"{found.pss_mb[0]:.0f} MB, page {found.cpu_percent[1]:.1f} % "
+                        f"{found.pss_mb[1]:.0f} MB; strip delay at most {worst:.3f} s",
+                        flush=True,
+                    )
+                    if pages == 1:
+                        costs.append(sum(found.cpu_percent))
+                        memories.append(sum(found.pss_mb))
+                        delays += found.delays_s
+                ratios.append(p99[10] / p99[0])
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    late_s = np.percentile(delays, (50, 99, 100))
+    print(f"page loaded in {loaded_s:.2f} s (at most {MOST_LOAD_S:g})")
+    print(
+        f"daemon and page: {statistics.median(costs):.1f} % of a core (at most "
+        f"{MOST_CPU_PERCENT:g}), {max(memories):.0f} MB (at most {MOST_PSS_MB:g})"
+    )
+    print(
+        f"delay of a strip: median {late_s[0]:.3f}, 99 % {late_s[1]:.3f}, most {late_s[2]:.3f} s "
+        f"(at most {MOST_DELAY_S:g}); samples lost: {lost}"
+    )
+    print(
+        f"lateness p99, ten pages over none: {statistics.median(ratios):.2f} (at most "
+        f"{MOST_RATIO:g}); of the rounds {', '.join(f'{ratio:.2f}' for ratio in ratios)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

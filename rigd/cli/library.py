@@ -1,0 +1,252 @@
+"""``rigd list`` and ``rigd specimens``: recorded sessions, the trend of a specimen, specimens."""
+
+import json
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from rigd.cli.options import EXIT_WRONG_USE, SESSIONS, AsJson, fail, progress
+from rigd.printable import printable
+from rigd.units import decimals
+
+if TYPE_CHECKING:
+    from rigd.library import Change, ModeTrend, Quantity, SessionRow, TrendPoint
+
+_WIDEST: Final = 24
+"""Characters of a text in a table."""
+_PLOT: Final = 25
+"""Characters of the plot of a trend."""
+
+
+def list_sessions(
+    folders: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="FOLDER", help="Folders of session files (default: sessions)."),
+    ] = None,
+    specimen: Annotated[str, typer.Option("--specimen", help="Only of this specimen.")] = "",
+    operator: Annotated[str, typer.Option("--operator", help="Only by this operator.")] = "",
+    excitation: Annotated[
+        str, typer.Option("--excitation", help="Only with this excitation, such as chirp.")
+    ] = "",
+    outcome: Annotated[
+        str,
+        typer.Option(
+            "--outcome",
+            help="Only those that ended so: complete, stopped, fault, unknown, recording, "
+            "incomplete or unreadable.",
+        ),
+    ] = "",
+    since: Annotated[
+        str, typer.Option("--since", metavar="DATE", help="Only from this day or time on.")
+    ] = "",
+    until: Annotated[
+        str, typer.Option("--until", metavar="DATE", help="Only up to this day or time.")
+    ] = "",
+    trend: Annotated[
+        bool,
+        typer.Option("--trend", help="Show the modes of one specimen over time."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List recorded sessions with their modes, or a specimen's trend.
+
+    The newest come first, with modes from the report or else from the quick look. Dates are local
+    (2026-11-20 or 2026-11-20T14:30). Torn and foreign files are listed with their problem. The
+    index library.sqlite in each folder only saves time, and may be removed.
+
+    Example: rigd list --specimen "antenna 3" --trend
+    """
+    from rigd.library import list_sessions as sessions_of
+    from rigd.library import mode_trends
+
+    rows: list[SessionRow] = []
+    for folder in folders or [SESSIONS]:
+        with progress(folder.name) as on_progress:
+            rows += sessions_of(
+                folder,
+                specimen=specimen,
+                operator=operator,
+                excitation=excitation,
+                outcome=outcome,
+                since=since,
+                until=until,
+                on_progress=on_progress,
+            )
+    rows.sort(key=lambda row: row.start_utc_ns or 0, reverse=True)
+    if trend:
+        trends = mode_trends(_of_one_specimen(rows))
+    if as_json:
+        document: dict[str, Any] = {"sessions": [row.as_dict() for row in rows]}
+        if trend:
+            document["trends"] = [each.as_dict() for each in trends]
+        typer.echo(json.dumps(document))
+    elif trend:
+        typer.echo("\n".join(_trend_lines(trends)))
+    else:
+        typer.echo("\n".join(_lines(rows)))
+
+
+def specimens() -> None:
+    """List the specimens that have a file of their own.
+
+    A file NAME.toml has the section [beam] of a profile and may have [beam.damping] and a text
+    note. It is looked for in specimens of the working folder, then in the per-user folder
+    ($XDG_CONFIG_HOME/rigd/specimens, by default ~/.config/rigd/specimens). Sessions with --specimen
+    NAME use its beam instead of the profile's.
+
+    Example: rigd specimens
+    """
+    from rigd.profile import ProfileError, load_specimen, specimen_files
+
+    for name, path in specimen_files().items():
+        try:
+            found = load_specimen(path)
+        except ProfileError as error:
+            told = f"cannot be used: {str(error).splitlines()[0]}"
+        else:
+            beam = found.beam
+            told = (
+                f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
+                f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
+            )
+        typer.echo(printable(f"{name}: {told}"))
+
+
+def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
+    """Return the sessions with modes; those of several specimens have no trend."""
+    found = [row for row in rows if row.modes]
+    specimens = sorted({row.specimen for row in found})
+    if len(specimens) > 1:
+        names = ", ".join(repr(name) if name else "none" for name in specimens)
+        fail(f"--trend: the sessions are of several specimens ({names}); name one by --specimen.",
+             EXIT_WRONG_USE)  # fmt: skip
+    return found
+
+
+def _local(row: "SessionRow") -> str:
+    if row.start_utc_ns is None:
+        return ""
+    try:
+        return f"{datetime.fromtimestamp(row.start_utc_ns / 1e9):%Y-%m-%d %H:%M}"
+    except (ValueError, OverflowError, OSError):  # a year beyond those of calendars
+        return ""
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Set a table in columns; those that are empty are left out."""
+    used = [column for column in range(len(heads)) if any(row[column] for row in rows)]
+    widths = {column: max(len(row[column]) for row in (heads, *rows)) for column in used}
+    for row in (heads, *rows):
+        yield "  ".join(f"{row[column]:{widths[column]}}" for column in used).rstrip()
+
+
+def _lines(rows: "list[SessionRow]") -> Iterator[str]:
+    if not rows:
+        yield "No sessions."
+        return
+    heads = ("date", "file", "specimen", "operator", "excitation", "outcome", "modes", "report")
+    yield from _table(
+        heads,
+        [
+            (
+                _local(row),
+                printable(row.path.name),
+                *(
+                    printable(text, _WIDEST)
+                    for text in (row.specimen, row.operator, row.excitation, row.outcome)
+                ),
+                ", ".join(map(_mode, row.modes)),
+                "" if row.report is None else printable(row.report.parent.suffix[1:]),
+            )
+            for row in rows
+        ],
+    )
+    for row in rows:
+        if row.problem:
+            yield f"{printable(row.path.name)}: {row.problem}"
+
+
+def _mode(mode: dict[str, Any]) -> str:
+    flagged = "?" if mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"] else ""
+    frequency_hz, damping = mode["frequency_hz"]["value"], mode["damping_ratio"]["value"]
+    return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flagged}"
+
+
+# Trend
+
+
+def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
+    if not trends:
+        yield "No modes are known of these sessions: analyze them first."
+        return
+    for number, trend in enumerate(trends, start=1):
+        if number > 1:
+            yield ""
+        low, high = _ends(trend)
+        yield from _table(
+            (f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", "", "file"),
+            [
+                (
+                    _local(point.row),
+                    _uncertain(point.frequency_hz),
+                    _relative(point.frequency_change, trend.points[0].frequency_hz["value"]),
+                    _uncertain(point.damping_ratio, 100),
+                    _relative(point.damping_change, trend.points[0].damping_ratio["value"]),
+                    _interval(point, low, high),
+                    printable(point.row.path.name),
+                )
+                for point in trend.points
+            ],
+        )
+    yield ""
+    yield (
+        "± and bars of the frequency: 95 % intervals. Changes since the mode's first session; * is "
+        "beyond both intervals, ? is flagged in its report or quick look."
+    )
+
+
+def _ends(trend: "ModeTrend") -> tuple[float, float]:
+    """Return lowest and highest end of the frequency's intervals."""
+    ends = [
+        end
+        for point in trend.points
+        for end in point.frequency_hz["interval_95"] or [point.frequency_hz["value"]]
+    ]
+    return min(ends), max(ends)
+
+
+def _interval(point: "TrendPoint", low: float, high: float) -> str:
+    """Draw the interval of the frequency between the ends of the plot."""
+    if high <= low:
+        return ""
+
+    def place(frequency_hz: float) -> int:
+        return min(max(round((frequency_hz - low) / (high - low) * (_PLOT - 1)), 0), _PLOT - 1)
+
+    value = point.frequency_hz["value"]
+    first, last = map(place, point.frequency_hz["interval_95"] or (value, value))
+    drawn = ["─" if first <= column <= last else " " for column in range(_PLOT)]
+    drawn[place(value)] = "●"
+    return "".join(drawn)
+
+
+def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
+    value, mark = scale * quantity["value"], " ?" if quantity["flag"] else ""
+    if quantity["interval_95"] is None:
+        return f"{value:.4g}{mark}"
+    low, high = quantity["interval_95"]
+    half = scale * (high - low) / 2
+    if not half > 0:
+        return f"{value:.6g}{mark}"
+    places = min(decimals(half), 9)
+    return f"{value:.{places}f} ± {half:.{places}f}{mark}"
+
+
+def _relative(change: "Change | None", first: float) -> str:
+    if change is None or first == 0:
+        return ""
+    percent = 100 * change.difference / first
+    return f"{percent:+.2g} %{' *' if change.beyond_intervals else ''}"

@@ -1,0 +1,162 @@
+"""Work of the daemon that takes processor time: predictions and checks, in a process of their own.
+
+They come while a session runs, asked for by anybody. In the daemon's own process they would hold
+the interpreter that supervises the session; the process that is started for each has an ordinary
+program's lowest priority.
+"""
+
+import asyncio
+import json
+import os
+import pickle
+import resource
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from rigd.errors import FailureError, RigdError
+from rigd.excitation import Value
+from rigd.profile import Profile
+from rigd.runtime import SINGLE_THREADED
+
+_PATIENCE_S: Final = 60.0
+_MOST_BYTES: Final = 4 << 30
+_LOWEST_PRIORITY: Final = 19
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionJob:
+    """A session to predict: see `rigd.runner.predict_session`."""
+
+    profile: Profile
+    """Rig of the session."""
+    excitation: str
+    """Name of the excitation."""
+    parameters: Mapping[str, Value]
+    """Its options."""
+    force: bool
+    """Let torques be clipped."""
+    specimen: str
+    """Name of the specimen; empty: the profile's."""
+
+    def perform(self) -> dict[str, Any]:
+        """Return the prediction as the reply has it."""
+        from rigd.profile import with_specimen
+        from rigd.runner import (
+            excitation_for,
+            largest_amplitude,
+            plan_document,
+            predict_session,
+        )
+
+        profile = with_specimen(self.profile, self.specimen)
+        excitation = excitation_for(profile, self.excitation, self.parameters)
+        plan = predict_session(profile, excitation, force=self.force)
+        return {
+            "plan": plan_document(profile, excitation, plan),
+            "largest_amplitude_rad": largest_amplitude(profile, excitation, force=self.force),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class CheckJob:
+    """A rig to check whose devices are the daemon's: see `rigd.checks.check_beside`."""
+
+    profile: Profile
+    """Rig to check."""
+    calibration: Mapping[str, Any] | None
+    """What the connected sensor told of itself; None: the devices are not connected."""
+
+    def perform(self) -> dict[str, Any]:
+        """Return the rows and the verdict as the reply has them."""
+        from rigd.checks import check_beside, overall
+
+        rows = check_beside(self.profile, self.calibration)
+        return {
+            "rows": [
+                {
+                    "what": f"{row.group}: {row.what}",
+                    "status": row.verdict.value,
+                    "text": f"{row.found} (wanted: {row.wanted})" if row.wanted else row.found,
+                    "remedy": row.detail,
+                }
+                for row in rows
+            ],
+            "verdict": overall(rows),
+        }
+
+
+class AsideError(FailureError):
+    """The work was refused or failed; the message is for the operator.
+
+    Parameters
+    ----------
+    message
+        Reason.
+    wrong_use
+        Whether the request itself has to be another.
+    """
+
+    def __init__(self, message: str, *, wrong_use: bool = False) -> None:
+        super().__init__(message)
+        self.wrong_use = wrong_use
+
+
+async def perform(job: PredictionJob | CheckJob) -> dict[str, Any]:
+    """Have a job done in a process of its own, without holding up the event loop.
+
+    Parameters
+    ----------
+    job
+        What to do.
+
+    Raises
+    ------
+    AsideError
+        If it is refused, fails, or takes longer than 60 s.
+    """
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "rigd.daemon.aside"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | SINGLE_THREADED,
+        )
+    except OSError as error:
+        raise AsideError(f"No process can be started for it ({error.strerror}).") from None
+    try:
+        told, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _PATIENCE_S)
+        answer = json.loads(told)
+    except TimeoutError:
+        raise AsideError(f"It takes longer than {_PATIENCE_S:g} s; check CPU load.") from None
+    except ValueError:
+        raise AsideError(f"Its process ended with exit code {process.returncode}.") from None
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    if "error" in answer:
+        raise AsideError(answer["error"], wrong_use=answer["wrong_use"])
+    done: dict[str, Any] = answer
+    return done
+
+
+def main() -> None:
+    """Do the job that standard input brings; the result goes to standard output as JSON."""
+    os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
+    resource.setrlimit(resource.RLIMIT_AS, (_MOST_BYTES, _MOST_BYTES))
+    job = pickle.load(sys.stdin.buffer)
+    try:
+        answer = job.perform()
+    except RigdError as error:
+        answer = {"error": str(error), "wrong_use": error.wrong_use}
+    except MemoryError:
+        answer = {"error": "There is not enough memory for such a session.", "wrong_use": True}
+    sys.stdout.write(json.dumps(answer, allow_nan=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""Index of a folder of sessions: an SQLite file beside them, a table of one row per session.
+
+It is a cache. Each row carries the stamp of the files that it was made from, and is made anew when
+that differs; an index that cannot be read, written or understood is done without. Several programs
+may use it at once: each writes in one transaction, and what another one has overwritten or removed
+is noticed by its stamp the next time.
+"""
+
+import contextlib
+import json
+import os
+import sqlite3
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from rigd.library._row import SessionRow, usable_modes
+
+INDEX_NAME: Final = "library.sqlite"
+"""Name of the index in its folder."""
+
+_APPLICATION: Final = 0x72696764  # "rigd"
+_VERSION: Final = 1
+"""Greater whenever the table, or what a row is made of, is another: older indexes are made anew."""
+_HEADER: Final = b"SQLite format 3\0"
+_APPLICATION_PLACE: Final = slice(68, 72)
+_PATIENCE_S: Final = 2.0
+"""Longest wait for another program that writes."""
+
+_DAMAGED: Final = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+"""Codes of errors that mean that the index is not what it should be."""
+
+_TYPES: Final = {
+    "id": "TEXT",
+    "start_utc": "TEXT",
+    "start_utc_ns": "INTEGER",
+    "profile": "TEXT",
+    "specimen": "TEXT",
+    "operator": "TEXT",
+    "excitation": "TEXT",
+    "note": "TEXT",
+    "outcome": "TEXT",
+    "reason": "TEXT",
+    "duration_s": "REAL",
+    "scheduled": "INTEGER",
+    "recorded": "INTEGER",
+    "missed": "INTEGER",
+    "late": "INTEGER",
+    "lost": "INTEGER",
+    "size_bytes": "INTEGER",
+    "modes": "TEXT",
+    "report": "TEXT",
+    "meta": "TEXT",
+    "problem": "TEXT",
+}
+"""Columns beside ``file`` and ``stamp``; modes and meta are JSON, times UTC in ISO 8601."""
+_KINDS: Final = {"TEXT": str, "INTEGER": int | None, "REAL": float | None}
+_READ: Final = tuple(name for name in _TYPES if name != "start_utc")
+
+Stamped = tuple[str, SessionRow]
+"""Stamp of the files that a row was made from, and the row."""
+
+
+class Index:
+    """Index of one folder.
+
+    Parameters
+    ----------
+    folder
+        Folder of the sessions; the index may be there or not, and need not be writable.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._path = folder / INDEX_NAME
+
+    def read(self) -> dict[str, Stamped]:
+        """Return the rows by the files' names; none if there is no index of use."""
+        if not self._is_ours():
+            return {}
+        rows: dict[str, Stamped] = {}
+        try:
+            with self._connected("ro") as database:
+                if database.execute("PRAGMA user_version").fetchone() != (_VERSION,):
+                    return {}
+                columns = ", ".join(("file", "stamp", *_READ))
+                for file, stamp, *values in database.execute(f"SELECT {columns} FROM sessions"):
+                    with contextlib.suppress(ValueError, TypeError):  # it is made anew
+                        rows[file] = stamp, self._row(file, dict(zip(_READ, values, strict=True)))
+        except sqlite3.Error:  # locked for long, or damaged
+            return {}
+        return rows
+
+    def write(self, rows: Mapping[str, Stamped], gone: Collection[str]) -> None:
+        """Store rows by the files' names and drop those of files that are gone, if it can be done.
+
+        Parameters
+        ----------
+        rows
+            New rows, and those that have changed.
+        gone
+            Names of files that are not there any more.
+        """
+        if self._path.exists() and not self._is_ours():
+            return  # whatever it is, it is somebody else's
+        try:
+            self._store(rows, gone)
+        except sqlite3.Error as error:
+            if error.sqlite_errorcode & 0xFF not in _DAMAGED:
+                return  # a folder that cannot be written to, a full disk, a lock held for long
+            with contextlib.suppress(OSError, sqlite3.Error):  # the files have everything
+                self._path.unlink()
+                self._store(rows, gone)
+
+    def _store(self, rows: Mapping[str, Stamped], gone: Collection[str]) -> None:
+        with self._connected("rwc") as database:
+            database.execute("BEGIN IMMEDIATE")
+            if database.execute("PRAGMA user_version").fetchone() != (_VERSION,):
+                columns = ", ".join(f"{name} {kind}" for name, kind in _TYPES.items())
+                database.execute("DROP TABLE IF EXISTS sessions")
+                database.execute(
+                    f"CREATE TABLE sessions (file TEXT PRIMARY KEY, {columns}, stamp TEXT)"
+                )
+                database.execute(f"PRAGMA application_id = {_APPLICATION}")
+                database.execute(f"PRAGMA user_version = {_VERSION}")
+            database.executemany(
+                "DELETE FROM sessions WHERE file = ?", [(file,) for file in gone if _storable(file)]
+            )
+            names = ("file", "stamp", *_TYPES)
+            marks = ", ".join("?" * len(names))
+            database.executemany(
+                f"INSERT OR REPLACE INTO sessions ({', '.join(names)}) VALUES ({marks})",
+                [
+                    (file, stamp, *_values(row))
+                    for file, (stamp, row) in rows.items()
+                    if _storable(file)
+                ],
+            )
+            database.execute("COMMIT")
+
+    @contextmanager
+    def _connected(self, mode: str) -> Iterator[sqlite3.Connection]:
+        # Transactions are begun by hand: the module's own would commit before a table is made.
+        database = sqlite3.connect(
+            f"{self._path.absolute().as_uri()}?mode={mode}",
+            uri=True,
+            timeout=_PATIENCE_S,
+            isolation_level=None,
+        )
+        try:
+            yield database
+        finally:
+            database.close()
+
+    def _is_ours(self) -> bool:
+        """Tell whether the file is an index, or one that was begun and is still empty."""
+        try:
+            with self._path.open("rb") as file:
+                head = file.read(_APPLICATION_PLACE.stop)
+        except OSError:
+            return False
+        mark = _APPLICATION.to_bytes(4, "big")
+        return not head or (head.startswith(_HEADER) and head[_APPLICATION_PLACE] == mark)
+
+    def _row(self, file: str, values: dict[str, object]) -> SessionRow:
+        """Make a row of the columns.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If they hold what no row does.
+        """
+        report = values["report"]
+        for name, value in values.items():
+            if name != "report" and not isinstance(value, _KINDS[_TYPES[name]]):
+                raise TypeError(name)
+        values["modes"] = usable_modes(json.loads(str(values["modes"])))
+        values["meta"] = dict(json.loads(str(values["meta"])))
+        values["report"] = None if report is None else self._folder / str(report)
+        return SessionRow(path=self._folder / file, **values)  # type: ignore[arg-type]
+
+
+def _values(row: SessionRow) -> list[object]:
+    values: dict[str, object] = {each.name: getattr(row, each.name) for each in fields(row)}
+    values["start_utc"] = None if row.start_utc_ns is None else _iso(row.start_utc_ns)
+    values["modes"] = json.dumps(row.modes)
+    values["meta"] = json.dumps(row.meta)
+    values["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))
+    return [values[name] for name in _TYPES]
+
+
+def _iso(utc_ns: int) -> str | None:
+    try:
+        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
+    except OverflowError:
+        return None
+    return moment.isoformat(timespec="milliseconds")
+
+
+def _storable(file: str) -> bool:
+    """Tell whether a name is text; any other is read anew each time."""
+    try:
+        file.encode()
+    except UnicodeEncodeError:
+        return False
+    return True

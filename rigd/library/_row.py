@@ -1,0 +1,237 @@
+"""One session of the library: what its file, its quick look and its report say of it."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final
+
+from rigd.printable import printable
+
+SUFFIX: Final = ".mcap"
+TORN_SUFFIX: Final = ".mcap.part"
+LOOK_SUFFIX: Final = ".look.json"
+REPORT_FOLDER: Final = re.compile(r"(.+)\.report(?:-(\d+))?")
+"""Name of the folder of a report: of which session, and which of its reports."""
+PAGE: Final = "report.html"
+NUMBERS: Final = "analysis.json"
+
+_MOST_JSON_BYTES: Final = 8 << 20
+_MOST_MODES: Final = 20
+_MOST_CHARACTERS: Final = 1000
+_MOST_META: Final = 100
+_MOST_DIGITS: Final = 18
+
+Mode = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRow:
+    """A session file of a folder, and what is known of its session.
+
+    What a file does not tell is an empty text or None. Texts are printable and cut to 1000
+    characters.
+    """
+
+    id: str
+    """Name of the file without its last suffix."""
+    path: Path
+    """The file."""
+    size_bytes: int
+    """Its size."""
+    start_utc_ns: int | None = None
+    """Wall clock at tick 0, ns since the Unix epoch."""
+    profile: str = ""
+    """Name of the rig's profile."""
+    specimen: str = ""
+    """Specimen that was named."""
+    operator: str = ""
+    """Operator."""
+    excitation: str = ""
+    """Kind of the excitation."""
+    note: str = ""
+    """Note."""
+    outcome: str = "unknown"
+    """``complete``, ``stopped`` or ``fault``; ``unknown`` if the file does not tell; ``recording``
+    and ``incomplete`` of a file without its end; ``unreadable``."""
+    reason: str = ""
+    """Why the session ended early, or failed."""
+    duration_s: float | None = None
+    """Length of the record."""
+    scheduled: int | None = None
+    """Ticks that were due."""
+    recorded: int | None = None
+    """Samples in the file."""
+    missed: int | None = None
+    """Ticks that the loop skipped."""
+    late: int | None = None
+    """Ticks that woke late."""
+    lost: int | None = None
+    """Samples that were taken and not recorded."""
+    modes: tuple[Mode, ...] = ()
+    """Modes of the last report, or without one of the quick look: objects ``frequency_hz`` and
+    ``damping_ratio``, each with ``value``, ``std``, ``interval_95`` and ``flag``."""
+    report: Path | None = None
+    """Page of the last report."""
+    meta: dict[str, float | str] = field(default_factory=dict)
+    """Metadata that users added, by name."""
+    problem: str = ""
+    """What is wrong with the file and what to do about it; empty of a sound one."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as a document of JSON types."""
+        document = {each.name: getattr(self, each.name) for each in fields(self)}
+        report = None if self.report is None else str(self.report)
+        return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
+
+
+def read_row(path: Path, look: Path | None, report: Path | None) -> SessionRow:
+    """Read what is known of a session; what cannot be read is told in the row.
+
+    Parameters
+    ----------
+    path
+        Session file.
+    look
+        File of its quick look, if there is one.
+    report
+        Folder of its last report, if there is one.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file has gone meanwhile.
+    """
+    from rigd.session import SessionError, added_metadata, read_summary
+
+    size = path.stat().st_size
+    results: dict[str, Any] = {"modes": _modes(look, report)}
+    if report is not None and (report / PAGE).is_file():
+        results["report"] = report / PAGE
+    try:
+        summary = read_summary(path)
+    except SessionError as error:
+        path.stat()  # which may have gone
+        return SessionRow(
+            path.stem, path, size, outcome="unreadable", problem=printable(str(error)), **results
+        )
+    metadata, outcome = summary.metadata, summary.outcome or {}
+    ended = _text(outcome, "outcome") or "unknown"
+    if summary.recording:
+        ended = "recording"
+    elif summary.problem:
+        ended = "incomplete"
+    scheduled = _count(outcome, "scheduled")
+    ticks = summary.samples if scheduled is None else scheduled
+    rate_hz = _number(metadata, "rate_hz") or 0.0
+    added = list(added_metadata(metadata).items())[:_MOST_META]
+    return SessionRow(
+        id=path.stem,
+        path=path,
+        size_bytes=size,
+        start_utc_ns=_count(metadata, "start_utc_ns"),
+        profile=_text(metadata, "profile"),
+        specimen=_text(metadata, "specimen"),
+        operator=_text(metadata, "operator"),
+        excitation=_text(metadata, "excitation"),
+        note=_text(metadata, "note"),
+        outcome=ended,
+        reason=_text(outcome, "reason"),
+        duration_s=ticks / rate_hz if ticks is not None and rate_hz > 0 else None,
+        scheduled=scheduled,
+        recorded=summary.samples,
+        missed=_count(outcome, "missed"),
+        late=_count(outcome, "late"),
+        lost=_count(outcome, "lost"),
+        meta={
+            _cut(name): _cut(value) if isinstance(value, str) else value for name, value in added
+        },
+        problem=summary.problem,
+        **results,
+    )
+
+
+def _cut(text: str) -> str:
+    return printable(text, _MOST_CHARACTERS)
+
+
+def _text(values: Mapping[str, str], key: str) -> str:
+    return _cut(values.get(key, "").strip())
+
+
+def _count(values: Mapping[str, str], key: str) -> int | None:
+    text = values.get(key, "")
+    # More digits are no count, and no 64 bits hold them.
+    countable = text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS + 1
+    return int(text) if countable and int(text) < 2**63 else None
+
+
+def _number(values: Mapping[str, str], key: str) -> float | None:
+    try:
+        number = float(values.get(key, "")[:400])
+    except ValueError:
+        return None
+    return number if isfinite(number) else None
+
+
+# Modes
+
+
+def _modes(look: Path | None, report: Path | None) -> tuple[Mode, ...]:
+    """Return the modes of the report, or else of the quick look; none if neither can be read."""
+    if report is not None:
+        for headline in _list(_document(report / NUMBERS), "headlines"):
+            if modes := usable_modes(_list(headline, "modes")):
+                return modes
+    return usable_modes(_list(_document(look), "modes"))
+
+
+def _document(path: Path | None) -> object:
+    try:
+        if path is None or path.stat().st_size > _MOST_JSON_BYTES:
+            return None
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):  # a result less, no session less
+        return None
+
+
+def _list(document: object, key: str) -> list[object]:
+    found = document.get(key) if isinstance(document, dict) else None
+    return found if isinstance(found, list) else []
+
+
+def usable_modes(modes: list[object]) -> tuple[Mode, ...]:
+    """Return the modes of a list that the record shows, if their numbers are finite."""
+    found = []
+    for mode in modes[:_MOST_MODES]:
+        if isinstance(mode, dict) and mode.get("shown") is not False:
+            frequency, damping = (_quantity(mode.get(k)) for k in ("frequency_hz", "damping_ratio"))
+            if frequency is not None and frequency["value"] > 0 and damping is not None:
+                found.append({"frequency_hz": frequency, "damping_ratio": damping})
+    return tuple(found)
+
+
+def _quantity(document: object) -> dict[str, Any] | None:
+    if not isinstance(document, dict) or (value := _finite(document.get("value"))) is None:
+        return None
+    ends = document.get("interval_95")
+    interval = [_finite(end) for end in ends] if isinstance(ends, list) and len(ends) == 2 else None
+    flag = document.get("flag")
+    return {
+        "value": value,
+        "std": _finite(document.get("std")),
+        "interval_95": None if interval is None or None in interval else interval,
+        "flag": _cut(flag) if isinstance(flag, str) else None,
+    }
+
+
+def _finite(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if isfinite(number) else None

@@ -1,0 +1,220 @@
+"""Sessions of a folder: found, compared with the index, read where they are new, and filtered."""
+
+import os
+from collections.abc import Callable
+from datetime import datetime, time, timedelta
+from pathlib import Path
+from typing import Final
+
+from rigd.errors import UserError
+from rigd.library._index import Index, Stamped
+from rigd.library._row import (
+    LOOK_SUFFIX,
+    NUMBERS,
+    PAGE,
+    REPORT_FOLDER,
+    SUFFIX,
+    TORN_SUFFIX,
+    SessionRow,
+    read_row,
+)
+
+_NS_PER_S: Final = 1_000_000_000
+_DATE_CHARACTERS: Final = len("2026-11-20")
+
+
+class LibraryError(UserError, ValueError):
+    """Sessions cannot be listed; the message names the folder or the filter, and the remedy."""
+
+
+def list_sessions(
+    folder: str | os.PathLike[str],
+    *,
+    specimen: str | None = None,
+    operator: str | None = None,
+    excitation: str | None = None,
+    outcome: str | None = None,
+    since: str | datetime | None = None,
+    until: str | datetime | None = None,
+    text: str | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> list[SessionRow]:
+    """List the sessions of a folder, the newest first.
+
+    Files are read where they are new or have changed, by their size and time, and the index of the
+    folder is brought up to date if it can be written. Torn and foreign files are listed with their
+    problem. Folders inside the folder are not looked into.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session files.
+    specimen, operator, excitation, outcome
+        What a session must have, in upper or lower case; None for any.
+    since, until
+        First and last moment at which a session may have begun, in ISO 8601, by the local clock
+        unless an offset is given. A date alone as `until` includes its day.
+    text
+        Text that any of specimen, operator, excitation, note, reason, metadata or name must
+        contain, in upper or lower case.
+    on_progress
+        Called now and then with the share of the new files that have been read.
+
+    Returns
+    -------
+    list of SessionRow
+
+    Raises
+    ------
+    LibraryError
+        If there is no such folder, it cannot be read, or a date is none.
+
+    Examples
+    --------
+    >>> from rigd.library import list_sessions
+    >>> (row,) = list_sessions(".", excitation="chirp")
+    >>> row.id, row.outcome, row.duration_s
+    ('session', 'complete', 21.5)
+    """
+    begins, ends = _moment_ns(since, "since"), _moment_ns(until, "until")
+    exactly = {
+        "specimen": specimen,
+        "operator": operator,
+        "excitation": excitation,
+        "outcome": outcome,
+    }
+    wanted = {name: value.strip().casefold() for name, value in exactly.items() if value}
+
+    def fits(row: SessionRow) -> bool:
+        if any(getattr(row, name).casefold() != value for name, value in wanted.items()):
+            return False
+        if begins is not None and (row.start_utc_ns is None or row.start_utc_ns < begins):
+            return False
+        if ends is not None and (row.start_utc_ns is None or row.start_utc_ns > ends):
+            return False
+        return not text or text.casefold() in _searched(row)
+
+    rows = [row for row in _rows(Path(folder), on_progress) if fits(row)]
+    return sorted(rows, key=lambda row: (row.start_utc_ns or 0, row.id), reverse=True)
+
+
+def _searched(row: SessionRow) -> str:
+    texts = (row.id, row.specimen, row.operator, row.excitation, row.note, row.reason)
+    added = (f"{name}={value}" for name, value in row.meta.items())
+    return "\n".join((*texts, *added)).casefold()
+
+
+def _moment_ns(given: str | datetime | None, name: str) -> int | None:
+    """Return a moment in ns since the epoch; of a date alone its first or its last moment."""
+    if given is None or given == "":
+        return None
+    try:
+        moment = given if isinstance(given, datetime) else datetime.fromisoformat(given.strip())
+        if name == "until" and not isinstance(given, datetime) and _is_date(given):
+            moment = datetime.combine(moment, time()) + timedelta(days=1, microseconds=-1)
+        # Without an offset it is local time.
+        return int(moment.timestamp()) * _NS_PER_S + moment.microsecond * 1000
+    except (ValueError, OverflowError, OSError):
+        raise LibraryError(
+            f"{name} = {str(given)[:40]!r} is no date; give one as 2026-11-20 or 2026-11-20T14:30."
+        ) from None
+
+
+def _is_date(given: str) -> bool:
+    return len(given.strip()) <= _DATE_CHARACTERS
+
+
+# Files
+
+
+class _Found:
+    """Session file as the folder has it, with what was made of it."""
+
+    def __init__(self, entry: os.DirEntry[str]) -> None:
+        self.path = Path(entry.path)
+        self.stamp = _stamp_of(entry.path)
+        self.look: Path | None = None
+        self.report: Path | None = None
+
+    def with_results(self, look: Path | None, report: Path | None) -> None:
+        """Take note of quick look and report, whose stamps become part of this one."""
+        self.look, self.report = look, report
+        if look is not None:
+            self.stamp += f" look {_stamp_of(look)}"
+        if report is not None:
+            self.stamp += f" {report.name} {_stamp_of(report / NUMBERS)} {_stamp_of(report / PAGE)}"
+
+
+def _rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:
+    found = _scan(folder)
+    index = Index(folder)
+    known = index.read()
+    rows: list[SessionRow] = []
+    fresh: dict[str, Stamped] = {}
+    unread = []
+    for name, file in found.items():
+        stamp, row = known.get(name, ("", None))
+        # Whether a file without its end is being recorded cannot be told by its stamp.
+        if row is not None and stamp == file.stamp and not name.endswith(TORN_SUFFIX):
+            rows.append(row)
+        else:
+            unread.append(name)
+    for number, name in enumerate(unread, start=1):
+        file = found[name]
+        try:
+            row = read_row(file.path, file.look, file.report)
+        except OSError:  # it has gone, or has got its final name
+            continue
+        rows.append(row)
+        if not name.endswith(TORN_SUFFIX):
+            fresh[name] = file.stamp, row
+        if on_progress is not None:
+            on_progress(number / len(unread))
+    gone = known.keys() - found.keys()
+    if fresh or gone:
+        index.write(fresh, gone)
+    return rows
+
+
+def _scan(folder: Path) -> dict[str, _Found]:
+    """Return the session files of a folder by name, with quick look and last report.
+
+    Raises
+    ------
+    LibraryError
+        If it is no folder, or cannot be read.
+    """
+    found: dict[str, _Found] = {}
+    looks: dict[str, Path] = {}
+    reports: dict[str, tuple[int, Path]] = {}
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                name = entry.name
+                if name.endswith((SUFFIX, TORN_SUFFIX)):
+                    found[name] = _Found(entry)
+                elif name.endswith(LOOK_SUFFIX):
+                    looks[name.removesuffix(LOOK_SUFFIX)] = Path(entry.path)
+                elif match := REPORT_FOLDER.fullmatch(name):
+                    number = int((match[2] or "1")[:9])
+                    if number >= reports.get(match[1], (0, None))[0]:
+                        reports[match[1]] = number, Path(entry.path)
+    except OSError as error:
+        raise LibraryError(
+            f"{folder}: the folder cannot be listed ({error.strerror}); give a folder of session "
+            "files."
+        ) from None
+    for name, file in found.items():
+        if name.endswith(SUFFIX):
+            stem = name.removesuffix(SUFFIX)
+            file.with_results(looks.get(stem), reports.get(stem, (0, None))[1])
+    return found
+
+
+def _stamp_of(path: str | os.PathLike[str]) -> str:
+    """Return size and time of a file; empty if it cannot be told."""
+    try:
+        status = Path(path).stat()
+    except OSError:
+        return ""
+    return f"{status.st_size} {status.st_mtime_ns}"

@@ -1,0 +1,125 @@
+"""Specimens in files of their own: ``specimens/NAME.toml``, with the beam as a profile has it."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from rigd.beam import Beam, Damping
+from rigd.devices import WhatMoves, reality
+from rigd.profile import _diagnostics as diagnostics
+from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
+from rigd.profile._places import specimen_files
+from rigd.profile._schema import SECTIONS, Profile, ScaleUncertainty, Specimen, fields_of
+from rigd.units import suffix_of, unit_of
+
+_BEAM: Final = "beam"
+_DAMPING: Final = "beam.damping"
+_UNCERTAINTY: Final = "uncertainty"
+_OF_THE_RIG: Final = "uncertainty.torque_scale_percent"
+_NOTE: Final = "note"
+_MOST_BYTES: Final = 16_384
+"""Longest file: it goes with each session through a pipe to the recorder."""
+
+
+def load_specimen(path: Path) -> Specimen:
+    """Read and validate the file of a specimen.
+
+    It has the section ``[beam]`` of a profile and may have ``[beam.damping]``, of ``[uncertainty]``
+    what concerns the beam, and a text ``note``.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    Specimen
+
+    Raises
+    ------
+    ProfileError
+        If it cannot be read, or anything in it is wrong; every problem is named with its key,
+        value, unit and remedy.
+    """
+    text = read_text(path)
+    if len(text.encode()) > _MOST_BYTES:
+        raise ProfileError(f"{path}: is longer than {_MOST_BYTES} bytes; shorten its notes.")
+    problems: list[str] = []
+    values, _ = flatten(parse(text, path), problems)
+    note = values.pop(_NOTE, "")
+    if not isinstance(note, str):
+        problems.append(f"{_NOTE} = {note!r} must be text in quotes.")
+    own = (f"{_BEAM}.", f"{_UNCERTAINTY}.")
+    for key in [key for key in values if not key.startswith(own) or key == _OF_THE_RIG]:
+        del values[key]
+        problems.append(
+            f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
+            "[uncertainty] length_percent and density_percent, and note; remove it."
+        )
+    sections = {_BEAM, _UNCERTAINTY}
+    sections |= {_DAMPING for key in values if key.startswith(f"{_DAMPING}.")}
+    values = validate(values, problems, frozenset({"", *SECTIONS} - sections))
+    if not problems:
+        problems.extend(diagnostics.first_mode(values))
+    if problems:
+        raise complaint(path, problems)
+    beam = Beam(**{field: values[key] for key, field in fields_of(_BEAM)})
+    damping = None
+    if _DAMPING in sections:
+        damping = Damping(**{field: values[key] for key, field in fields_of(_DAMPING)})
+    uncertainty = ScaleUncertainty(**{field: values[key] for key, field in fields_of(_UNCERTAINTY)})
+    return Specimen(path.stem, path, text, beam, damping, uncertainty, note)
+
+
+def with_specimen(profile: Profile, name: str) -> Profile:
+    """Mount a specimen on a rig: its beam takes the place of the profile's.
+
+    Parameters
+    ----------
+    profile
+        Profile of the rig.
+    name
+        What a session names its specimen. Without a file of that name it is only a label, and the
+        profile stays as it is.
+
+    Returns
+    -------
+    Profile
+
+    Raises
+    ------
+    ProfileError
+        If the file of that name cannot be used.
+    """
+    path = specimen_files().get(name.strip())
+    if path is None:
+        return profile
+    specimen = load_specimen(path)
+    rig = replace(profile.rig, beam=specimen.beam, damping=specimen.damping or profile.rig.damping)
+    scale_percent = profile.uncertainty.torque_scale_percent
+    return replace(
+        profile,
+        rig=rig,
+        uncertainty=replace(specimen.uncertainty, torque_scale_percent=scale_percent),
+        specimen=specimen,
+        specimen_in_words=_in_words(profile, specimen),
+    )
+
+
+def _in_words(profile: Profile, specimen: Specimen) -> str:
+    head = f"Specimen {specimen.name} ({specimen.path}): "
+    different = [
+        f"{key.partition('.')[2].removesuffix(suffix_of(key)).replace('_', ' ')} "
+        f"{own:g} {unit_of(key)} (profile: {its:g})"
+        for key, field in fields_of(_BEAM)
+        if (own := getattr(specimen.beam, field)) != (its := getattr(profile.rig.beam, field))
+    ]
+    if specimen.damping not in (None, profile.rig.damping):
+        different.append("nominal damping of its own")
+    if not different:
+        return f"{head}beam as in the profile."
+    words = f"{head}{', '.join(different)}; for prediction, nominal model and file."
+    if reality(profile.rig) is not WhatMoves.HARDWARE:
+        words += " The simulated rig keeps the beam of the profile."
+    return words

@@ -1,0 +1,1 @@
+from ._server import run_page as run_page

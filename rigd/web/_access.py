@@ -1,0 +1,233 @@
+"""Access to the page: who may read, who may act, and what a page in another tab cannot do.
+
+Everybody who reaches the port may read; acting needs the token of the printed address. Any page on
+the internet can have its own name lead to loopback (DNS rebinding), and can send requests there:
+hence a name of this computer as Host, the same origin, a header that no form can send, and no
+cross-origin permission of any kind.
+"""
+
+import asyncio
+import hmac
+import json
+import time
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
+
+from aiohttp import web
+
+if TYPE_CHECKING:
+    from aiohttp.web_protocol import RequestHandler
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+_OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost"})
+_OWN_HEADER: Final = "X-Rigd"
+_FREE_COMMANDS: Final = frozenset({"stop", "predict"})
+"""Who sees that something goes wrong may stop it; a prediction moves nothing."""
+
+_READ_S: Final = 5.0
+"""Time for the body of a request."""
+_SILENT_S: Final = 10.0
+"""Time for the first request of a connection."""
+_LOOK_S: Final = 0.5
+_MOST_CONNECTIONS: Final = 96
+
+_POLICY: Final = "; ".join(
+    (
+        "default-src 'self'",
+        "object-src 'none'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+REPORT_POLICY: Final = "; ".join(
+    (
+        "default-src 'none'",
+        "style-src 'unsafe-inline'",
+        "img-src 'self' data:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+        "sandbox allow-popups allow-downloads",
+    )
+)
+"""For reports, which are one file each, with their style in it: no scripts, an origin of none."""
+_HEADERS: Final = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+}
+
+
+class Access:
+    """Checks each request before anything else sees it.
+
+    Parameters
+    ----------
+    token
+        What whoever acts has to know.
+    """
+
+    def __init__(self, token: str) -> None:
+        self._token = token.encode()
+
+    @web.middleware
+    async def guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answer a request that may be answered, under the page's policy."""
+        try:
+            refusal = _refusal(request)
+            response = await handler(request) if refusal is None else refusal
+        except web.HTTPException as error:
+            response = refused(error.status, error.reason)
+        return response
+
+    @staticmethod
+    async def protect(_: web.Request, response: web.StreamResponse) -> None:
+        """Add the page's policy to a response that is about to be sent."""
+        for name, value in _HEADERS.items():
+            response.headers.setdefault(name, value)
+
+    def may_act(self, request: web.Request) -> bool:
+        """Whether a request has the token."""
+        scheme, _, given = request.headers.get("Authorization", "").partition(" ")
+        return scheme == "Bearer" and hmac.compare_digest(given.encode(), self._token)
+
+    def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
+        """Whether a command of the control socket may be passed on.
+
+        Parameters
+        ----------
+        request
+            Request that brought it.
+        command, parameters
+            Its members. A prediction of a file would have the daemon read that file.
+        """
+        if self.may_act(request):
+            return True
+        reads_a_file = (
+            command == "predict" and isinstance(parameters, dict) and "path" in parameters
+        )
+        return command in _FREE_COMMANDS and not reads_a_file
+
+
+async def object_of(request: web.Request) -> dict[str, Any]:
+    """Return the JSON object that a request brings.
+
+    Parameters
+    ----------
+    request
+        Request whose body is read.
+
+    Raises
+    ------
+    HTTPException
+        If it brings something else, or takes its time.
+    """
+    try:
+        given = json.loads(await asyncio.wait_for(request.read(), _READ_S))
+    except TimeoutError:
+        raise web.HTTPRequestTimeout(reason="The request did not come to its end.") from None
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict):
+        raise web.HTTPBadRequest(reason="The request is not a JSON object.")
+    return given
+
+
+def refused(status: int, text: str) -> web.Response:
+    """Return a refusal, as the page shows it.
+
+    Parameters
+    ----------
+    status
+        HTTP status.
+    text
+        Sentence for the operator.
+    """
+    return web.json_response({"ok": False, "error": text, "wrong_use": True}, status=status)
+
+
+def _refusal(request: web.Request) -> web.Response | None:
+    """Refuse what no page of ours sends."""
+    host = request.headers.get("Host", "")
+    # From another port through a tunnel; the name is what tells a page of somebody else.
+    if _name_of(host) not in _OWN_NAMES:
+        return refused(403, "Open this page as http://127.0.0.1:PORT/.")
+    origin = request.headers.get("Origin")
+    if origin is not None and origin != f"http://{host}":
+        return refused(403, "Requests from other pages are refused.")
+    if request.headers.get("Sec-Fetch-Site", "same-origin") not in ("same-origin", "none"):
+        return refused(403, "Requests from other pages are refused.")
+    if request.method not in ("GET", "HEAD", "POST"):
+        return refused(405, "Only GET, HEAD and POST are answered.")
+    if request.method == "POST" and (
+        request.headers.get(_OWN_HEADER) != "1" or request.content_type != "application/json"
+    ):
+        return refused(403, f"A request that acts is JSON and has the header {_OWN_HEADER}: 1.")
+    return None
+
+
+def _name_of(host: str) -> str:
+    """Return the name in a Host header; empty if it is no plain name and port."""
+    try:
+        split = urlsplit(f"//{host}")
+        port = split.port
+    except ValueError:
+        return ""
+    plain = split.hostname if port is None else f"{split.hostname}:{port}"
+    return (split.hostname or "") if plain == host else ""
+
+
+# Connections
+
+
+class Connections:
+    """Bounds the connections: their number, and the time for which one may say nothing.
+
+    Attributes
+    ----------
+    serving
+        Makes the protocols of connections, and knows those there are; set before there are any.
+    """
+
+    serving: web.Server
+
+    def __init__(self) -> None:
+        self._silent: dict[RequestHandler, float] = {}
+        """Connections without a request so far, and until when each has to make one."""
+
+    def look_after(self) -> None:
+        """Close those that say nothing, from now on."""
+        now_s, open_now = time.monotonic(), set(self.serving.connections)
+        self._silent = {each: end_s for each, end_s in self._silent.items() if each in open_now}
+        for protocol, end_s in self._silent.items():
+            if end_s < now_s and protocol.transport is not None:
+                protocol.transport.abort()
+        asyncio.get_running_loop().call_later(_LOOK_S, self.look_after)
+
+    def welcome(self) -> asyncio.Protocol:
+        """Make the protocol of a new connection, or turn it away."""
+        if len(self.serving.connections) >= _MOST_CONNECTIONS:
+            return _TurnedAway()
+        protocol = self.serving()
+        self._silent[protocol] = time.monotonic() + _SILENT_S
+        return protocol
+
+    @web.middleware
+    async def heard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Take note that a connection has made a request."""
+        self._silent.pop(request.protocol, None)
+        return await handler(request)
+
+
+class _TurnedAway(asyncio.Protocol):
+    """A connection too many."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Close it."""
+        transport.close()

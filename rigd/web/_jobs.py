@@ -1,0 +1,168 @@
+"""Jobs of the page: reports, campaigns and exports by `analyze`, at idle priority.
+
+They stand still while a session runs.
+"""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from rigd.runtime import SINGLE_THREADED
+
+Document = dict[str, Any]
+
+MOST_JOBS: Final = 16
+"""Jobs that may wait."""
+_PROGRAM: Final = (sys.executable, "-m", "analysis")
+_LOOK_S: Final = 0.2
+_MOST_SAID: Final = 4096
+_LOWEST_PRIORITY: Final = 19
+
+
+class JobError(Exception):
+    """A job cannot be taken, or failed; the message is for the operator."""
+
+
+@dataclass(slots=True)
+class Job:
+    """Something that `analyze` makes."""
+
+    number: int
+    kind: str
+    """``report``, ``campaign`` or ``export``."""
+    arguments: Sequence[str]
+    """Command line of `analyze`."""
+    id: str = ""
+    """Session it is about, if it is one."""
+    address: str = ""
+    """Where its result is served."""
+    state: str = "waiting"
+    error: str = ""
+    done: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def document(self) -> Document:
+        """Tell the page how it stands."""
+        return {
+            "type": "job",
+            "number": self.number,
+            "kind": self.kind,
+            "id": self.id,
+            "state": self.state,
+            "error": self.error,
+            "address": self.address if self.state == "done" else "",
+        }
+
+
+class Jobs:
+    """One job after the other, none of which disturbs a session.
+
+    Parameters
+    ----------
+    folder
+        Folder of the sessions, in which they are run.
+    tell
+        Called with each change of a job.
+
+    Attributes
+    ----------
+    paused
+        A session runs.
+    """
+
+    def __init__(self, folder: Path, tell: Callable[[Document], None]) -> None:
+        self.paused = True  # until the daemon has said that no session runs
+        self._folder = folder
+        self._tell = tell
+        self._waiting: asyncio.Queue[Job] = asyncio.Queue(MOST_JOBS)
+        self._count = 0
+
+    def put(self, kind: str, arguments: Sequence[str], session: str = "", address: str = "") -> Job:
+        """Queue a job.
+
+        Parameters
+        ----------
+        kind, arguments, session, address
+            See `Job`.
+
+        Raises
+        ------
+        JobError
+            If too many wait already.
+        """
+        self._count += 1
+        job = Job(self._count, kind, arguments, session, address)
+        try:
+            self._waiting.put_nowait(job)
+        except asyncio.QueueFull:
+            raise JobError(f"{MOST_JOBS} jobs are waiting already; try again later.") from None
+        self._say(job)
+        return job
+
+    async def run(self) -> None:
+        """Do what is queued, until cancelled."""
+        while True:
+            job = await self._waiting.get()
+            while self.paused:
+                await asyncio.sleep(_LOOK_S)
+            job.state = "running"
+            self._say(job)
+            try:
+                await self._perform(job)
+                job.state = "done"
+            except (JobError, OSError) as error:
+                job.state, job.error = "failed", str(error)
+            job.done.set()
+            self._say(job)
+
+    def _say(self, job: Job) -> None:
+        """Tell how a job stands; who waits for an export is answered."""
+        if job.kind != "export":
+            self._tell(job.document())
+
+    async def _perform(self, job: Job) -> None:
+        process = await asyncio.create_subprocess_exec(
+            *(*_PROGRAM, *job.arguments),
+            cwd=self._folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=os.environ | SINGLE_THREADED,
+            start_new_session=True,  # with its workers it is suspended and ended as one
+        )
+        _give_way(process.pid)
+        ending = asyncio.create_task(process.communicate())
+        stopped = False
+        try:
+            while not ending.done():
+                if self.paused is not stopped:
+                    stopped = self.paused
+                    _signal(process.pid, signal.SIGSTOP if stopped else signal.SIGCONT)
+                await asyncio.wait((ending,), timeout=_LOOK_S)
+            _, said = ending.result()
+        finally:
+            if process.returncode is None:
+                _signal(process.pid, signal.SIGKILL)
+                await asyncio.wait((ending,))
+        if process.returncode != 0:
+            words = said.decode(errors="replace").strip()[-_MOST_SAID:]
+            last = words.splitlines()[-1] if words else f"exit code {process.returncode}"
+            raise JobError(f"The {job.kind} was not made: {last}")
+
+
+def _give_way(pid: int) -> None:
+    """Have a process, and what it starts, give way to everything else."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, pid, _LOWEST_PRIORITY)
+        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
+
+
+def _signal(group: int, number: int) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(group, number)

@@ -1,0 +1,282 @@
+"""Sessions on the page: the library's rows, quick looks, reports and downloads.
+
+A session is named by its file's stem; no address of the page has a path in it.
+"""
+
+import asyncio
+import json
+import re
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from aiohttp import web
+
+from rigd.library import SessionRow, list_sessions
+from rigd.web._access import REPORT_POLICY, Access, object_of, refused
+from rigd.web._jobs import JobError, Jobs
+
+Document = dict[str, Any]
+
+_MOST_ROWS: Final = 1000
+_ROWS: Final = 50
+_MOST_IDS: Final = 100
+_MOST_CURVES: Final = 12
+_MOST_LOOK: Final = 4 << 20
+_FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
+_EXPORTS: Final = {"mat": ".mat", "uff": ".uff"}
+_REPORT_FILES: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+_PAGE: Final = "report.html"
+
+
+class Library:
+    """Serves what lies in the sessions' folder, and nothing else.
+
+    Parameters
+    ----------
+    folder
+        Folder of the session files.
+    access
+        Says who may have something made.
+    jobs
+        Makes reports and exports.
+    """
+
+    def __init__(self, folder: Path, access: Access, jobs: Jobs) -> None:
+        self._folder = folder
+        self._access = access
+        self._jobs = jobs
+        self._exporting = asyncio.Lock()
+
+    def routes(self) -> list[web.RouteDef]:
+        """Return the addresses that are served."""
+        return [
+            web.get("/api/sessions", self._list),
+            web.get("/api/sessions/{id}/file.{ending}", self._file),
+            web.get("/api/sessions/{id}/look", self._look),
+            web.get("/api/sessions/{id}/report/", self._report),
+            web.get("/api/sessions/{id}/report/{name}", self._report),
+            web.post("/api/sessions/{id}/report", self._make_report),
+            web.get("/api/campaign/{name}/", self._campaign),
+            web.get("/api/campaign/{name}/{file}", self._campaign),
+            web.post("/api/campaign", self._make_campaign),
+            web.get("/api/frf", self._responses),
+        ]
+
+    async def rows(self, **filters: Any) -> list[SessionRow]:  # noqa: ANN401 - the library's
+        """Return the sessions of the folder, newest first.
+
+        Parameters
+        ----------
+        **filters
+            As of `rigd.library.list_sessions`.
+        """
+        return await asyncio.to_thread(list_sessions, self._folder, **filters)
+
+    async def specimens(self) -> list[str]:
+        """Return the specimens of all sessions, the last one first."""
+        return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
+
+    async def last_response(self, specimen: str, but: str) -> Document | None:
+        """Return the response of the last session of a specimen, as the page is told it.
+
+        Parameters
+        ----------
+        specimen
+            Its name; without one, of the last session without one.
+        but
+            The session that is left out: the one that runs.
+        """
+        for row in await self.rows(specimen=specimen or None):
+            if row.id == but or row.specimen != specimen:
+                continue
+            response = (self._look_of(row.id) or {}).get("response")
+            if response:
+                where = {"type": "last", "path": str(row.path), "specimen": row.specimen}
+                return {**response, **where, "id": row.id}
+        return None
+
+    # Rows
+
+    async def _list(self, request: web.Request) -> web.Response:
+        filters = {name: value for name in _FILTERS if (value := request.query.get(name))}
+        limit, offset = (
+            _whole(request.query.get(name, str(usual)), name)
+            for name, usual in (("limit", _ROWS), ("offset", 0))
+        )
+        rows = await self.rows(**filters)
+        shown = rows[offset : offset + min(limit, _MOST_ROWS)]
+        return web.json_response({"total": len(rows), "sessions": [row.as_dict() for row in shown]})
+
+    async def _look(self, request: web.Request) -> web.Response:
+        look = self._look_of(self._session(request).stem)
+        return (
+            refused(404, "There is no quick look of it.")
+            if look is None
+            else web.json_response(look)
+        )
+
+    async def _responses(self, request: web.Request) -> web.Response:
+        """Return the responses of several sessions, for an overlay."""
+        ids = [name for name in request.query.get("ids", "").split(",") if name]
+        if not 1 <= len(ids) <= _MOST_CURVES:
+            return refused(400, f"ids: name 1 to {_MOST_CURVES} sessions.")
+        responses, errors = [], []
+        for name in ids:
+            look = self._look_of(self._path(name).stem)
+            if look is None or not look.get("response"):
+                errors.append(f"{name}: there is no quick look of it, and so no response.")
+            else:
+                specimen = look.get("specimen")
+                responses.append({"id": name, "specimen": specimen, **look["response"]})
+        return web.json_response({"responses": responses, "errors": errors})
+
+    # Downloads
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        path = self._session(request)
+        ending = request.match_info["ending"]
+        if ending == "mcap":
+            return web.FileResponse(path, headers=_download_headers(path.name))
+        if ending not in _EXPORTS:
+            return refused(404, "There are .mcap, .mat and .uff.")
+        if self._jobs.paused:
+            return refused(409, "A session runs; files are converted when it has ended.")
+        async with self._exporting:
+            with tempfile.TemporaryDirectory(prefix="rigd-page-") as folder:
+                out = Path(folder) / f"{path.stem}{_EXPORTS[ending]}"
+                arguments = ("export", "record", str(path), str(out))
+                try:
+                    job = self._jobs.put("export", arguments, path.stem)
+                except JobError as error:
+                    return refused(409, str(error))
+                await job.done.wait()
+                if job.error:
+                    return refused(409, job.error)
+                # It is open, and may be sent after the folder has gone.
+                return web.Response(body=out.open("rb"), headers=_download_headers(out.name))
+
+    # Reports
+
+    async def _report(self, request: web.Request) -> web.StreamResponse:
+        path = self._session(request)
+        found = await asyncio.to_thread(_row_of, self._folder, path.stem)
+        if found is None or found.report is None:
+            return refused(404, "There is no report of it.")
+        return self._page_of(found.report.parent, request.match_info.get("name", _PAGE))
+
+    async def _campaign(self, request: web.Request) -> web.StreamResponse:
+        folder = self._inside(request.match_info["name"])
+        if not folder.name.startswith("campaign.report"):
+            return refused(404, "There is no such campaign.")
+        return self._page_of(folder, request.match_info.get("file", _PAGE))
+
+    def _page_of(self, folder: Path, name: str) -> web.StreamResponse:
+        """Serve one file of a report, which must be a plain one in its folder."""
+        if not _REPORT_FILES.fullmatch(name):
+            return refused(404, "There is no such file.")
+        path = (folder / name).resolve()
+        if path.parent.parent != self._folder.resolve() or not path.is_file():
+            return refused(404, "There is no such file.")
+        return web.FileResponse(path, headers={"Content-Security-Policy": REPORT_POLICY})
+
+    async def _make_report(self, request: web.Request) -> web.Response:
+        if not self._access.may_act(request):
+            return refused(403, "Making a report needs the token of the printed address.")
+        path = self._session(request)
+        address = f"/api/sessions/{path.stem}/report/"
+        return self._queue("report", [str(path)], path.stem, address)
+
+    async def _make_campaign(self, request: web.Request) -> web.Response:
+        if not self._access.may_act(request):
+            return refused(403, "A campaign needs the token of the printed address.")
+        given = await object_of(request)
+        ids = given.get("ids")
+        if (
+            not isinstance(ids, list)
+            or not 2 <= len(ids) <= _MOST_IDS
+            or not all(isinstance(name, str) for name in ids)
+        ):
+            return refused(400, f"ids: name 2 to {_MOST_IDS} sessions.")
+        paths = [str(self._path(name)) for name in dict.fromkeys(ids)]
+        folder = self._free("campaign.report")
+        arguments = [*paths, "--jobs", "1", "--report", str(folder)]
+        return self._queue("campaign", arguments, "", f"/api/campaign/{folder.name}/")
+
+    def _queue(self, kind: str, arguments: list[str], name: str, address: str) -> web.Response:
+        try:
+            job = self._jobs.put(kind, arguments, name, address)
+        except JobError as error:
+            return refused(409, str(error))
+        return web.json_response({"ok": True, "job": job.number}, status=202)
+
+    def _free(self, name: str) -> Path:
+        """Return a folder of that name that is not there yet."""
+        number, path = 1, self._folder / name
+        while path.exists():
+            number += 1
+            path = self._folder / f"{name}-{number}"
+        return path
+
+    # Names
+
+    def _session(self, request: web.Request) -> Path:
+        return self._path(request.match_info["id"])
+
+    def _path(self, name: str) -> Path:
+        """Return the file of a session.
+
+        Raises
+        ------
+        HTTPNotFound
+            If there is no plain file of that name in the folder.
+        """
+        path = self._inside(f"{name}.mcap")
+        if not path.is_file():
+            raise web.HTTPNotFound(reason="There is no such session.")
+        return path
+
+    def _inside(self, name: str) -> Path:
+        """Return what has a name in the folder; nothing leads out of it.
+
+        Raises
+        ------
+        HTTPNotFound
+            If the name is a path, or a link that leads elsewhere.
+        """
+        with suppress(OSError, ValueError):
+            path = self._folder / name
+            plain = Path(name).name == name and not name.startswith(".") and name.isprintable()
+            path.lstat()  # or there is none, or its name is too long
+            if plain and path.resolve().parent == self._folder.resolve():
+                return path
+        raise web.HTTPNotFound(reason="There is no such session.")
+
+    def _look_of(self, name: str) -> Document | None:
+        """Return the quick look of a session, if there is one that can be read."""
+        with suppress(OSError, ValueError, web.HTTPNotFound):
+            path = self._inside(f"{name}.look.json")
+            if path.stat().st_size <= _MOST_LOOK:
+                look = json.loads(path.read_bytes(), parse_constant=lambda _: None)
+                return look if isinstance(look, dict) else None
+        return None
+
+
+def _row_of(folder: Path, name: str) -> SessionRow | None:
+    return next((row for row in list_sessions(folder) if row.id == name), None)
+
+
+def _download_headers(name: str) -> dict[str, str]:
+    # A session's name may hold anything that a file's name may.
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+    return {
+        "Content-Disposition": f'attachment; filename="{plain}"',
+        "Content-Type": "application/octet-stream",
+    }
+
+
+def _whole(text: str, name: str) -> int:
+    if not text.isdecimal() or len(text) > len(str(_MOST_ROWS)) + 3:
+        raise web.HTTPBadRequest(reason=f"{name} is no whole number.")
+    return int(text)

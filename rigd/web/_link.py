@@ -1,0 +1,174 @@
+"""The page's connection to the daemon: by the public control socket, made again when it is lost."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+Document = dict[str, Any]
+_Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+_STATUS_S: Final = 0.4
+"""Time from one question for the status to the next."""
+_SILENT_S: Final = 0.9
+"""A daemon from which nothing is heard for so long is told of."""
+_RETRY_S: Final = 0.5
+_CONNECT_S: Final = 5.0
+_ANSWER_S: Final = 90.0
+_LONGEST_LINE: Final = 1 << 20
+_CROWD_TRIES: Final = 20
+_CROWD_PAUSE_S: Final = 0.1
+
+
+class DaemonError(Exception):
+    """The daemon cannot be asked; the message is for the operator."""
+
+
+class DaemonLink:
+    """Follows one daemon, and passes requests on.
+
+    Parameters
+    ----------
+    path
+        The daemon's socket.
+    on_message
+        Called with each event, and with each status reply.
+    on_lost
+        Called with the reason when the daemon is not heard any more.
+    """
+
+    def __init__(
+        self, path: Path, on_message: Callable[[Document], None], on_lost: Callable[[str], None]
+    ) -> None:
+        self._path = path
+        self._on_message = on_message
+        self._on_lost = on_lost
+        self._asking = asyncio.Event()
+        self._held: _Connection | None = None
+        self._commanding = asyncio.Lock()
+
+    async def run(self) -> None:
+        """Follow the daemon, until cancelled."""
+        while True:
+            try:
+                await self._follow()
+            except (OSError, ValueError, DaemonError, asyncio.IncompleteReadError) as error:
+                self._let_go()
+                self._on_lost(str(error) if isinstance(error, DaemonError) else _GONE)
+            await asyncio.sleep(_RETRY_S)
+
+    def ask_for_status(self) -> None:
+        """Have the status come soon: something has changed."""
+        self._asking.set()
+
+    async def ask(self, request: Document) -> Document:
+        """Pass a request on and return the reply.
+
+        A session that was started keeps its connection until its series ends, and with it the
+        control; further requests that need it take the same one.
+
+        Parameters
+        ----------
+        request
+            As docs/control_socket.md has it.
+
+        Raises
+        ------
+        DaemonError
+            If there is no reply.
+        """
+        if request.get("command") == "predict":
+            return await self._ask_anew(request)
+        async with self._commanding:
+            if self._held is not None:
+                with suppress(DaemonError):
+                    return await _exchange(self._held, request)
+                self._let_go()
+            return await self._ask_anew(request)
+
+    async def _ask_anew(self, request: Document) -> Document:
+        """Ask over a new connection; a daemon that has too many clients is asked again."""
+        for attempt in range(_CROWD_TRIES):
+            if attempt:
+                await asyncio.sleep(_CROWD_PAUSE_S)
+            try:
+                link = await self._connect()
+            except (OSError, TimeoutError):
+                raise DaemonError(_GONE) from None
+            try:
+                reply = await _exchange(link, request)
+                if request.get("command") == "start" and reply.get("ok"):
+                    self._held = link
+            finally:
+                if self._held is not link:
+                    link[1].close()
+            if not reply.get("crowded"):
+                break
+        return reply
+
+    async def _connect(self) -> _Connection:
+        opening = asyncio.open_unix_connection(self._path, limit=_LONGEST_LINE)
+        return await asyncio.wait_for(opening, _CONNECT_S)
+
+    async def _follow(self) -> None:
+        """Read what one connection brings, to its end."""
+        reader, writer = await self._connect()
+        asking = asyncio.create_task(self._keep_asking(writer))
+        silent = False
+        line = asyncio.create_task(reader.readline())
+        try:
+            writer.write(b'{"command": "watch", "signals": true}\n')
+            while True:
+                await asyncio.wait((line,), timeout=_SILENT_S)
+                if not line.done():
+                    if not silent:
+                        self._on_lost(f"The daemon has said nothing for {_SILENT_S:g} s.")
+                    silent = True
+                    continue
+                silent = False
+                self._take(line.result())
+                line = asyncio.create_task(reader.readline())
+        finally:
+            asking.cancel()
+            line.cancel()
+            writer.close()
+
+    def _take(self, line: bytes) -> None:
+        if not line:
+            raise DaemonError(_GONE)
+        message = json.loads(line)
+        if message.get("reply") == "watch" and not message.get("ok"):
+            raise DaemonError(str(message.get("error")))
+        if message.get("event") == "series":
+            self._let_go()
+        if "event" in message or message.get("reply") == "status":
+            self._on_message(message)
+
+    async def _keep_asking(self, writer: asyncio.StreamWriter) -> None:
+        while True:
+            writer.write(b'{"command": "status"}\n')
+            self._asking.clear()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._asking.wait(), _STATUS_S)
+
+    def _let_go(self) -> None:
+        """Give control back."""
+        held, self._held = self._held, None
+        if held is not None:
+            held[1].close()
+
+
+async def _exchange(link: _Connection, request: Document) -> Document:
+    """Send a request and wait for its reply."""
+    reader, writer = link
+    try:
+        writer.write(json.dumps(request).encode() + b"\n")
+        line = await asyncio.wait_for(reader.readline(), _ANSWER_S)
+        return dict(json.loads(line))
+    except (OSError, ValueError, TimeoutError):
+        raise DaemonError("The daemon gave no answer.") from None
+
+
+_GONE: Final = "The daemon is not running, or cannot be reached; start it with rigd serve."

@@ -1,0 +1,387 @@
+"""Server of the page: its routes, what it tells the pages of the daemon, and its program."""
+
+import asyncio
+import json
+import os
+import re
+import sys
+import time
+from collections.abc import Awaitable, Iterator
+from contextlib import suppress
+from importlib.resources import files
+from inspect import Parameter, cleandoc, signature
+from pathlib import Path
+from typing import Any, Final
+
+from aiohttp import web
+
+from rigd.beam import Beam, Damping
+from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
+from rigd.excitation import FROM_THE_RIG, KINDS
+from rigd.profile import specimen_files
+from rigd.runtime import ignore
+from rigd.units import unit_of
+from rigd.view import Subject
+from rigd.web._access import Access, Connections, object_of, refused
+from rigd.web._jobs import Jobs
+from rigd.web._library import Library
+from rigd.web._link import DaemonError, DaemonLink
+from rigd.web._live import Pages
+from rigd.web._signals import Block, SessionResponse, Strips, nominal_document
+
+Document = dict[str, Any]
+
+_LOOPBACK: Final = "127.0.0.1"
+_COMMANDS: Final = frozenset({"start", "stop", "tare", "zero", "reset", "predict", "check"})
+_LONGEST_REQUEST: Final = 65_536
+_KEEP_ALIVE_S: Final = 15.0
+_LINGERING_S: Final = 1.0
+_GAUGES_S: Final = 0.095
+_RESPONSE_S: Final = 1.0
+_GRACE_S: Final = 1.0
+_NICENESS: Final = 5
+_AT_WORK: Final = ("running", "stopping")
+_STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
+
+
+class PageServer:
+    """The page of one rig.
+
+    Parameters
+    ----------
+    job
+        What the daemon tells of the rig: see `rigd.daemon._page`.
+
+    Attributes
+    ----------
+    pages
+        The pages that are open.
+    """
+
+    def __init__(self, job: Document) -> None:
+        self._job = job
+        self._socket = Path(job["socket"])
+        self._access = Access(job["token"])
+        self.pages = Pages()
+        self._jobs = Jobs(Path(job["folder"]), self.pages.send)
+        self._library = Library(Path(job["folder"]), self._access, self._jobs)
+        self._link = DaemonLink(self._socket, self._take, self._lose)
+        self._excitations = dict(_excitations())
+        self._nominal = self._nominal_of(job)
+        self._specimens: list[str] = []
+        self._status: Document | None = None
+        self._lost: Document | None = None
+        self._gauges: Document | None = None
+        self._gauges_s = 0.0
+        self._strips = Strips()
+        self._session: str | None = None
+        self._response: SessionResponse | None = None
+        self._shown: Document | None = None
+        self._last: Document | None = None
+        self._finding: set[asyncio.Task[None]] = set()
+
+    def application(self) -> web.Application:
+        """Return the routes."""
+        application = web.Application(
+            middlewares=[self._access.guard], client_max_size=_LONGEST_REQUEST
+        )
+        application.on_response_prepare.append(self._access.protect)
+        application.add_routes(
+            [
+                web.get("/", self._static),
+                web.get("/static/{name}", self._static),
+                web.get("/favicon.ico", self._static),
+                web.get("/api/live", self._live),
+                web.post("/api/command", self._command),
+                *self._library.routes(),
+            ]
+        )
+        return application
+
+    async def run(self) -> None:
+        """Follow the daemon and work on jobs, until cancelled."""
+        await asyncio.gather(
+            self._link.run(), self._jobs.run(), self._estimate(), self._find_specimens()
+        )
+
+    def end(self, reason: str) -> None:
+        """Tell the pages that this is the end."""
+        self._lose(reason)
+
+    # Requests
+
+    async def _static(self, request: web.Request) -> web.StreamResponse:
+        """Serve a file of the page."""
+        name = request.match_info.get(
+            "name", "index.html" if request.path == "/" else "favicon.svg"
+        )
+        path = Path(str(files("rigd.web") / "static" / name))
+        if not _STATIC_NAME.fullmatch(name) or not path.is_file():
+            return refused(404, "There is no such file.")
+        return web.FileResponse(path)
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        """Serve a page that is open."""
+        hello = {
+            "type": "hello",
+            "profile": self._job["profile"],
+            "description": self._job["description"],
+            "limits": self._job["limits"],
+            "daemon": None if self._status is None else self._status["daemon"],
+            "excitations": self._excitations,
+            "specimens": self._specimens,
+            "required_meta": self._job["required_meta"],
+        }
+        known = (
+            *(hello, self._lost, self._status, self._gauges, self._strips.last()),
+            *(self._nominal, self._last, self._shown),
+        )
+        return await self.pages.follow(request, filter(None, known))
+
+    async def _command(self, request: web.Request) -> web.Response:
+        """Pass a request on to the daemon."""
+        given = await object_of(request)
+        command = given.get("command")
+        if not isinstance(command, str) or command not in _COMMANDS:
+            return refused(400, f"command: there are {', '.join(sorted(_COMMANDS))}.")
+        if not self._access.may_command(request, command, given.get("parameters")):
+            return refused(403, "The token is missing or wrong: open the address of rigd status.")
+        try:
+            if command == "stop":
+                # Asks again and again, and then by a signal.
+                reply = await asyncio.to_thread(stop_session, self._socket)
+            else:
+                reply = await self._link.ask(given)
+        except (DaemonError, DaemonGoneError) as error:
+            return refused(503, str(error))
+        except RefusedByDaemonError as error:
+            return refused(409, str(error))
+        finally:
+            self._link.ask_for_status()
+        status = 200 if reply.get("ok") else 400 if reply.get("wrong_use") else 409
+        return web.json_response(reply, status=status)
+
+    # What the daemon tells
+
+    def _take(self, message: Document) -> None:
+        """Take a message of the daemon, and tell the pages."""
+        if self._lost is not None:
+            self._lost = None
+            self._link.ask_for_status()
+        event = message.get("event")
+        if event is None:
+            self._take_status(message)
+        elif event == "signals":
+            self._take_signals(message)
+        elif event == "message":
+            self.pages.note(message["level"], message["text"])
+        else:
+            del message["event"]
+            self.pages.send({"type": event, **message})
+            if event != "progress":
+                self._link.ask_for_status()
+            if event == "session":
+                self._begin_finding(self._find_specimens())
+
+    def _take_status(self, status: Document) -> None:
+        self._status = {"type": "status", **status}
+        self._jobs.paused = status["state"] in _AT_WORK
+        series = status["series"]
+        session = series["path"] if series is not None and series["running"] else None
+        if session is not None and session != self._session:
+            self._begin(session, series)
+        self._session = session
+        self.pages.send(self._status)
+
+    def _begin(self, path: str, series: Document) -> None:
+        """Make ready for the response of a session."""
+        plan, rate_hz = series["plan"], self._job["rate_hz"]
+        self._nominal = self._nominal_of(plan)
+        first, end = plan["segments"]["sweep"]
+        self._shown = self._last = None
+        self._response = None
+        if series["excitation"] != "hold":
+            self._response = SessionResponse(
+                Subject(
+                    Path(path).stem,
+                    rate_hz,
+                    round(plan["record_s"] * rate_hz),
+                    (first, end),
+                    Beam(**plan["beam"]),
+                    Damping(**plan["damping"]),
+                    self._job["tool_inertia_kg_m2"],
+                    self._job["angle_delay_s"],
+                    self._job["torque_delay_s"],
+                )
+            )
+        self.pages.send(self._nominal)
+        specimen = str(series["notes"].get("specimen", ""))
+        self._begin_finding(self._find_last(specimen, Path(path).stem))
+
+    def _nominal_of(self, specimen: Document) -> Document:
+        """Return the nominal model of the beam that a job or a plan names."""
+        beam, damping = Beam(**specimen["beam"]), Damping(**specimen["damping"])
+        return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
+
+    def _take_signals(self, event: Document) -> None:
+        if event["count"]:
+            block = Block.of_event(event)
+            self.pages.send(self._strips.feed(block))
+            if self._response is not None:
+                self._response.feed(block)
+        now_s = time.monotonic()
+        if now_s - self._gauges_s >= _GAUGES_S:
+            self._gauges_s = now_s
+            self._gauges = {
+                "type": "gauges",
+                **event["gauges"],
+                "frequency_hz": event["frequency_hz"],
+            }
+            self.pages.send(self._gauges)
+
+    def _lose(self, reason: str) -> None:
+        """Tell the pages that the daemon is not heard."""
+        if self._lost is None or self._lost["reason"] != reason:
+            self._lost = {"type": "lost", "reason": reason}
+            self.pages.send(self._lost)
+        self._status = None
+
+    async def _estimate(self) -> None:
+        """Tell the response of the session that runs, now and then."""
+        while True:
+            await asyncio.sleep(_RESPONSE_S)
+            if self._response is not None and self.pages:
+                shown = self._response.document()
+                self._shown = shown or self._shown
+                self.pages.send(shown)
+
+    def _begin_finding(self, finding: Awaitable[None]) -> None:
+        """Look something up in the library, without waiting for it."""
+        task = asyncio.ensure_future(finding)
+        self._finding.add(task)
+        task.add_done_callback(self._finding.discard)
+
+    async def _find_specimens(self) -> None:
+        with suppress(OSError, ValueError):
+            used = await self._library.specimens()
+            self._specimens = list(dict.fromkeys([*used, *specimen_files()]))
+
+    async def _find_last(self, specimen: str, but: str) -> None:
+        with suppress(OSError, ValueError):
+            self._last = await self._library.last_response(specimen, but)
+            self.pages.send(self._last)
+
+
+def _excitations() -> Iterator[tuple[str, list[Document]]]:
+    """Return the options of each excitation, as its function has and describes them."""
+    for name, function in KINDS.items():
+        described = _descriptions(cleandoc(function.__doc__ or ""))
+        yield (
+            name,
+            [
+                {
+                    "name": option.name,
+                    "unit": unit_of(option.name),
+                    "default": None if option.default is Parameter.empty else option.default,
+                    "help": described.get(option.name, ""),
+                }
+                for option in signature(function).parameters.values()
+                if option.name not in FROM_THE_RIG
+            ],
+        )
+
+
+def _descriptions(text: str) -> dict[str, str]:
+    """Return what a docstring says of each argument."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
+    entries = re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section[1], re.MULTILINE) if section else []
+    return {
+        name.strip(): " ".join(words.split())
+        for names, words in entries
+        for name in names.split(",")
+    }
+
+
+# Program
+
+
+def run_page() -> None:
+    """Serve the page until standard input ends; its first line is the job.
+
+    Standard output gets one line: the port, or why there is no page.
+    """
+    ignore()
+    os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
+    job = json.loads(sys.stdin.readline() or "null")
+    if job is not None:
+        asyncio.run(_run(job))
+
+
+async def _run(job: Document) -> None:
+    try:
+        server, _, listening = await open_page(job)
+    except OSError as error:
+        told = {"error": f"port {job['port']} cannot be had: {error.strerror}"}
+        print(json.dumps(told), flush=True)  # noqa: T201 - the daemon reads it
+        return
+    print(json.dumps({"port": port_of(listening)}), flush=True)  # noqa: T201
+    running = asyncio.create_task(server.run())
+    gone = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
+    await asyncio.wait((running, gone), return_when=asyncio.FIRST_COMPLETED)
+    if running.done():
+        running.result()
+    # The daemon has ended, however: its successor may want the port.
+    listening.close()
+    server.end("The daemon has ended; start it with rigd serve.")
+    await asyncio.sleep(_GRACE_S)
+    os._exit(0)  # whoever still reads would be waited for
+
+
+async def open_page(job: Document) -> tuple[PageServer, web.AppRunner, asyncio.Server]:
+    """Listen on the port of a job, or on another one if that may be.
+
+    Parameters
+    ----------
+    job
+        As of :class:`PageServer`, with ``port`` and ``any_port``.
+
+    Returns
+    -------
+    tuple
+        Server, to be run; what answers for it; its listening socket.
+
+    Raises
+    ------
+    OSError
+        If the port cannot be had.
+    """
+    server, connections = PageServer(job), Connections()
+    application = server.application()
+    application.middlewares.append(connections.heard)
+    runner = web.AppRunner(
+        application,
+        access_log=None,
+        handle_signals=False,
+        auto_decompress=False,
+        keepalive_timeout=_KEEP_ALIVE_S,
+        lingering_time=_LINGERING_S,
+        shutdown_timeout=_GRACE_S,
+    )
+    await runner.setup()
+    assert runner.server is not None
+    connections.serving = runner.server
+    loop = asyncio.get_running_loop()
+    try:
+        listening = await loop.create_server(connections.welcome, _LOOPBACK, job["port"])
+    except OSError:
+        if not job["any_port"]:
+            raise
+        listening = await loop.create_server(connections.welcome, _LOOPBACK, 0)
+    connections.look_after()
+    return server, runner, listening
+
+
+def port_of(listening: asyncio.Server) -> int:
+    """Return the port on which a server listens."""
+    port: int = listening.sockets[0].getsockname()[1]
+    return port

@@ -1,0 +1,223 @@
+"""What the page shows of a running record: strips of the last seconds, the growing response.
+
+Both are made from the blocks of signals that the daemon tells, which may have gaps.
+"""
+
+import base64
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from rigd.beam import Beam, Damping, transfer
+from rigd.view import Subject, SweepResponse, Thinning
+
+Document = dict[str, Any]
+Real = npt.NDArray[np.float64]
+
+STRIP_S: Final = 0.05
+"""Time that a point of a strip stands for."""
+_KEPT_S: Final = 10.0
+FIRST_HZ: Final = 0.5
+LAST_HZ: Final = 60.0
+_GROUPS: Final = 200
+"""Groups of frequencies of which the extremes are told: at most twice as many points."""
+_MODEL_STEP_HZ: Final = 0.01
+_DIGITS: Final = 6
+_SAMPLE: Final = np.dtype(
+    [
+        ("tick", np.int64),
+        ("angle_rad", np.float64),
+        ("angle_reference_rad", np.float64),
+        ("coupling_torque_nm", np.float64),
+        ("status", np.uint32),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Signals of some ticks, one after the other; what is not known is NaN."""
+
+    first_tick: int
+    rate_hz: float
+    angle_rad: Real
+    reference_rad: Real
+    torque_nm: Real
+
+    @classmethod
+    def of_event(cls, event: Mapping[str, Any]) -> "Block":
+        """Take it out of the daemon's event ``signals``."""
+        angle, reference, torque = (
+            np.frombuffer(base64.b64decode(event[name]), dtype="<f4").astype(np.float64)
+            for name in ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
+        )
+        return cls(event["first_tick"], event["rate_hz"], angle, reference, torque)
+
+
+# Strips
+
+
+class Strips:
+    """Envelopes of the last 10 s of angle and torque, in points of 0.05 s."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[float | None, ...]] = deque(maxlen=round(_KEPT_S / STRIP_S))
+        self._next = 0
+        """Number of the point that is not told yet, since the start of the session."""
+        self._rest: list[Real] = []
+        self._end = 0
+        """Tick that is expected next."""
+
+    def feed(self, block: Block) -> Document | None:
+        """Take a block; return the points that it completes as the page is told them."""
+        ticks = max(1, round(STRIP_S * block.rate_hz))
+        values = np.stack((block.angle_rad, block.reference_rad, block.torque_nm))
+        missing = block.first_tick - self._end
+        if missing < 0 or missing > _KEPT_S * block.rate_hz:
+            self._points.clear()
+            self._next = block.first_tick // ticks
+            self._rest = []
+            missing = block.first_tick - self._next * ticks
+        if missing:
+            self._rest.append(np.full((3, missing), np.nan))
+        self._rest.append(values)
+        self._end = block.first_tick + values.shape[1]
+        waiting = np.concatenate(self._rest, axis=1)
+        count = waiting.shape[1] // ticks
+        self._rest = [waiting[:, count * ticks :]]
+        if count == 0:
+            return None
+        bins = waiting[:, : count * ticks].reshape(3, count, ticks)
+        # Without those functions' warning of points of which nothing is known.
+        least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
+        columns = np.round(
+            (least[0], greatest[0], least[1], greatest[1], least[2], greatest[2]), _DIGITS
+        )
+        points = [tuple(_known(column)) for column in columns.T]
+        first, self._next = self._next, self._next + count
+        self._points.extend(points)
+        return _strip(first, points)
+
+    def last(self) -> Document | None:
+        """Return all points that are kept, for a page that has just been opened."""
+        points = list(self._points)
+        return _strip(self._next - len(points), points) if points else None
+
+
+def _strip(first: int, points: list[tuple[float | None, ...]]) -> Document:
+    names = (
+        *("angle_min", "angle_max", "reference_min", "reference_max"),
+        *("torque_min", "torque_max"),
+    )
+    columns = zip(*points, strict=True)
+    return {
+        "type": "strip",
+        "t0_s": round(first * STRIP_S, 3),
+        "dt_s": STRIP_S,
+        **{name: list(column) for name, column in zip(names, columns, strict=True)},
+    }
+
+
+def _known(values: Real) -> list[float | None]:
+    return [None if value != value else value for value in values.tolist()]
+
+
+# Frequency response
+
+
+class SessionResponse:
+    """The response of the session that runs, as far as the sweep has come.
+
+    Parameters
+    ----------
+    subject
+        The session.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self._subject = subject
+        self._sweep = SweepResponse(subject, LAST_HZ)
+        self._thinning: Thinning | None = None
+        self._fresh = False
+        self._reached_hz = 0.0
+
+    def feed(self, block: Block) -> None:
+        """Take a block; what is not known of it is left out."""
+        known = np.isfinite(block.angle_rad)
+        samples = np.zeros(int(known.sum()), dtype=_SAMPLE)
+        samples["tick"] = (block.first_tick + np.arange(known.size))[known]
+        samples["angle_rad"] = block.angle_rad[known]
+        samples["angle_reference_rad"] = block.reference_rad[known]
+        samples["coupling_torque_nm"] = block.torque_nm[known]
+        if samples.size:
+            self._sweep.feed(samples)
+            self._fresh = True
+
+    def document(self) -> Document | None:
+        """Return the response as the page is told it; None if nothing new is known."""
+        estimate = self._sweep.estimate() if self._fresh else None
+        self._fresh = False
+        if estimate is None or not estimate.excited.any():
+            return None
+        reached_hz = float(estimate.response.frequency_hz[estimate.excited][-1])
+        if estimate.final and reached_hz < self._reached_hz:
+            return None  # the last whole segment ends before the sweep does
+        self._reached_hz = reached_hz
+        response = estimate.response.without_delays(
+            input_delay_s=self._subject.angle_delay_s, output_delay_s=self._subject.torque_delay_s
+        )
+        grid = response.frequency_hz
+        if self._thinning is None:
+            self._thinning = Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS)
+        shown = np.where(estimate.excited, response.response, np.nan)
+        kept = _extremes(self._thinning, np.abs(shown))
+        coherence = None
+        if response.coherence is not None:
+            coherence = _known(np.round(response.coherence[kept], 4))
+        return _curve(grid[kept], shown[kept]) | {
+            "type": "response",
+            "coherence": coherence,
+            "reached_hz": round(reached_hz, 3),
+        }
+
+
+def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) -> Document:
+    """Return what the sensor measures of the nominal beam, as the page is told it.
+
+    Parameters
+    ----------
+    beam, damping
+        The specimen as the profile has it.
+    tool_inertia_kg_m2
+        Inertia between sensor and beam.
+    """
+    grid = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
+    s = 2j * np.pi * grid
+    model = transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
+    kept = _extremes(Thinning.logarithmic(grid, FIRST_HZ, LAST_HZ, _GROUPS), np.abs(model))
+    return {"type": "nominal", **_curve(grid[kept], model[kept])}
+
+
+def _curve(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:
+    return {
+        "frequency_hz": np.round(frequency_hz, 4).tolist(),
+        "magnitude": [float(f"{value:.4g}") for value in np.abs(response)],
+        "phase_rad": np.round(np.angle(response), 4).tolist(),
+    }
+
+
+def _extremes(thinning: Thinning, magnitude: Real) -> npt.NDArray[np.intp]:
+    """Return where each group's least and greatest magnitude are, without those not known."""
+    grouped = magnitude[thinning.groups]
+    unknown = np.isnan(grouped)
+    rows = ~unknown.all(axis=1)
+    grouped, unknown, groups = grouped[rows], unknown[rows], thinning.groups[rows]
+    least = np.where(unknown, np.inf, grouped).argmin(axis=1)
+    greatest = np.where(unknown, -np.inf, grouped).argmax(axis=1)
+    places = np.stack((least, greatest), axis=1)
+    kept: npt.NDArray[np.intp] = np.unique(np.take_along_axis(groups, places, axis=1))
+    return kept

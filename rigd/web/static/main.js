@@ -1,0 +1,17 @@
+// The operator's page: its parts, and the link that feeds them.
+
+import { Bar } from "./bar.js";
+import { Events } from "./events.js";
+import { Gauges } from "./gauges.js";
+import { Link } from "./link.js";
+import { LiveResponse } from "./response.js";
+import { Rig } from "./rig.js";
+import { Sessions } from "./sessions.js";
+import { StartForm } from "./start.js";
+import { Strips } from "./strips.js";
+
+const link = new Link();
+for (const Part of [Bar, Gauges, Strips, LiveResponse, StartForm, Rig, Sessions, Events]) {
+  new Part(link);
+}
+link.connect();

@@ -1,0 +1,261 @@
+"""Quick look: its findings against those of `select`; the last session; the file; the program."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import eventually, has_ended
+
+from analysis import quick_look
+from analysis.identify import Measurement, freest_alone
+from analysis.quick_look import LookError, look_at, write_look
+from analysis.record import load_record
+from analysis.results import whole_record
+from rigd.session import look_path
+
+
+@pytest.fixture(scope="module")
+def chirps(short_chirps, tmp_path_factory):
+    """Both chirps in a folder of their own, and the looks at them in turn."""
+    folder = tmp_path_factory.mktemp("looks")
+    paths = [Path(shutil.copy(path, folder)) for path in short_chirps]
+    looks = []
+    for path in paths:
+        looks.append(look_at(path))
+        write_look(looks[-1], path)
+    return paths, looks
+
+
+@pytest.fixture(scope="module")
+def selection(short_chirps):
+    return whole_record(load_record(short_chirps[0])).selection
+
+
+def test_the_modes_are_those_of_the_whole_judgement(chirps, selection):
+    _, (look, _) = chirps
+    assert [mode["mode"] for mode in look["modes"]] == [1, 2, 3]
+    for told, mode in zip(look["modes"], selection.headline.modes, strict=True):
+        assert told["frequency_hz"] == mode.frequency_hz.as_json()
+        assert told["damping_ratio"] == mode.damping_ratio.as_json()
+        assert told["shown"] is mode.shown
+    assert look["flags"] == [finding.sentence for finding in selection.verdict.findings]
+
+
+def test_the_response_keeps_the_height_of_the_resonances(chirps):
+    _, (look, _) = chirps
+    response = look["response"]
+    hz, magnitude = (np.array(response[name]) for name in ("frequency_hz", "magnitude"))
+    assert 200 < hz.size <= 400
+    assert (np.diff(hz) > 0).all()
+    assert {len(values) for values in response.values()} == {hz.size}
+    for mode in look["modes"][:2]:
+        near = np.abs(hz - mode["frequency_hz"]["value"]) < 1.0
+        assert magnitude[near].max() > 3 * np.median(magnitude)
+    low = look["coherence"]["low_bands"]
+    assert 0.4 < look["coherence"]["mean"] < 1.0
+    assert all(0.5 <= first < last < 51 for first, last in low)
+
+
+def test_thinning_keeps_extremes():
+    hz = np.linspace(0.5, 50, 8000)
+    magnitude = np.ones(8000)
+    magnitude[[1234, 4321]] = 100.0, 0.01
+    kept = quick_look._thinned(hz, magnitude)
+    assert kept.size <= 400
+    assert {1234, 4321} <= set(kept)
+    assert (quick_look._thinned(hz[:50], magnitude[:50]) == np.arange(50)).all()
+
+
+def test_low_bands_are_joined():
+    hz = np.arange(100) * 0.1 + 10.0
+    low = np.zeros(100, bool)
+    low[[5, 40, 41, 42, 45, 99]] = True  # the lone ones are narrower than what is resolved
+    assert list(quick_look._bands(hz, low, 0.15)) == [(pytest.approx(14.0), pytest.approx(14.5))]
+    assert list(quick_look._bands(hz, ~low, 0.15)) == [(10.0, pytest.approx(19.8))]
+
+
+def test_the_last_session_of_the_specimen_is_compared_with(chirps):
+    paths, (first, second) = chirps
+    assert first["against_last"] is None
+    against = second["against_last"]
+    assert against["file"] == paths[0].name
+    assert against["sentence"].startswith(f"No significant change against {paths[0].stem} (mode 1")
+    for mode, before, after in zip(against["modes"], first["modes"], second["modes"], strict=True):
+        change = after["frequency_hz"]["value"] - before["frequency_hz"]["value"]
+        assert mode["frequency_hz_change"] == change
+        ratio = after["damping_ratio"]["value"] / before["damping_ratio"]["value"]
+        assert mode["damping_ratio_change_percent"] == pytest.approx(100 * (ratio - 1))
+        assert mode["significant"] is False
+    # Asked for, an earlier one is compared with a later one too.
+    assert look_at(paths[0], paths[1])["against_last"]["file"] == paths[1].name
+
+
+def look_with(*hz, **others):
+    modes = [
+        {
+            "mode": number,
+            "shown": True,
+            "frequency_hz": {"value": value, "std": 0.001, "flag": None},
+            "damping_ratio": {"value": 0.01, "std": 1e-4, "flag": None},
+        }
+        for number, value in enumerate(hz, start=1)
+    ]
+    common = {"version": 1, "specimen": "a", "start_utc_ns": 5, "made_utc_ns": 6}
+    return common | {"file": "before.mcap", "modes": modes} | others
+
+
+def test_a_change_counts_from_three_standard_deviations_on():
+    before = look_with(2.5, 16.0, 44.0)
+    now = look_with(2.5 + 4.1e-3, 16.0 + 4.4e-3)
+    now["modes"][1]["damping_ratio"]["value"] = 0.0105
+    against = quick_look._against(now["modes"], before)
+    assert [mode["significant"] for mode in against["modes"]] == [False, True]
+    assert against["sentence"] == (
+        "Significant change against before: mode 2 +0.0044 Hz, damping +5 %."
+    )
+    before["modes"][1]["frequency_hz"]["flag"] = "part of the record is unexplained"
+    now["modes"][1]["damping_ratio"]["std"] = None
+    assert not any(m["significant"] for m in quick_look._against(now["modes"], before)["modes"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "file"),
+    [
+        ("newer", look_with(2.5, start_utc_ns=7, file="newer.mcap"), "newer.mcap"),
+        ("older", look_with(2.5, start_utc_ns=3), "last.mcap"),
+        ("other", look_with(2.5, start_utc_ns=7, specimen="b"), "last.mcap"),
+        ("later", look_with(2.5, start_utc_ns=9), "last.mcap"),
+        ("without", look_with(start_utc_ns=7), "last.mcap"),
+        ("version", look_with(2.5, start_utc_ns=7, version=2), "last.mcap"),
+        ("garbage", [1], "last.mcap"),
+        ("garbage", {"file": 1, "modes": {"a": 1}}, "last.mcap"),
+    ],
+)
+def test_the_last_look_is_found_by_start_and_specimen(tmp_path, name, content, file):
+    last = look_path(tmp_path / "last.mcap")
+    last.write_text(json.dumps(look_with(2.5, start_utc_ns=4, file="last.mcap")))
+    look_path(tmp_path / f"{name}.mcap").write_text(json.dumps(content))
+    found = quick_look._last_look(tmp_path / "now.mcap", "a", 8)
+    assert found["file"] == file
+
+
+def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection, monkeypatch):
+    paths, _ = chirps
+    monkeypatch.setattr(quick_look, "_JUDGED_S", 10.0)
+    look = look_at(paths[0])
+    for told, mode in zip(look["modes"], selection.headline.modes, strict=True):
+        # The same structure is selected, under a noise spectrum that hardly differs.
+        std = mode.frequency_hz.std
+        assert told["frequency_hz"]["value"] == pytest.approx(mode.frequency_hz.value, abs=std)
+        assert told["frequency_hz"]["std"] == pytest.approx(std, rel=0.3)
+        assert told["frequency_hz"]["flag"] is None
+    assert "type VI alone was fitted" in look["flags"][0]
+
+
+def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps):
+    measurement = Measurement.of_record(load_record(short_chirps[0]))
+    cubic = measurement.torque_nm + 4e3 * measurement.angle_rad**3
+    told, found = freest_alone(replace(measurement, torque_nm=cubic))
+    assert {mode.frequency_hz.flag for mode in told.modes if mode.shown} == {
+        "part of the record is unexplained"
+    }
+    assert found
+    told, found = freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
+    assert {mode.frequency_hz.flag for mode in told.modes} == {
+        "the record and its file do not fit each other"
+    }
+    assert [finding.kind for finding in found] == ["sign"]
+
+
+def test_what_cannot_be_analysed_says_why(write_session, short_signals, signals_of, tmp_path):
+    held = replace(short_signals, metadata={"excitation": "hold", "specimen": "a"})
+    look = look_at(write_session(tmp_path / "held.mcap", held))
+    assert look["modes"] == []
+    assert look["specimen"] == "a"
+    assert look["flags"][-1].startswith("No modes: the motor was held")
+    assert "No modes" in look["text"][-1]
+    cut = replace(short_signals, segments={"sweep": (6000, 7000)})
+    look = look_at(write_session(tmp_path / "cut.mcap", cut))
+    assert look["flags"][0].startswith("segment 'sweep' covers ticks 6000 to 6999")
+    json.dumps(look, allow_nan=False)
+
+
+def test_the_text_is_for_a_terminal(chirps):
+    paths, (_, look) = chirps
+    head, *modes = look["text"]
+    assert head == f"Quick look at {paths[1].stem}; ± 95 %, statistical only:"
+    assert modes[0].startswith("  mode 1: 2.5")
+    assert modes[2].endswith(" %")
+    assert modes[3].startswith("  mean coherence 0.")
+    assert look["text"][-1] == f"  {look['against_last']['sentence']}"
+
+
+def test_a_look_is_written_whole_and_replaces_an_older_one_only(tmp_path):
+    path = tmp_path / "a.mcap"
+    place = look_path(path)
+    write_look(look_with(2.5, made_utc_ns=6), path)
+    write_look(look_with(2.6, made_utc_ns=7), path)
+    assert json.loads(place.read_text())["made_utc_ns"] == 7
+    write_look(look_with(2.7, made_utc_ns=5), path)
+    assert json.loads(place.read_text())["made_utc_ns"] == 7
+    place.write_text("somebody else's")
+    with pytest.raises(LookError, match="move it away"):
+        write_look(look_with(2.5), path)
+    assert place.read_text() == "somebody else's"
+    with pytest.raises(LookError, match="cannot be written"):
+        write_look(look_with(2.5), tmp_path / "missing" / "a.mcap")
+    assert [each.name for each in tmp_path.iterdir()] == [place.name]
+
+
+def look(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "analysis.quick_look", *map(str, arguments)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def test_the_program_writes_the_look_and_prints_it(short_chirps, tmp_path):
+    path = Path(shutil.copy(short_chirps[0], tmp_path))
+    done = look(path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == json.loads(look_path(path).read_text())["text"]
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("missing.mcap",), "Error: missing.mcap cannot be read"),
+        (("missing.mcap", "--parent", 1), ""),  # of another process
+    ],
+)
+def test_the_program_says_what_is_wrong_in_a_sentence(arguments, said):
+    done = look(*arguments)
+    assert done.returncode == 1
+    assert done.stderr.startswith(said)
+    assert done.stderr.count("\n") == bool(said)
+
+
+def test_it_runs_at_the_lowest_priority_and_ends_with_its_parent(short_chirps, tmp_path):
+    """As it is started: below a process that is killed, suspended."""
+    path = Path(shutil.copy(short_chirps[0], tmp_path))
+    code = (
+        "import os, subprocess, sys, time\n"
+        "look = subprocess.Popen([sys.executable, '-m', 'analysis.quick_look', sys.argv[1],\n"
+        "                         '--parent', str(os.getpid())], start_new_session=True)\n"
+        "while os.sched_getscheduler(look.pid) != os.SCHED_IDLE: time.sleep(0.001)\n"
+        "os.kill(look.pid, 19)\n"
+        "print(look.pid, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True)
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.communicate()
+    assert eventually(lambda: has_ended(pid))
+    assert not look_path(path).exists()

@@ -1,0 +1,126 @@
+"""``rigd list``: a table, the trend of a specimen, and JSON."""
+
+import json
+import time
+
+import pytest
+from library_folders import mode
+from typer.testing import CliRunner
+
+from rigd.cli.app import app
+
+
+@pytest.fixture
+def listed(tmp_path, monkeypatch):
+    """Run `rigd list` in Tokyo; returns its result."""
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    time.tzset()
+    monkeypatch.chdir(tmp_path)
+    yield lambda *arguments: CliRunner().invoke(app, ["list", *map(str, arguments)])
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.fixture
+def sessions(record_briefly, write_look, write_report):
+    """Two sessions of a specimen, one of another, and a text."""
+    first = record_briefly("first", specimen="antenna 3", operator="Ada")
+    write_look(first, mode(2.600, 0.002, 0.00910, 0.00008), mode(16.3))
+    second = record_briefly("second", specimen="antenna 3", day=1.5, outcome="stopped")
+    write_report(second, mode(2.570, 0.002, 0.00905, 0.00008), mode(16.3))
+    record_briefly("third", specimen="antenna 4", day=2)
+    second.with_name("text.mcap").write_text("no session")
+
+
+@pytest.mark.usefixtures("sessions")
+def test_the_newest_come_first_with_their_modes_and_problems(listed):
+    told = listed(".").stdout.splitlines()
+    assert [line.split("  ")[0] for line in told[:4]] == [
+        "date", "2023-11-17 07:13", "2023-11-16 19:13", "2023-11-15 07:13"
+    ]  # fmt: skip
+    assert [cell.strip() for cell in told[2].split("  ") if cell.strip()][1:] == [
+        "second.mcap", "antenna 3", "chirp", "stopped", "2.57 Hz 0.905 %, 16.3 Hz 0.5 %",
+        "report",
+    ]  # fmt: skip
+    assert "text.mcap" in told[4]
+    assert told[5].startswith("text.mcap: ")
+    assert "is not an MCAP file" in told[5]
+
+
+@pytest.mark.usefixtures("sessions")
+def test_the_trend_says_which_changes_are_beyond_the_intervals(listed):
+    told = listed(".", "--specimen", "antenna 3", "--trend").stdout.splitlines()
+    first, second = told[1:3]
+    assert first.startswith("2023-11-15 07:13  2.6000 ± 0.0020 ")
+    assert "-1.2 % *" in second
+    assert "-0.55 % " in second
+    assert second.count("*") == 1
+    assert first.index("●") > second.index("●")
+    assert told[4].startswith("mode 2")
+    assert "*" not in "".join(told[4:7])
+
+
+@pytest.mark.usefixtures("sessions")
+def test_a_trend_is_of_one_specimen(listed, write_look, record_briefly):
+    write_look(record_briefly("fourth", day=3), mode(9.0))
+    refused = listed(".", "--trend")
+    assert refused.exit_code == 2
+    assert "--specimen" in refused.stderr
+    assert "'antenna 3'" in refused.stderr
+    assert "none" in refused.stderr
+
+
+@pytest.mark.usefixtures("sessions")
+def test_json_has_rows_and_trends(listed):
+    told = json.loads(listed(".", "--specimen", "antenna 3", "--trend", "--json").stdout)
+    assert [row["id"] for row in told["sessions"]] == ["second", "first"]
+    assert told["sessions"][0]["report"].endswith("second.report/report.html")
+    change = told["trends"][0]["points"][1]["frequency_change"]
+    assert change == {"difference": pytest.approx(-0.03), "beyond_intervals": True}
+
+
+def test_specimens_are_listed_with_their_beams_and_problems(listed, tmp_path):
+    folder = tmp_path / "specimens"
+    folder.mkdir()
+    beam = "[beam]\n" + "".join(
+        f'{key} = {{ value = {value}, source = "paper" }}\n'
+        for key, value in (
+            ("length_m", 0.95), ("density_kg_per_m", 4.7e-3), ("bending_stiffness_n_m2", 0.09)
+        )
+    )  # fmt: skip
+    (folder / "antenna 4.toml").write_text(f"note = 'steel'\n{beam}")
+    (folder / "broken.toml").write_text("[beam]")
+    told = CliRunner().invoke(app, ["specimens"]).stdout.splitlines()
+    assert told == [
+        "antenna 4: 0.95 m, 0.0047 kg/m, 0.09 N·m², steel (specimens/antenna 4.toml)",
+        "broken: cannot be used: specimens/broken.toml: section [beam] is missing.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--meta", "temperature_c"], "--meta 'temperature_c': is not NAME=VALUE"),
+        (["--meta", "batch=1", "--meta", "batch=2"], "--meta 'batch=2': is given twice"),
+        (["--meta", "temperature_c=21,4"], "temperature_c = '21,4' is not a finite number"),
+    ],
+)
+def test_metadata_that_cannot_be_stored_is_refused_before_anything_starts(options, told):
+    refused = CliRunner().invoke(app, ["run", "hold", *options])
+    assert refused.exit_code == 2
+    assert told in refused.stderr
+
+
+def test_folders_stand_together_and_one_that_is_not_there_is_told(listed, record_briefly, tmp_path):
+    path = record_briefly("first")
+    other = tmp_path / "other"
+    other.mkdir()
+    path.rename(other / "late.mcap")
+    record_briefly("second", day=1)
+    told = listed(".", "other").stdout.splitlines()
+    assert [line.split()[2] for line in told[1:]] == ["second.mcap", "late.mcap"]
+    missing = listed()
+    assert missing.exit_code == 2
+    assert "sessions: the folder cannot be listed" in missing.stderr
+    (tmp_path / "sessions").mkdir()
+    assert listed().stdout == "No sessions.\n"

@@ -1,0 +1,150 @@
+"""Quick looks as processes, with a program in place of the real one that does as it is named."""
+
+import json
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from processes import children, eventually, state_of
+
+from rigd.runner import _quick_looks as quick_looks
+from rigd.runner._quick_looks import QuickLook, QuickLooks
+from rigd.runner._session import SessionResult
+from rigd.session import look_path
+
+PROGRAM = """
+import json, pathlib, sys, time
+
+session = pathlib.Path(sys.argv[1])
+assert sys.argv[2] == "--parent"
+name = session.stem
+if name == "fails":
+    sys.exit("a hint\\nError: The record is too short.")
+if name == "silent":
+    sys.exit(3)
+if name == "hangs":
+    time.sleep(600)
+if name == "waits":
+    while not session.with_suffix(".go").exists():
+        time.sleep(0.005)
+text = "{" if name == "torn" else json.dumps({"text": [f"Look at {name}"]})
+session.with_suffix(".look.json").write_text(text)
+"""
+
+
+@pytest.fixture
+def looks(tmp_path, monkeypatch):
+    (tmp_path / "look_program.py").write_text(PROGRAM)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(quick_looks, "_PROGRAM", "look_program")
+    told = []
+    looks = QuickLooks(told.append)
+    looks.told = told
+    yield looks
+    looks.close()
+    assert not looks.busy
+    assert not children(os.getpid())
+
+
+def done(looks):
+    def idle():
+        looks.attend()
+        return not looks.busy
+
+    assert eventually(idle)
+    return looks.told
+
+
+def test_sessions_are_looked_at_one_after_the_other(looks, tmp_path):
+    paths = [tmp_path / f"{name}.mcap" for name in ("a", "b")]
+    for path in paths:
+        looks.begin(path)
+        assert len(children(os.getpid())) == 1
+    first, second = done(looks)
+    assert [first.session, second.session] == paths
+    assert first.path == look_path(paths[0])
+    assert first.lines == ["Look at a"]
+    assert first.error == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("fails", "The record is too short."),
+        ("silent", "its program ended with exit code 3."),
+        ("torn", "torn.look.json cannot be read."),
+    ],
+)
+def test_a_look_that_fails_says_why(looks, tmp_path, name, error):
+    looks.begin(tmp_path / f"{name}.mcap")
+    (told,) = done(looks)
+    assert (told.path, told.look) == (None, None)
+    assert told.error.endswith(error)
+    assert told.lines == [f"No quick look at {name}.mcap: {told.error}"]
+
+
+def test_none_runs_beside_a_session(looks, tmp_path):
+    looks.begin(tmp_path / "waits.mcap")
+    (pid,) = children(os.getpid())
+    with looks.held():
+        assert eventually(lambda: state_of(Path(f"/proc/{pid}")) == "T")
+        (tmp_path / "waits.go").touch()
+        looks.begin(tmp_path / "next.mcap")
+        time.sleep(0.1)
+        looks.attend()
+        assert children(os.getpid()) == [pid]
+        assert state_of(Path(f"/proc/{pid}")) == "T"
+        assert looks.told == []
+    assert [each.session.stem for each in done(looks)] == ["waits", "next"]
+
+
+def test_one_that_hangs_is_killed_and_not_for_the_time_of_a_session(looks, tmp_path, monkeypatch):
+    monkeypatch.setattr(quick_looks, "_LONGEST_S", 0.4)
+    looks.begin(tmp_path / "hangs.mcap")
+    with looks.held():
+        time.sleep(0.5)
+    looks.attend()
+    assert looks.told == []
+    (told,) = done(looks)
+    assert told.error == "it took longer than 0.4 s."
+
+
+def test_of_too_many_the_oldest_are_left_out(looks, tmp_path):
+    names = ("waits", "a", "b", "c", "d", "e")
+    for name in names:
+        looks.begin(tmp_path / f"{name}.mcap")
+    assert [(each.session.stem, each.error) for each in looks.told] == [
+        ("a", "later sessions came first."),
+        ("b", "later sessions came first."),
+    ]
+    (tmp_path / "waits.go").touch()
+    assert [each.session.stem for each in done(looks)] == ["a", "b", "waits", "c", "d", "e"]
+
+
+def test_closing_ends_one_that_is_suspended(looks, tmp_path):
+    looks.begin(tmp_path / "hangs.mcap")
+    os.kill(children(os.getpid())[0], signal.SIGSTOP)
+    looks.begin(tmp_path / "a.mcap")
+    looks.close()
+    assert children(os.getpid()) == []
+    assert looks.told == []
+
+
+def test_a_look_is_noted_and_told_as_an_event():
+    path = Path("out/a.mcap")
+    look = QuickLook(path, look_path(path), {"text": ["Look\x1b[2J"]}, "")
+    result = SessionResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
+    other = replace(result, path=Path("out/b.mcap"))
+    results = [other, result]
+    look.note(results)
+    assert results == [other, replace(result, look=look.path)]
+    assert results[1].as_dict()["look"] == "out/a.look.json"
+    assert other.as_dict()["look"] is None
+    event = json.loads(json.dumps({"event": "quick_look", **look.as_dict()}))
+    assert QuickLook.of_event(event) == look
+    assert look.lines == ["Look?[2J"]
+    none = QuickLook(path, None, None, "why.")
+    assert QuickLook.of_event(none.as_dict()) == none

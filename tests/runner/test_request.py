@@ -1,0 +1,45 @@
+"""Metadata of a session file: what the rig, the program and the request say of it."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from rigd.engine import Connected
+from rigd.excitation import hold
+from rigd.profile import load_profile
+from rigd.runner._request import Order, file_header, software_commit
+
+
+@pytest.fixture
+def metadata_of():
+    """Return the metadata of a session with a sensor of this calibration."""
+
+    def make(calibration):
+        profile = load_profile("sim")
+        order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
+        return file_header(order, Connected(calibration, {}, {}, True), {}).metadata
+
+    return make
+
+
+def test_the_sensors_serial_number_is_told_if_it_tells_one(metadata_of):
+    assert metadata_of({"serial_number": "FT12345"})["sensor_serial_number"] == "FT12345"
+    assert "sensor_serial_number" not in metadata_of({"device": "simulated force-torque sensor"})
+
+
+def test_the_commit_is_that_of_the_checkout(metadata_of):
+    checkout = Path(__file__).parents[2]
+    if not (checkout / ".git").exists():
+        pytest.skip("this is no checkout")
+    command = ["git", "-C", checkout, "rev-parse", "HEAD"]
+    commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    stated = metadata_of({})["software_commit"]
+    assert commit[:12] in stated or stated.startswith("v")
+
+
+def test_without_a_checkout_or_git_there_is_no_commit(monkeypatch, tmp_path):
+    software_commit.cache_clear()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert software_commit() == {}
+    software_commit.cache_clear()

@@ -1,0 +1,176 @@
+"""Top bar of the operator's page: state, reason, STOP; and what stays where it is."""
+
+import pytest
+from fake_web_server import TOKEN, UTC_NS, fake_web_server, gauges, progress, status, strip
+from playwright.sync_api import expect
+
+TELL_S = 1.0
+"""Within this time the page has to say what has happened."""
+
+
+@pytest.fixture
+def server():
+    with fake_web_server() as server:
+        yield server
+
+
+@pytest.fixture
+def page(server, open_page):
+    """The page with the right to act, connected."""
+    page = open_page(f"{server.address}#token={TOKEN}")
+    expect(page.locator("#state-word")).to_have_text("READY")
+    return page
+
+
+def says(page, selector, text):
+    """See that an element says a text within a second."""
+    expect(page.locator(selector)).to_contain_text(text, timeout=1000 * TELL_S)
+
+
+def change(before, after, reason):
+    return {
+        "type": "state", "utc_ns": UTC_NS + 10**9, "from": before, "to": after, "reason": reason,
+    }  # fmt: skip
+
+
+FULL_DISK = "The free space of the session's disk of 12 MB is below its limit of 50 MB."
+
+
+@pytest.mark.parametrize(
+    ("message", "word", "reason", "tone"),
+    [
+        (change("ready", "running", "chirp was started"), "RUNNING", "Chirp was", "running"),
+        (change("running", "stopping", "stop asked for"), "STOPPING", "Stop asked", "stopping"),
+        (change("stopping", "ready", "chirp was stopped"), "READY", "was stopped", "ready"),
+        (change("running", "fault", FULL_DISK), "FAULT", "The free space", "alarm"),
+        ({"type": "lost", "reason": "The daemon is gone."}, "OFFLINE", "press the STO", "quiet"),
+        (status("idle", doing="connecting"), "CONNECTING", "", "quiet"),
+        (status(zero_lost=True), "READY", "The zero is lost", "ready"),
+    ],
+    ids=["running", "stopping", "stopped", "full-disk", "lost-daemon", "connecting", "zero-lost"],
+)
+def test_the_state_is_told_within_a_second(server, page, message, word, reason, tone):
+    server.tell(message)
+    says(page, "#state-word", word)
+    says(page, "#state-reason", reason)
+    assert page.get_attribute("#bar", "data-tone") == tone
+    assert page.is_visible("#fault") == (word == "FAULT")
+
+
+def test_a_lost_server_is_told_and_found_again(server, page):
+    server.hang_up()
+    says(page, "#state-word", "OFFLINE")
+    assert page.is_disabled("#start-button")
+    expect(page.locator("#state-word")).to_have_text("READY")
+    assert page.is_enabled("#start-button")
+
+
+def test_a_session_that_runs_and_says_nothing_is_offline(server, page):
+    server.tell(status("running"), progress(0.1))
+    says(page, "#state-word", "RUNNING")
+    expect(page.locator("#state-word")).to_have_text("OFFLINE")
+    server.tell(progress(0.2), status("running"))
+    says(page, "#state-word", "RUNNING")
+
+
+def test_a_fault_names_its_reason_and_the_way_out(server, page):
+    reason = "The angle of 0.51 rad exceeds its limit of 0.5 rad. " + "Turn it back. " * 20
+    server.tell(status("fault", reason=reason))
+    says(page, "#fault-reason", reason.strip())
+    assert page.is_disabled("#start-button")
+    page.click("#fault-reset")
+    says(page, "#rig-result", "Fault reset.")
+    assert server.asked == [("reset", True)]
+
+
+def test_progress_tells_time_left_phase_and_frequency(server, page):
+    controller = {"pid": 812, "uid": 1000, "user": "ada"}
+    server.tell(
+        status("running", controller=controller),
+        progress(0.5, session=2, repeat=3, missed=7),
+        gauges(0.4, frequency_hz=12.345),
+    )
+    says(page, "#frequency", "12.3 Hz")
+    says(page, "#time-left", "1:08")
+    says(page, "#phase", "recording, 2 of 3")
+    says(page, "#controller", "ada, process 812")
+    says(page, "#count-missed", "7")
+    # Where time is skipped there is no time left to tell.
+    server.tell(progress(0.25, time_left_s=None))
+    says(page, "#time-left", "25 %")
+
+
+@pytest.mark.parametrize("token", ["", f"#token={TOKEN}"], ids=["no-token", "token"])
+def test_stop_is_for_everybody_and_says_what_came_of_it(server, open_page, token):
+    page = open_page(server.address + token)
+    server.replies["stop"] = {"stopping": True}
+    page.focus("#stop")
+    page.keyboard.press("Enter")
+    says(page, "#state-reason", "Stop requested.")
+    assert server.asked == [("stop", bool(token))]
+    assert "not an emergency stop" in page.inner_text(".stop")
+
+
+def test_a_stop_that_fails_says_what_to_do(server, page):
+    server.replies["stop"] = {"ok": False, "error": "The daemon gave no answer."}
+    page.click("#stop")
+    says(page, "#state-reason", "Not stopped: The daemon gave no answer. Use rigd stop")
+    page.wait_for_timeout(100)
+    assert page.inner_text("#state-word") == "READY"
+
+
+def test_stop_works_where_the_server_answers_no_more(server, page, open_page):
+    server.close()
+    page.click("#stop")
+    says(page, "#state-reason", "Not stopped: The page's server does not answer.")
+    # That it cannot be reached is what is tested.
+    open_page.complaints.clear()
+
+
+def test_without_the_token_the_page_is_read_only_and_says_how_to_act(server, open_page):
+    page = open_page(server.address)
+    expect(page.locator("#state-word")).to_have_text("READY")
+    assert "rigd serve --web" in page.inner_text("#read-only")
+    page.wait_for_selector("#rows tr")
+    page.check("#rows tr:nth-child(1) input")
+    page.check("#rows tr:nth-child(3) input")
+    for needs_right in ("#start-button", "#zero", "#tare", "#check", "#reset", "#campaign"):
+        assert page.is_disabled(needs_right)
+    for free in ("#stop", "#predict", "#overlay"):
+        assert page.is_enabled(free)
+
+
+def test_the_token_stays_with_the_tab_and_leaves_the_address(page, server):
+    assert TOKEN not in page.url
+    page.reload()
+    expect(page.locator("#state-word")).to_have_text("READY")
+    assert page.is_enabled("#start-button")
+
+
+@pytest.mark.parametrize("width", [360, 390, 1280])
+def test_nothing_jumps_or_overflows_when_a_session_runs(server, open_page, width):
+    page = open_page(f"{server.address}#token={TOKEN}", width=width)
+    page.wait_for_selector("#rows tr")
+    boxes = """() => ["#stop", "#live", "#response", "#start", "#rig", "#sessions"].map(
+        (each) => { const box = document.querySelector(each).getBoundingClientRect();
+            return [each, Math.round(box.x), Math.round(box.y), Math.round(box.width)] })"""
+    before = page.evaluate(boxes)
+    server.tell(
+        status("running", controller={"pid": 4_194_304, "uid": 1000, "user": "a.rather.long.name"}),
+        progress(0.5, repeat=1000, session=999, missed=123_456, late=123_456, phase="waiting"),
+        strip(0.0, 200),
+        gauges(1.2),
+        {"type": "event", "utc_ns": UTC_NS, "level": "warning", "text": "Very long. " * 50},
+    )
+    says(page, "#phase", "waiting for the beam to rest")
+    assert page.evaluate(boxes) == before
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    bar = page.locator("#bar")
+    assert bar.evaluate("bar => bar.scrollHeight - bar.clientHeight") <= 1
+
+
+def test_the_page_is_there_within_a_second(server, open_page):
+    page = open_page(server.address)
+    says(page, "#state-word", "READY")
+    loaded_s = page.evaluate("performance.getEntriesByType('navigation')[0].loadEventEnd") / 1e3
+    assert loaded_s < 1.0

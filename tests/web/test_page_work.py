@@ -1,0 +1,325 @@
+"""What an operator does on the page: start, rig, live signals, responses, sessions, events."""
+
+import re
+
+import pytest
+from fake_web_server import (
+    MODES,
+    PLAN,
+    TOKEN,
+    UTC_NS,
+    fake_web_server,
+    gauges,
+    hello,
+    job,
+    response,
+    session,
+    status,
+    strip,
+)
+from playwright.sync_api import expect
+
+from rigd.units import UNITS
+
+
+@pytest.fixture
+def server():
+    with fake_web_server() as server:
+        yield server
+
+
+@pytest.fixture
+def page(server, open_page):
+    page = open_page(f"{server.address}#token={TOKEN}")
+    page.wait_for_selector("#rows tr")
+    return page
+
+
+def says(page, selector, text):
+    expect(page.locator(selector)).to_contain_text(text)
+
+
+def drawn(page, canvas):
+    """Share of a canvas that has something on it."""
+    return page.evaluate(
+        """canvas => {
+            const { width, height } = document.querySelector(canvas);
+            const { data } = document.querySelector(canvas).getContext("2d")
+                .getImageData(0, 0, width, height);
+            let points = 0;
+            for (let k = 3; k < data.length; k += 4) points += data[k] > 0;
+            return points / (width * height);
+        }""",
+        canvas,
+    )
+
+
+# Start
+
+
+def test_a_start_sends_what_the_form_says(server, page):
+    server.tell(hello(required_meta=["temperature_c"]), status())
+    page.fill("#parameter-amplitude_rad", "0,02")
+    page.fill("#parameter-taper_s", "")
+    page.fill("#repeat", "2")
+    page.fill("#operator", "R. Igge")
+    page.fill("#specimen", "antenna 3")
+    page.fill("#metadata-rows input:nth-child(2)", "21,4")
+    page.click("#metadata-add")
+    page.fill("#metadata-rows .pair:nth-child(2) input:nth-child(1)", "clamp")
+    page.fill("#metadata-rows .pair:nth-child(2) input:nth-child(2)", "new")
+    server.replies["start"] = {"series": 1, "plan": PLAN}
+    page.click("#start-button")
+    says(page, "#prediction", "Predicted peaks")
+    assert server.asked == [("start", True)]
+    assert server.requests == [
+        {
+            "command": "start", "excitation": "chirp", "repeat": 2,
+            "parameters": {
+                "amplitude_rad": 0.02, "start_hz": 0.05, "stop_hz": 50, "duration_s": 120,
+                "rest_s": 1, "ring_down_s": 15,
+            },
+            "notes": {
+                "operator": "R. Igge", "specimen": "antenna 3",
+                "meta": {"temperature_c": 21.4, "clamp": "new"},
+            },
+        }
+    ]  # fmt: skip
+
+
+def test_each_excitation_has_its_own_parameters_with_units(page):
+    assert "Amplitude" in page.inner_text("#parameters")
+    assert "rad" in page.inner_text("#parameters")
+    page.select_option("#excitation", "hold")
+    assert page.locator("#parameters input").count() == 1
+    assert page.input_value("#parameter-duration_s") == "10"
+
+
+def test_a_value_that_is_no_number_is_told_and_not_sent(server, page):
+    page.fill("#parameter-amplitude_rad", "much")
+    page.click("#start-button")
+    says(page, "#start-result", "Amplitude much is not a number; give one in rad.")
+    page.fill("#parameter-amplitude_rad", "0.02")
+    page.fill("#repeat", "1.5")
+    page.click("#start-button")
+    says(page, "#start-result", "Repeat 1.5 is not a whole number")
+    assert server.asked == []
+
+
+def test_a_refusal_is_told_in_the_daemon_s_words(server, page):
+    told = "The predicted peak angle of 0.6 rad exceeds 0.5 rad; lower the amplitude."
+    server.replies["start"] = {"ok": False, "error": told}
+    page.click("#start-button")
+    says(page, "#start-result", told)
+    page.wait_for_selector("#start-button:enabled")
+
+
+def test_predict_shows_peaks_against_limits_and_offers_the_largest_amplitude(server, page):
+    refused = "The predicted peak speed of 11 rad/s exceeds 10 rad/s."
+    plan = PLAN | {"peak_velocity_rad_s": 11.0, "refused": refused}
+    server.replies["predict"] = {"plan": plan, "largest_amplitude_rad": 0.028_679}
+    page.click("#predict")
+    says(page, "#prediction", "11.0 of 10 rad/s")
+    says(page, "#prediction", refused)
+    says(page, "#prediction", "39.0 mm")
+    rows = page.locator("#prediction .bar-row")
+    assert [rows.nth(k).get_attribute("class").split()[1:] for k in range(3)] == [
+        [], ["over"], ["near"],
+    ]  # fmt: skip
+    # Rounded down, so that it passes; and predicted anew.
+    page.click("#take-largest")
+    assert page.input_value("#parameter-amplitude_rad") == "0.0286"
+    page.wait_for_selector("#prediction:not(.outdated)")
+    assert server.requests[-1]["parameters"]["amplitude_rad"] == 0.0286
+    page.fill("#parameter-duration_s", "60")
+    page.wait_for_selector("#prediction.outdated")
+
+
+def test_names_have_the_units_that_they_have_everywhere(page):
+    units = page.evaluate("async () => (await import('/static/format.js')).UNITS")
+    assert list(units.items()) == list(UNITS.items())
+
+
+# Rig
+
+
+def test_zero_tare_and_check_tell_their_results(server, page):
+    axes = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+    server.replies |= {
+        "zero": {"moved_rad": 0.001},
+        "tare": {
+            "mean": dict.fromkeys(axes, 0.4005), "std": dict.fromkeys(axes, 0.02),
+            "torque_std_nm": 0.0021,
+        },
+        "check": {
+            "verdict": "1 failed",
+            "rows": [
+                {"what": "bus load", "status": "ok", "text": "41 %", "remedy": "None."},
+                {"what": "priority", "status": "failed", "text": "none", "remedy": "Set it."},
+            ],
+        },
+    }  # fmt: skip
+    page.click("#zero")
+    says(page, "#rig-result", "Zero set (shift 0.00100 rad).")
+    page.click("#tare")
+    says(page, "#rig-result", "0.401 N")
+    says(page, "#rig-result", "0.020 N·m")
+    page.click("#check")
+    says(page, "#rig-result", "1 failed")
+    assert page.locator("#rig-result .failed").inner_text() == "failed priority: none\nSet it."
+    assert "None." not in page.inner_text("#rig-result")
+    server.tell(status(last_check={"utc_ns": UTC_NS, "verdict": "1 failed"}))
+    says(page, "#last-check", "1 failed, ")
+    says(page, "#calibration", "FT12345")
+
+
+def test_buttons_wait_for_their_state(server, page):
+    enabled = "['zero', 'tare', 'check', 'reset', 'start-button'].filter(id => " \
+        "!document.getElementById(id).disabled).join()"  # fmt: skip
+    assert page.evaluate(enabled) == "zero,tare,check,start-button"
+    for told, expected in (
+        (status("running"), ""), (status("fault"), "reset"), (status(doing="tare"), ""),
+        (status("idle"), "check"),
+    ):  # fmt: skip
+        server.tell(told)
+        page.wait_for_function(f"() => {enabled} === '{expected}'")
+
+
+# Live
+
+
+def test_gauges_are_per_cent_of_limits_and_coloured_near_them(server, page):
+    told = gauges(0.5)
+    told["angle"] |= {"value": 0.4, "fraction": 0.8}
+    told["velocity"] |= {"value": 10.4, "fraction": 1.04}
+    told["i2t"] = {"value": 0.1, "limit": None, "unit": "N·m", "fraction": None}
+    server.tell(told)
+    says(page, "#gauge-angle", "80 %")
+    assert page.get_attribute("#gauge-angle", "class") == "gauge near"
+    assert page.get_attribute("#gauge-angle", "title") == "0.400 rad of 0.500 rad"
+    assert page.get_attribute("#gauge-velocity", "class") == "gauge over"
+    assert page.inner_text("#gauge-velocity .percent") == "104 %"
+    says(page, "#gauge-i2t", "0.100 N·m")
+
+
+def test_strips_show_the_last_ten_seconds(server, page):
+    before = drawn(page, "#strip-angle")
+    server.tell(strip(0.0, 300))
+    label = re.compile("^Angle, last 10 s: −0.02[45].* to 0.02[45].* rad$")
+    expect(page.locator("#strip-angle")).to_have_attribute("aria-label", label)
+    assert drawn(page, "#strip-angle") > 2 * before
+    # Gaps are none of its business, and a new record begins anew.
+    gap = strip(0.0, 40)
+    for name in ("angle_min", "angle_max", "reference_min", "reference_max"):
+        gap[name][10] = None
+    full = drawn(page, "#strip-angle")
+    server.tell(gap)
+    page.wait_for_timeout(100)
+    assert 0 < drawn(page, "#strip-angle") < 0.6 * full
+
+
+def test_the_response_grows_over_model_and_last_session(server, page):
+    before = drawn(page, "#response-plot")
+    server.tell(response("nominal"), response("last", specimen="antenna 3"))
+    says(page, "#response-keys", "last session (antenna 3)")
+    server.tell(response(reached_hz=5.0))
+    says(page, "#response-keys", "measured")
+    little = drawn(page, "#response-plot")
+    assert little > before
+    page.hover("#response-plot", position={"x": 60, "y": 50})
+    says(page, "#response-readout", "coherence")
+    assert "Hz" in page.inner_text("#response-readout")
+
+
+def test_rerun_is_linked_where_there_is_a_live_view(server, page):
+    assert page.is_hidden("#rerun")
+    told = status()
+    told["rig"]["live_view"] = {"url": "http://127.0.0.1:9090/?url=x"}
+    server.tell(told)
+    page.wait_for_selector("#rerun", state="visible")
+    assert page.get_attribute("#rerun", "href") == "http://127.0.0.1:9090/?url=x"
+
+
+# Sessions
+
+
+def test_sessions_are_filtered_and_looked_at(server, page):
+    server.sessions = [session(0), session(1, outcome="stopped", specimen="antenna 4")]
+    page.select_option("[name=outcome]", "stopped")
+    page.wait_for_function("() => document.querySelectorAll('#rows tr[id]').length === 1")
+    says(page, "#sessions-count", "1 session")
+    page.click("#rows button.link >> nth=0")
+    page.wait_for_selector(".detail:not([hidden])")
+    told = page.inner_text(".detail")
+    assert "2.61130" in told  # to the second digit of its uncertainty
+    assert "2.60973 to 2.61287" in told
+    assert "the second mode has changed" in told
+    assert "Damping of mode 3 is uncertain" in told
+    assert "Temperature\n21.4 °C" in told
+
+
+def test_files_and_report_of_a_session(server, page):
+    server.sessions = [session(0), session(1, report="/somewhere/report.html")]
+    page.fill("[name=text]", "x")
+    page.wait_for_function("() => document.querySelectorAll('#rows tr[id]').length === 2")
+    name = server.sessions[1]["id"]
+    hrefs = page.locator(f"#session-{name} .files a")
+    assert [hrefs.nth(k).get_attribute("href") for k in range(hrefs.count())] == [
+        f"/api/sessions/{name}/report/",
+        *(f"/api/sessions/{name}/file.{ending}" for ending in ("mcap", "mat", "uff")),
+    ]
+    page.click("text=Make report")
+    says(page, "#sessions-result", "Report of")
+    address = f"/api/sessions/{server.sessions[0]['id']}/report"
+    assert server.asked == [(address, True)]
+    server.sessions[0] = session(0, report="/somewhere/else/report.html")
+    server.tell(job("done", id=server.sessions[0]["id"], address=f"{address}/"))
+    page.wait_for_selector(f"#sessions-result a[href='{address}/']")
+    assert page.locator("#rows a:text-is('Report')").count() == 2
+    server.tell(job("failed", error="The report was not made: no space."))
+    says(page, "#sessions-result", "The report was not made: no space.")
+
+
+def test_several_ticked_make_an_overlay_or_a_campaign(server, page):
+    assert page.is_disabled("#overlay")
+    for row in (1, 3):
+        page.check(f"#rows tr:nth-child({row}) input")
+    says(page, "#ticked", "2 ticked")
+    page.click("#overlay")
+    page.wait_for_selector("#comparison", state="visible")
+    assert page.locator("#comparison-keys .key").count() == 2
+    assert drawn(page, "#comparison-plot") > 0.02
+    page.click("#campaign")
+    says(page, "#sessions-result", "Campaign: running")
+    assert server.asked == [("/api/campaign", True)]
+
+
+def test_what_others_wrote_stays_text(server, page):
+    evil = "<img src=x onerror=\"document.title='broken'\">"
+    server.sessions = [session(0, specimen=evil, operator=evil, note=evil, modes=MODES)]
+    server.tell(
+        {"type": "event", "utc_ns": UTC_NS, "level": "info", "text": evil},
+        {"type": "session"},
+        status("fault", reason=evil),
+    )
+    says(page, "#rows", evil)
+    says(page, "#event-list", evil)
+    assert page.locator("main img").count() == 0
+    assert page.title() == "sim – rigd"
+
+
+# Events
+
+
+def test_events_are_listed_once_newest_first(server, page):
+    for second, level in ((1, "info"), (3, "warning"), (2, "error")):
+        server.tell({
+            "type": "event", "utc_ns": UTC_NS + second * 10**9, "level": level,
+            "text": f"event {second}",
+        })  # fmt: skip
+    server.tell(status())
+    says(page, "#event-list", "event 2")
+    texts = page.locator("#event-list .text").all_inner_texts()
+    assert texts == ["event 3", "event 2", "event 1",
+                     "idle → ready: the simulated rig is connected"]  # fmt: skip
+    assert page.locator("#event-list li.warning .level").inner_text() == "warning"
