@@ -180,7 +180,7 @@ def definitions(whole: WholeRecord) -> str:
     whole : WholeRecord
     """
     parts = [
-        "On the left coupling torque over motor angle, as transforms of Laplace",
+        "On the left coupling torque over motor angle, as Laplace transforms",
         f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
         "powers of s are principal values",
     ]
