@@ -27,7 +27,7 @@ from analysis.cli.welch_options import (
     choice,
     welch_settings,
 )
-from analysis.results import Routes
+from analysis.results import FIGURE_FORMATS, Routes
 from rigd.runtime import raise_on, use_one_thread
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import LoneSessionError
     from analysis.identify import Setting
+    from analysis.results import FigureFormat
 
 DEFAULT: Final = "default"
 """Name under which the command is registered that takes all other arguments."""
@@ -198,6 +199,12 @@ def analyze(
             help="Folder of the report, new or empty; with --each, of one folder per file.",
         ),
     ] = None,
+    figures: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST", help="File formats of the figures: png, svg, pdf, comma-separated."
+        ),
+    ] = "png,svg",
     json: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write all results as JSON; - for standard output."),
@@ -274,6 +281,7 @@ def analyze(
         whole_record=method != "welch",
         fixed=_fixed(fix),
         band_hz=band_hz(band),
+        figures=_figure_formats(figures),
     )
     outputs = Outputs(report, json, overwrite, verbose)
     try:
@@ -293,7 +301,7 @@ def analyze(
                     files, settings, outputs,
                     structures=tuple(STRUCTURES) if routes.whole_record else (),
                     fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
-                    with_paper=paper,
+                    with_paper=paper, formats=routes.figures,
                 )  # fmt: skip
             except LoneSessionError as lone:
                 code = _lone_session(lone, routes, outputs)
@@ -362,6 +370,18 @@ def _fixed(text: str) -> tuple[Setting, ...]:
             param_hint="--fix",
         )
     return tuple(name for name in SETTINGS if name in names)
+
+
+def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
+    names = {name.strip().lower() for name in text.split(",") if name.strip()}
+    unknown = sorted(names.difference(FIGURE_FORMATS))
+    if unknown or not names:
+        raise typer.BadParameter(
+            f"there is no {', '.join(unknown) or 'format'}; choose from "
+            f"{', '.join(FIGURE_FORMATS)}.",
+            param_hint="--figures",
+        )
+    return tuple(each for each in FIGURE_FORMATS if each in names)
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:

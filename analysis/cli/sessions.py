@@ -255,7 +255,7 @@ def _analyse_file(
         warn=lambda text: tell(f"Warning: {text}"),
     )  # fmt: skip
     with new_folder(folder, overwrite=overwrite) as part:
-        write_report(result, part, on_step)
+        write_report(result, part, on_step, formats=routes.figures)
     if rerun is not None:
         from analysis.report import write_rerun_file
 

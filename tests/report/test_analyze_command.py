@@ -50,9 +50,9 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert result.stderr == ""
     report = tmp_path / "session.report"
     assert sorted(path.name for path in report.iterdir()) == [
-        "SHA256SUMS", "analysis.json", "figures", "frf.png", "report.html", "tables", "tables.txt",
+        "SHA256SUMS", "analysis.json", "figures", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
-    for picture in (report / "frf.png", *(report / "figures").glob("*.png")):
+    for picture in (report / "figures").glob("*.png"):
         assert np.asarray(Image.open(picture).convert("L")).std() > 10
     content = json.loads((tmp_path / "fits.json").read_text())
     assert content == json.loads((report / "analysis.json").read_text())
@@ -97,7 +97,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
         (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
     ]  # fmt: skip
     assert "Fits to Welch's estimate" in result.stderr
-    assert (tmp_path / "out" / "signals.png").exists()
+    assert (tmp_path / "out" / "figures" / "welch_signals.png").exists()
 
 
 def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
@@ -118,8 +118,8 @@ def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
     # A report never lands on one that is there.
     assert (before / "frf.png").read_text() == "mine"
     assert [path.name for path in before.iterdir()] == ["frf.png"]
-    assert (tmp_path / "session.report-2" / "frf.png").stat().st_size > 10_000
-    assert (tmp_path / "other.report" / "frf.png").stat().st_size > 10_000
+    assert (tmp_path / "session.report-2" / "figures" / "welch_frf.png").stat().st_size > 10_000
+    assert (tmp_path / "other.report" / "figures" / "welch_frf.png").stat().st_size > 10_000
 
 
 def broken_file(kind, path, good):

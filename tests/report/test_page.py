@@ -17,9 +17,9 @@ from analysis.identify._headline import Simpler
 from analysis.report import _style as style
 from analysis.report._document import finite, record_entries
 from analysis.report._folder import OutputExistsError
-from analysis.report._page import Picture
 from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_page import record_page
+from analysis.report._style import Picture
 from analysis.report._text import damping_sentences
 from analysis.report._write import _write_page, report_tables
 
@@ -88,7 +88,7 @@ def test_it_is_one_well_formed_document(source, read_page):
     identifiers = [a["id"] for _, a in read_page.attributes if "id" in a]
     assert len(identifiers) == len(set(identifiers))
     used = {a["href"].removeprefix("#") for _, a in read_page.attributes if "href" in a}
-    assert used == {"verdict", "figures", "tables", "paper", "how"}
+    assert used == {"verdict", "figures", "model", "tables", "paper", "how"}
     assert used <= set(identifiers)
 
 
@@ -136,9 +136,10 @@ def test_figures_of_the_page_are_the_files_and_their_text_is_text(report, read_p
     assert {"Coupling torque", "Frequency (Hz)", "total", "Mode 1"} <= words
 
 
-def test_a_figure_stands_in_the_page_in_its_smaller_format():
-    assert Picture("name", "seen", b"png", b"longer").source == "data:image/png;base64,cG5n"
-    assert Picture("name", "seen", b"longer", b"svg").source == "data:image/svg+xml;base64,c3Zn"
+def test_a_figure_stands_in_the_page_as_svg_unless_that_is_far_larger():
+    longer = b"twice or more"
+    assert Picture("name", "seen", b"png", longer).source == "data:image/png;base64,cG5n"
+    assert Picture("name", "seen", b"png", b"svg").source == "data:image/svg+xml;base64,c3Zn"
 
 
 def test_the_verdict_comes_first_with_its_intervals(read_page, record_result):
@@ -190,7 +191,7 @@ def open_table(report, name):
 
 def test_csv_and_page_hold_the_same_numbers(report, read_page, record_result):
     modes, tables, of_paper = report_tables(record_result)
-    assert {path.stem for path in (report / "tables").iterdir()} == {
+    assert {path.stem for path in (report / "tables").glob("*.csv")} == {
         table.name for table in (modes, *tables, *of_paper)
     }
     for table in (modes, *tables, *of_paper):

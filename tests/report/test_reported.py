@@ -15,9 +15,9 @@ from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._bands import excited_band_hz, supported_band_hz
 from analysis.report._document import document
-from analysis.report._page import Picture
 from analysis.report._record_figures import illustrations
 from analysis.report._record_page import record_page
+from analysis.report._style import Picture
 from analysis.report._table import MARK, Cell, csv_text, unreported
 from analysis.report._text import damping_sentences, record_text, tables_text
 from analysis.report._write import report_tables

@@ -281,7 +281,7 @@ def run(application, *arguments):
 
 def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeypatch):
     # The figures take longer than all the rest, and are tested elsewhere.
-    monkeypatch.setattr("analysis.report.write_report", lambda *_: None)
+    monkeypatch.setattr("analysis.report.write_report", lambda *_, **__: None)
     out = tmp_path / "new" / "fits.rrd"
     quick = ("--types", "I", "--weights", "const", "--method", "welch", "--segment", "1000")
     done = run(app, session, *quick, "--rerun", out)
