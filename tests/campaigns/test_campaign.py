@@ -156,7 +156,9 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     assert verdict.dissent == ()
     stated, structure, *_ = verdict.sentences
     assert stated.startswith("The files are not of one specimen, they state 2: beam_length_m 0.98")
-    assert structure.startswith("The numbers are those of type VI: damping by the material (")
+    assert structure.startswith(
+        "The numbers are those of type VI: internal damping (alpha free) and external"
+    )
     assert not found.homogeneity.mixed
     assert any("No between-session variance" in sentence for sentence in verdict.sentences)
     assert "\nThe numbers are those of type VI: damping" in campaign_text(found)
