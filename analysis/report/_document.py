@@ -243,7 +243,7 @@ def document(
     Parameters
     ----------
     results : sequence of RecordResult
-        The entries of whole records follow those of the paper's route.
+        The entries of whole records follow those of the Welch fits.
     errors : mapping of str to str, optional
         Message for each file that could not be analysed.
 
