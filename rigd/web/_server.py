@@ -20,7 +20,7 @@ from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.excitation import FROM_THE_RIG, KINDS
 from rigd.profile import specimen_files
 from rigd.runtime import ignore
-from rigd.units import unit_of
+from rigd.units import UNITS, unit_of
 from rigd.view import Subject
 from rigd.web._access import Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
@@ -130,6 +130,7 @@ class PageServer:
             "excitations": self._excitations,
             "specimens": self._specimens,
             "required_meta": self._job["required_meta"],
+            "units": dict(UNITS),
         }
         known = (
             *(hello, self._lost, self._status, self._gauges, self._strips.last()),

@@ -9,6 +9,7 @@ from pathlib import Path
 from aiohttp import web
 
 import rigd
+from rigd.units import UNITS
 
 STATIC = Path(rigd.__file__).parent / "web" / "static"
 TOKEN = "right-to-act"
@@ -34,7 +35,8 @@ EXCITATIONS = {
 def hello(**members):
     return {
         "type": "hello", "profile": "sim", "limits": {}, "daemon": {}, "excitations": EXCITATIONS,
-        "specimens": ["antenna 3", "antenna 4"], "required_meta": [], **members,
+        "specimens": ["antenna 3", "antenna 4"], "required_meta": [],
+        "units": dict(UNITS), **members,
     }  # fmt: skip
 
 
