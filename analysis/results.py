@@ -7,7 +7,7 @@ needs (`analysis.campaigns.SessionResult`) and makes a `analysis.campaigns.Campa
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 _ORDERS: Final = frozenset({"alpha", "lambda"})
 
 
+FigureFormat = Literal["png", "svg", "pdf"]
+FIGURE_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg", "pdf")
+DEFAULT_FORMATS: Final[tuple[FigureFormat, ...]] = ("png", "svg")
+"""Formats of the figures unless asked for: PDF takes as long as PNG and SVG together."""
+
+
 @dataclass(frozen=True, slots=True)
 class Routes:
     """What is done with a record: Welch's fits, by these settings, and those of the whole record.
@@ -42,6 +48,8 @@ class Routes:
         Settings of rig and specimen that stay at the file's values.
     band_hz : tuple of float or None
         Band of both; None takes what suits the record.
+    figures : tuple of str
+        Formats of the report's figures.
     """
 
     settings: WelchSettings
@@ -49,6 +57,7 @@ class Routes:
     whole_record: bool
     fixed: tuple[Setting, ...]
     band_hz: tuple[float, float] | None = None
+    figures: tuple[FigureFormat, ...] = DEFAULT_FORMATS
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +194,6 @@ def record_result(
     path: Path,
     routes: Routes,
     *,
-    welch_required: bool = False,
     on_step: Callable[[str], None] = lambda _done: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> RecordResult:
@@ -195,9 +203,6 @@ def record_result(
     ----------
     path : Path
     routes : Routes
-    welch_required : bool
-        Whether Welch's fits are run though they suit the record ill. Otherwise they are left out
-        then, if the whole record is analysed, too.
     on_step : callable, optional
         Called with a few words after each step.
     warn : callable, optional
@@ -223,7 +228,7 @@ def record_result(
     if routes.paper:
         welch, left_out = welch_analysis(
             record, routes.settings, routes.band_hz,
-            optional=routes.whole_record and not welch_required, on_step=on_step,
+            optional=routes.whole_record, on_step=on_step,
         )  # fmt: skip
     if left_out:
         warn(f"{path}: {left_out}")

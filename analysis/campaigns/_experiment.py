@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
+from rigd.session import added_metadata
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -61,8 +62,6 @@ LABEL: Final = "specimen"
 
 _OF_SPECIMEN: Final = (LABEL, "beam_length_m", "beam_density_kg_per_m",
                        "beam_bending_stiffness_n_m2", "tool_inertia_kg_m2")  # fmt: skip
-_META: Final = "meta_"
-"""Begins the keys that users add."""
 _WHOLE: Final = 0.99
 """Share of the planned sweep from which it counts as complete: ticks may be missing at its end."""
 
@@ -83,7 +82,7 @@ class Experiment:
         When it was recorded, to the second; empty if the file does not say.
     operator, note : str
         What the file says of either, or nothing.
-    meta : mapping of str to str
+    added : mapping of str to (float or str)
         Metadata that the user added, by its names, such as ``temperature_c``.
     """
 
@@ -93,7 +92,7 @@ class Experiment:
     start_utc: str = ""
     operator: str = ""
     note: str = ""
-    meta: Mapping[str, str] = field(default_factory=dict)
+    added: Mapping[str, float | str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, record: Record) -> Experiment:
@@ -119,11 +118,7 @@ class Experiment:
             start_utc=_time(metadata.get("start_utc_ns", "")),
             operator=metadata.get("operator", "").strip(),
             note=metadata.get("note", "").strip(),
-            meta={
-                key.removeprefix(_META): text
-                for key, text in metadata.items()
-                if key.startswith(_META)
-            },
+            added=added_metadata(metadata),
         )
 
     @property

@@ -27,7 +27,7 @@ from analysis.cli.welch_options import (
     choice,
     welch_settings,
 )
-from analysis.results import Routes
+from analysis.results import FIGURE_FORMATS, Routes
 from rigd.runtime import raise_on, use_one_thread
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import LoneSessionError
     from analysis.identify import Setting
+    from analysis.results import FigureFormat
 
 DEFAULT: Final = "default"
 """Name under which the command is registered that takes all other arguments."""
@@ -198,6 +199,12 @@ def analyze(
             help="Folder of the report, new or empty; with --each, of one folder per file.",
         ),
     ] = None,
+    figures: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST", help="File formats of the figures: png, svg, pdf, comma-separated."
+        ),
+    ] = "png,svg",
     json: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write all results as JSON; - for standard output."),
@@ -266,7 +273,7 @@ def analyze(
             param_hint="--fix",
         )
     if method == "record":
-        _check_without_paper(context, is_campaign=is_campaign, rerun=rerun)
+        _check_without_paper(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     routes = Routes(
         settings,
@@ -274,6 +281,7 @@ def analyze(
         whole_record=method != "welch",
         fixed=_fixed(fix),
         band_hz=band_hz(band),
+        figures=_figure_formats(figures),
     )
     outputs = Outputs(report, json, overwrite, verbose)
     try:
@@ -293,7 +301,7 @@ def analyze(
                     files, settings, outputs,
                     structures=tuple(STRUCTURES) if routes.whole_record else (),
                     fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
-                    with_paper=paper,
+                    with_paper=paper, formats=routes.figures,
                 )  # fmt: skip
             except LoneSessionError as lone:
                 code = _lone_session(lone, routes, outputs)
@@ -323,19 +331,13 @@ def _refuse_of_campaigns(options: Sequence[str], files: Sequence[Path]) -> None:
     raise typer.BadParameter(why, param_hint=" and ".join(options))
 
 
-def _check_without_paper(context: typer.Context, *, is_campaign: bool, rerun: Path | None) -> None:
+def _check_without_paper(context: typer.Context, *, is_campaign: bool) -> None:
     """Refuse outputs of the Welch fits where these are left out; name options without effect."""
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
             "--method all, or add --each.",
             param_hint="--method",
-        )
-    if rerun is not None:
-        raise typer.BadParameter(
-            "its charts are of the paper's fits, which --method record leaves out; take --method "
-            "all.",
-            param_hint="--rerun",
         )
     sources = {name: context.get_parameter_source(name) for name in _OF_WELCH}
     given = [f"--{name}" for name, source in sources.items() if source and source.name == _TYPED]
@@ -368,6 +370,18 @@ def _fixed(text: str) -> tuple[Setting, ...]:
             param_hint="--fix",
         )
     return tuple(name for name in SETTINGS if name in names)
+
+
+def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
+    names = {name.strip().lower() for name in text.split(",") if name.strip()}
+    unknown = sorted(names.difference(FIGURE_FORMATS))
+    if unknown or not names:
+        raise typer.BadParameter(
+            f"there is no {', '.join(unknown) or 'format'}; choose from "
+            f"{', '.join(FIGURE_FORMATS)}.",
+            param_hint="--figures",
+        )
+    return tuple(each for each in FIGURE_FORMATS if each in names)
 
 
 def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from analysis.results import DEFAULT_FORMATS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from analysis.cli.sessions import Outputs
     from analysis.identify import Setting
     from analysis.models import WelchSettings
+    from analysis.results import FigureFormat
 
 _NAME: Final = "campaign"
 _FIGURES: Final = 8
@@ -30,6 +33,7 @@ def campaign_command(
     jobs: int | None = None,
     dask: str | None = None,
     with_paper: bool = False,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> int:
     """Analyse a campaign, write its folder and its JSON, and print its tables.
 
@@ -53,6 +57,8 @@ def campaign_command(
         Address of a Dask scheduler to use instead.
     with_paper : bool
         Whether the paper's numbers stand beside these.
+    formats : sequence of str
+        Formats of the figures.
 
     Returns
     -------
@@ -83,7 +89,7 @@ def campaign_command(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask,
     )  # fmt: skip
-    found = _analysed(run, len(files), folder, outputs, with_paper=with_paper)
+    found = _analysed(run, len(files), folder, outputs, with_paper=with_paper, formats=formats)
     lines = [f"Report of the campaign: {folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
         # Before anything is said: the streams may take nothing.
@@ -106,6 +112,7 @@ def _analysed(
     outputs: Outputs,
     *,
     with_paper: bool,
+    formats: Sequence[FigureFormat],
 ) -> CampaignResult:
     """Analyse and write, with progress on a terminal; tell what failed."""
     from rich.console import Console
@@ -134,7 +141,7 @@ def _analysed(
             if len(found.sessions) == 1:
                 raise LoneSessionError(found.sessions[0].path, found.failures)
             write_campaign(
-                found, part, with_paper=with_paper,
+                found, part, with_paper=with_paper, formats=formats,
                 on_step=lambda done: progress.update(bar, advance=1, description=done),
             )  # fmt: skip
     for failure in found.failures:

@@ -251,11 +251,11 @@ def _analyse_file(
     from analysis.results import record_result
 
     result = record_result(
-        file, routes, welch_required=rerun is not None, on_step=on_step,
+        file, routes, on_step=on_step,
         warn=lambda text: tell(f"Warning: {text}"),
     )  # fmt: skip
     with new_folder(folder, overwrite=overwrite) as part:
-        write_report(result, part, on_step)
+        write_report(result, part, on_step, formats=routes.figures)
     if rerun is not None:
         from analysis.report import write_rerun_file
 

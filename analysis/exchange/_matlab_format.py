@@ -15,6 +15,7 @@ from analysis.exchange._source import (
     check_samples,
     no_such_channel,
 )
+from rigd.session import META_PREFIX, NOTES
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -185,10 +186,7 @@ def write_mat(table: Table, stream: BinaryIO) -> None:
     )
 
 
-_WORDS: Final = ("id", "operator", "specimen", "note")
-_ADDED: Final = "meta_"
-"""Begins the keys that users add, whose values are numbers only if their names have a unit."""
-
+_WORDS: Final = ("id", *NOTES)
 _NUMBER: Final = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)")
 _LARGEST_EXACT: Final = 2**53
 """From here on not every whole number is a double."""
@@ -197,7 +195,7 @@ _LARGEST_EXACT: Final = 2**53
 def _value(key: str, text: str) -> str | float | NDArray[Any]:
     """Return what a text of the session's metadata stands for."""
     parts = [part.strip() for part in text.split(",")]
-    words = key in _WORDS or (key.startswith(_ADDED) and not unit_of(key))
+    words = key in _WORDS or (key.startswith(META_PREFIX) and not unit_of(key))
     if words or not all(map(_NUMBER.fullmatch, parts)):
         return text
     if len(parts) > 1:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from analysis.campaigns import CampaignResult
-    from analysis.report._page import Facts, Picture
+    from analysis.report._page import Facts
+    from analysis.report._style import Picture
 
 _OF_RECORDS: Final = ("damping", "pooled_response", "pooled", "validation")
 """Figures that go with the verdict; the others are the paper's."""

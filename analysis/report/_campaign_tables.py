@@ -20,6 +20,7 @@ from analysis.report._pooled_tables import (
 )
 from analysis.report._specimen_tables import homogeneity_table, specimens_table
 from analysis.report._table import ABSENT, WORDS, Cell, Column, Entry, Row, Table
+from rigd.session import META_PREFIX
 from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
         *(each.experiment for each in campaign.sessions),
         *(each.experiment for each in campaign.failures),
     )
-    added = dict.fromkeys(name for its in stated if its for name in its.meta)
+    added = dict.fromkeys(name for its in stated if its for name in its.added)
     return Table.of(
         "session_list",
         "Sessions, as their files state them",
@@ -97,7 +98,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
                 said(its.label if its else ""),
                 said(its.operator if its else ""),
                 said(its.note if its else ""),
-                *(_added_cell(name, its.meta.get(name) if its else None) for name in added),
+                *(_added_cell(its.added.get(name) if its else None) for name in added),
                 used,
             )
             for used, group in ((True, campaign.sessions), (False, campaign.failures))
@@ -111,17 +112,13 @@ def _added_column(name: str) -> Column:
     """Column of metadata that users added, with the unit that its name ends in."""
     unit = unit_of(name)
     words = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return Column(f"{words} ({unit})" if unit else words, f"meta_{name}", WORDS)
+    return Column(f"{words} ({unit})" if unit else words, f"{META_PREFIX}{name}", WORDS)
 
 
-def _added_cell(name: str, text: str | None) -> Cell:
-    """Show a value as the file has it; for programs it is a number if its name has a unit."""
-    if text is None:
+def _added_cell(value: float | str | None) -> Cell:
+    if value is None:
         return Cell(None, ABSENT)
-    try:
-        return Cell(float(text) if unit_of(name) else text, text)
-    except ValueError:
-        return Cell(text, text)
+    return Cell(value, value if isinstance(value, str) else f"{value:g}")
 
 
 def sessions_welch_table(campaign: CampaignResult) -> Table:

@@ -13,14 +13,16 @@ from analysis.report._campaign_text import campaign_text
 from analysis.report._document import document_text
 from analysis.report._folder import write_new
 from analysis.report._table import csv_text
+from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
     from analysis.campaigns import CampaignResult
+    from analysis.results import FigureFormat
 
 
 def write_campaign(
@@ -28,6 +30,7 @@ def write_campaign(
     folder: Path,
     *,
     with_paper: bool = False,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> None:
     """Write the page ``report.html``, every figure and every table.
@@ -39,6 +42,8 @@ def write_campaign(
         An existing folder without these files.
     with_paper : bool
         Whether the paper's numbers stand beside these.
+    formats : sequence of str
+        Formats of the figures.
     on_step : callable, optional
         Called with a figure's name after each.
 
@@ -49,15 +54,12 @@ def write_campaign(
     """
     from analysis.report import _style as style
     from analysis.report._campaign_page import campaign_page
-    from analysis.report._page import Picture
 
     pictures = []
     for name, (draw, description) in _figures(campaign).items():
         with style.styled():
             figure = draw()
-            png = style.save(figure, folder / f"{name}.png")
-            svg = style.save_svg(figure, folder / f"{name}.svg")
-        pictures.append(Picture(name, description, png, svg))
+            pictures.append(style.save_picture(figure, folder / name, description, formats))
         on_step(f"figure {name}")
     for name, table in all_tables(campaign, with_paper=with_paper).items():
         write_new(folder / f"{name}.csv", csv_text(table))

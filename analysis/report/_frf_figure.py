@@ -43,7 +43,7 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     head_in = 1.0 + 0.2 * legend_rows
     height_in = 3.75 * rows + 1.15 + head_in
     figure = style.new_figure(
-        width_in, height_in, f"{analysis.record.path.name} — frequency response",
+        width_in, height_in, "Frequency response by Welch's method",
         f"coupling torque over motor angle  ·  {_estimate_text(analysis)}  ·  "
         "MSE, WMSE in (N·m/rad)²",
     )  # fmt: skip

@@ -63,13 +63,11 @@ _NARROWEST: Final = 0.006
 """Least half of a detail, relative to the mode's frequency."""
 
 
-def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure:
+def frf_figure(measured: FrequencyResponse, fit: RecordFit) -> Figure:
     """Draw magnitude, phase, the band's width, and a detail of every mode.
 
     Parameters
     ----------
-    name : str
-        What the title calls the record.
     measured : FrequencyResponse
         Ratio of the whole record's transforms, with the delay between the channels in it.
     fit : RecordFit
@@ -81,14 +79,10 @@ def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure
     seen = measured.response * np.exp(
         2j * np.pi * fit.parameters["delay_s"] * measured.frequency_hz
     )
-    figure = style.new_figure(
-        11.0, 8.2, f"{name} — frequency response",
-        f"coupling torque over motor angle  ·  measured: empirical transfer function estimate, "
-        f"delay removed  ·  model: type {fit.structure.name}",
-    )  # fmt: skip
+    figure = style.new_figure(9.0, 6.4)
     count = max(len(shown), 1)
     grid = figure.add_gridspec(
-        2, count, left=0.075, right=0.985, top=0.885, bottom=0.06, hspace=0.25, wspace=0.2,
+        2, count, left=0.085, right=0.985, top=0.95, bottom=0.075, hspace=0.27, wspace=0.22,
         height_ratios=(3.4, 1.0),
     )  # fmt: skip
     whole = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
@@ -131,7 +125,7 @@ def frf_figure(name: str, measured: FrequencyResponse, fit: RecordFit) -> Figure
         if column == 0:
             detail.set_ylabel("Magnitude (dB)")
     figure.legend(
-        *magnitude.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.925),
+        *magnitude.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.995),
         ncols=3, borderaxespad=0.0,
     )  # fmt: skip
     return figure
@@ -181,7 +175,6 @@ _SPAN: Final = 300.0
 
 
 def loss_figure(
-    name: str,
     fit: RecordFit,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
@@ -192,8 +185,6 @@ def loss_figure(
 
     Parameters
     ----------
-    name : str
-        What the title calls the record.
     fit : RecordFit
         With the modes that are drawn.
     axis_hz : tuple of float
@@ -204,12 +195,8 @@ def loss_figure(
         Orders that the data do not support: then the total is not split into its parts.
     """
     modes = fit.modes
-    figure = style.new_figure(
-        11.0, 4.8, f"{name} — loss factor",
-        f"type {fit.structure.name}  ·  shaded: 95 % bands  ·  points: twice the damping ratio of "
-        f"each mode with its 95 % interval  ·  grey: {_grey(withheld)}",
-    )  # fmt: skip
-    axes = figure.add_axes((0.075, 0.105, 0.91, 0.70))
+    figure = style.new_figure(9.0, 3.6)
+    axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
     drawn = _curves(axes, fit, axis_hz, supported_hz, withheld)
     if modes:
         axes.errorbar(
@@ -231,17 +218,10 @@ def loss_figure(
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         figure.legend(
-            handles, labels, loc="upper left", bbox_to_anchor=(0.075, 0.875), ncols=4,
+            handles, labels, loc="upper right", bbox_to_anchor=(0.985, 0.99), ncols=4,
             borderaxespad=0.0,
         )  # fmt: skip
     return figure
-
-
-def _grey(withheld: Collection[str]) -> str:
-    """Say what the shaded parts of the axis are."""
-    if withheld:
-        return "not drawn, an order that the data do not support would decide there"
-    return "outside the modes, extrapolated; no curve where nothing was excited"
 
 
 def _curves(
@@ -294,24 +274,18 @@ _STRETCHES: Final = 120
 """At most: a short record has fewer independent values."""
 
 
-def residual_figure(name: str, analysis: RecordAnalysis, fit: RecordFit) -> Figure:
+def residual_figure(analysis: RecordAnalysis, fit: RecordFit) -> Figure:
     """Draw the residual's spectrum, its cumulative periodogram, and its power in time.
 
     Parameters
     ----------
-    name : str
-        What the title calls the record.
     analysis : RecordAnalysis
         That the fit belongs to.
     fit : RecordFit
     """
-    figure = style.new_figure(
-        11.0, 6.4, f"{name} — residual",
-        f"measured torque minus that of the model, type {fit.structure.name}  ·  sum of squares "
-        f"{fit.cost:.6g} for {fit.degrees_of_freedom} degrees of freedom",
-    )  # fmt: skip
+    figure = style.new_figure(9.0, 4.8)
     grid = figure.add_gridspec(
-        2, 2, left=0.075, right=0.985, top=0.855, bottom=0.075, hspace=0.42, wspace=0.17,
+        2, 2, left=0.085, right=0.985, top=0.94, bottom=0.095, hspace=0.45, wspace=0.19,
     )  # fmt: skip
     _spectrum(figure.add_subplot(grid[0, :]), analysis, fit)
     _cumulative(figure.add_subplot(grid[1, 0]), analysis, fit)
@@ -432,23 +406,24 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     """Draw the figures one after the other; within `style.styled`."""
     from analysis.report._signal_figures import signals_figure
 
-    name, highest_hz, shown = whole.record.path.name, whole.band_hz[1], whole.visible_modes
+    highest_hz, shown = whole.band_hz[1], whole.visible_modes
     # Details and lines are of modes that the record shows, not of what the model adds.
     fit = replace(whole.fit, modes=tuple(m for m in whole.fit.modes if m.number in shown))
     modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in whole.fit.modes)
     frf, loss, residual, signals = FIGURES
     measured = measured_response(whole)
+    model = f"the model (type {whole.headline.name})"
     yield Illustration(
         frf,
-        frf_figure(name, measured, whole.fit),
-        f"Frequency response from motor angle to coupling torque: magnitude and phase as measured "
-        f"and of the model, half-width of the model's 95 % band, and details of the modes ({modes} "
-        "Hz). The band is narrower than the line where it is not seen.",
+        frf_figure(measured, whole.fit),
+        "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
+        f"(empirical transfer function estimate, delay removed) and of {model}; half-width of the "
+        f"model's 95 % band; details of the modes ({modes} Hz). The band is narrower than the line "
+        "where it is not seen.",
     )
     yield Illustration(
         loss,
         loss_figure(
-            name,
             fit,
             (float(measured.frequency_hz[0]), highest_hz),
             supported_band_hz(whole),
@@ -458,33 +433,38 @@ def illustrations(whole: WholeRecord) -> Iterator[Illustration]:
     )
     yield Illustration(
         residual,
-        residual_figure(name, whole.analysis, fit),
-        "What the model leaves of the torque: its spectrum beside what was taken for noise; its "
-        "cumulative periodogram, which stays in the shaded range in 95 of 100 records or more if "
-        "only noise is left; and its power through the record. Excess at a mode or at one time "
-        "is what the model lacks.",
+        residual_figure(whole.analysis, fit),
+        f"Residual of the torque, measured minus that of {model}: its spectrum beside the noise "
+        "model; its cumulative periodogram, which stays in the shaded range in 95 of 100 records "
+        "or more if only noise is left; and its power through the record. Excess at a mode or at "
+        f"one time is what the model lacks. Sum of squares {fit.cost:.6g} for "
+        f"{fit.degrees_of_freedom} degrees of freedom.",
     )
     yield Illustration(
         signals,
         signals_figure(whole.record, fit, highest_hz),
-        "Motor angle, coupling torque as measured and as the model makes it of the measured angle, "
-        "and their difference; below, where each mode rings most.",
+        f"Motor angle; coupling torque from 0 to {highest_hz:g} Hz, measured and as {model} "
+        f"predicts it from the measured angle (fit {whole.analysis.fit_percent(whole.fit):.2f} % "
+        "NRMSE); residual; below, where each mode rings most.",
     )
 
 
 def _loss_description(whole: WholeRecord) -> str:
+    shown = (
+        "Loss factor against frequency with 95 % bands, type "
+        f"{whole.headline.name}; points: twice the damping ratio of each mode with its 95 % "
+        "interval. "
+    )
     if whole.withheld:
-        return (
-            "Loss factor of all damping against frequency with its 95 % band, and at each mode "
-            "that shows (points: twice its damping ratio). It is drawn between these modes only, "
-            "and not split into internal and external: elsewhere, and for either part, the result "
-            "would follow from an order that the data do not support."
+        return shown + (
+            "It is of all damping, not split into internal and external, and drawn between the "
+            "modes that show only: elsewhere (grey), and for either part, an order that the data "
+            "do not support would decide."
         )
-    return (
-        "Loss factor of internal, external and all damping against frequency with 95 % bands; at a "
-        "mode it is about twice the damping ratio (points). Between the modes the model "
-        "interpolates, outside them it extrapolates; where the torque does not stand out of the "
-        "noise nothing is drawn."
+    return shown + (
+        "At a mode the loss factor is about twice the damping ratio. Between the modes the model "
+        "interpolates, outside them (grey) it extrapolates; where the torque does not stand out of "
+        "the noise nothing is drawn."
     )
 
 

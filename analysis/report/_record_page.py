@@ -6,7 +6,10 @@ import hashlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from markupsafe import Markup
+
 from analysis.models import ESTIMATOR_WORDS
+from analysis.report._equation import definitions, equations, mathml, types_table
 from analysis.report._page import page, versions
 from analysis.report._text import damping_sentences
 
@@ -16,7 +19,8 @@ if TYPE_CHECKING:
 
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
-    from analysis.report._page import Facts, Picture
+    from analysis.report._page import Facts
+    from analysis.report._style import Picture
     from analysis.report._table import Table
     from analysis.results import RecordResult, WholeRecord
 
@@ -64,6 +68,9 @@ def record_page(
         experiments=whole.verdict.experiments,
         warnings=result.warnings,
         pictures=pictures,
+        equations=[Markup(mathml(each)) for each in equations(whole)],
+        definitions=definitions(whole),
+        types=types_table(whole),
         modes=modes,
         tables=tables,
         paper_pictures=paper_pictures,

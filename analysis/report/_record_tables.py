@@ -64,8 +64,8 @@ def modes_table(whole: WholeRecord) -> Table:
             Column("std (Hz)", "frequency_std_hz"),
             Column("Damping ratio (%)", "damping_ratio"),
             Column("std (%)", "damping_ratio_std"),
-            Column("95 % from (%)", "damping_ratio_low"),
-            Column("to (%)", "damping_ratio_high"),
+            Column("95 % from (%)", "damping_ratio_low_95"),
+            Column("to (%)", "damping_ratio_high_95"),
         ),
         rows,
         (
@@ -85,9 +85,9 @@ def parameters_table(whole: WholeRecord) -> Table:
     told = whole.headline
     combined = combined_parameters(whole)
     including_scales = (
-        Column("", "combined_std_si"),
-        Column("with scales: from", "combined_low_si"),
-        Column("to", "combined_high_si"),
+        Column("", "combined_std"),
+        Column("with scales: from", "combined_low_95"),
+        Column("to", "combined_high_95"),
     )
     return Table.of(
         "parameters",
@@ -96,10 +96,10 @@ def parameters_table(whole: WholeRecord) -> Table:
             Column("Parameter", "parameter", WORDS),
             Column("Meaning", "meaning", WORDS),
             Column("Unit", "unit", WORDS),
-            Column("Value", "value_si"),
-            Column("std", "std_si"),
-            Column("95 % from", "low_si"),
-            Column("to", "high_si"),
+            Column("Value", "value"),
+            Column("std", "std"),
+            Column("95 % from", "low_95"),
+            Column("to", "high_95"),
             *(including_scales if combined else ()),
             Column("Remark", "remark", WORDS),
         ),
@@ -127,8 +127,8 @@ def sizes_table(whole: WholeRecord) -> Table:
             Column("Value", "value"),
             Column("std", "std"),
             Column("std (%)", "relative_std"),
-            Column("95 % from", "low"),
-            Column("to", "high"),
+            Column("95 % from", "low_95"),
+            Column("to", "high_95"),
         ),
         (_size_row(told, each) for each in told.sizes),
         (
@@ -151,7 +151,7 @@ def condition_table(whole: WholeRecord) -> Table | None:
         free = told.parameters[name]
         rows.append(
             (
-                symbol,
+                Cell(name, symbol),
                 _unit_cell(unit),
                 *estimate((each.value, *_ends(each)), each.std, factor),
                 *estimate((free.value, *_ends(free)), free.std, factor),
@@ -163,12 +163,12 @@ def condition_table(whole: WholeRecord) -> Table | None:
         (
             Column("Parameter", "parameter", WORDS),
             Column("Unit", "unit", WORDS),
-            Column("Then", "value_si"),
-            Column("95 % from", "low_si"),
-            Column("to", "high_si"),
-            Column("Free", "free_value_si"),
-            Column("95 % from", "free_low_si"),
-            Column("to", "free_high_si"),
+            Column("Then", "value"),
+            Column("95 % from", "low_95"),
+            Column("to", "high_95"),
+            Column("Free", "free_value"),
+            Column("95 % from", "free_low_95"),
+            Column("to", "free_high_95"),
         ),
         rows,
         ("The intervals on the left hold only if what is taken for granted is true.",),
@@ -187,8 +187,10 @@ def correlations_table(whole: WholeRecord) -> Table:
             *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
         ),
         (
-            (symbol, *(_correlation(i == j, value) for j, value in enumerate(row)))
-            for i, (symbol, row) in enumerate(zip(symbols, fit.correlation.tolist(), strict=True))
+            (Cell(name, symbol), *(_correlation(i == j, value) for j, value in enumerate(row)))
+            for i, (name, symbol, row) in enumerate(
+                zip(fit.determined, symbols, fit.correlation.tolist(), strict=True)
+            )
         ),
         ("Of ζ, γ, ρ/EI and EI the logarithms. Bold: 0.9 or more.",),
     )
@@ -206,7 +208,13 @@ def _parameter_row(
     if each.flag is not None:
         shown = (marked(shown[0]), *map(greyed, shown[1:]))
     fixed = name not in told.fit.interval and name != "drag"
-    return (symbol, meaning, _unit_cell(unit), *shown, "fixed" if fixed else each.flag or "")
+    return (
+        Cell(name, symbol),
+        meaning,
+        _unit_cell(unit),
+        *shown,
+        "fixed" if fixed else each.flag or "",
+    )
 
 
 _SI: Final = {"µs": "s", "ms": "s", "g": "kg", "mm": "m", "ppm": "1", "%": "1"}
@@ -580,8 +588,8 @@ def amplitude_tables(whole: WholeRecord) -> tuple[Table, ...]:
                 Column("Tip amplitude (mm)", "tip_amplitude_m", ".3g", 1e3),
                 Column("Damping ratio (%)", "damping_ratio"),
                 Column("std (%)", "damping_ratio_std"),
-                Column("95 % from (%)", "damping_ratio_low"),
-                Column("to (%)", "damping_ratio_high"),
+                Column("95 % from (%)", "damping_ratio_low_95"),
+                Column("to (%)", "damping_ratio_high_95"),
             ),
             rows,
             ("Amplitude 0 is the beam without air, as in the table of the modes.",),

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.report._bands import response_band
 from analysis.report._folder import OutputError, OutputExistsError
-from analysis.report._text import tables_text
+from analysis.report._text import analysis_tables, as_text, damping_sentences, record_tables
 from rigd.session import read_session, read_timings
 from rigd.view import (
     COHERENCE_AXIS,
@@ -20,6 +21,8 @@ from rigd.view import (
     ORANGE,
     PHASE_AXIS,
     PURPLE,
+    SKY_BLUE,
+    TIMELINE,
     VERMILION,
     Chart,
     Color,
@@ -34,10 +37,11 @@ from rigd.view import (
     new_rrd_file,
     phase_deg,
     response_chart,
+    send_columns,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     import rerun.blueprint as rrb
@@ -45,12 +49,18 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from analysis.paper import FittedModel, WelchAnalysis
-    from analysis.results import RecordResult
+    from analysis.report._signal_figures import TorqueInBand
+    from analysis.results import RecordResult, WholeRecord
     from rigd.view import Axis
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
 
+RECORD: Final = "/whole_record"
+RECORD_TITLE: Final = "Whole record"
+VERDICT: Final = f"{RECORD}/verdict"
+VERDICT_PAGE: Final = "Verdict"
+TORQUE_PAGE: Final = "Torque"
 FITS: Final = "/fits"
 TITLE: Final = "Fits"
 TABLES: Final = f"{FITS}/tables"
@@ -67,6 +77,8 @@ _LINES: Final[dict[str, tuple[Color, float]]] = {"const": (ORANGE, 3.0), "omega"
 _MORE_LINES: Final = ((PURPLE, 1.5), (GREEN, 1.5), (ORANGE, 1.5))
 _MOST_IN_WORDS: Final = 2
 """Models whose keys on a narrow chart say that what they name are weights."""
+_SCALARS: Final = "Scalars:scalars"
+"""Rerun's name of the values of a plot."""
 _GROUPS: Final = 400
 """Groups of points along the axis, two kept per group: enough for the pixels of a view."""
 
@@ -105,10 +117,27 @@ class Graph:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Charts that are seen together: a wide one over two narrow ones."""
+    """Charts that are seen together: a wide one over two narrow ones.
+
+    Attributes
+    ----------
+    title
+        Title of the tab.
+    graphs
+        Charts, the wide one first.
+    frequency_hz
+        Frequencies of all curves, shape (n,).
+    band_hz
+        Ends of the axes.
+    """
 
     title: str
     graphs: tuple[Graph, Graph, Graph]
+    frequency_hz: Real
+    band_hz: tuple[float, float]
+
+
+# Welch fits
 
 
 def pages(analysis: WelchAnalysis) -> tuple[Page, ...]:
@@ -131,7 +160,7 @@ def line_keys(weightings: tuple[str, ...]) -> dict[str, Key]:
 
 
 def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
-    """Draw all pages, which are the same at any time of the session.
+    """Draw all pages of the Welch fits, which are the same at any time of the session.
 
     Parameters
     ----------
@@ -142,36 +171,43 @@ def draw(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
     stream
         Takes the drawings.
     """
-    import rerun as rr
+    for page in pages(analysis):
+        _draw_page(page, stream)
+    _draw_text(TABLES, f"```\n{tables}\n```", stream)
 
-    thinning = Thinning.logarithmic(
-        analysis.response.frequency_hz, *analysis.settings.band_hz, _GROUPS
-    )
-    for graph in (graph for page in pages(analysis) for graph in page.graphs):
+
+def tab(analysis: WelchAnalysis) -> rrb.Container:
+    """Return the tab of the Welch fits, with a tab in it for each page and for the tables."""
+    import rerun.blueprint as rrb
+
+    tables = rrb.TextDocumentView(name=TABLES_PAGE, origin=TABLES)
+    return rrb.Tabs(*map(_page_view, pages(analysis)), tables, name=TITLE)
+
+
+def _draw_page(page: Page, stream: RecordingStream) -> None:
+    thinning = Thinning.logarithmic(page.frequency_hz, *page.band_hz, _GROUPS)
+    for graph in page.graphs:
         graph.chart.draw_frame(stream)
         for order, curve in enumerate(graph.curves):
             strips = thinning.strips(curve.values)
             graph.chart.draw_curve(
                 stream, curve.name, strips, curve.key, static=True, dotted=curve.dotted, order=order
             )
-    stream.log(
-        TABLES,
-        rr.TextDocument(f"```\n{tables}\n```", media_type=rr.MediaType.MARKDOWN),
-        static=True,
-    )
 
 
-def tab(analysis: WelchAnalysis) -> rrb.Container:
-    """Return the tab of the fits, with a tab in it for each page and for the tables."""
-    import rerun.blueprint as rrb
+def _draw_text(entity: str, text: str, stream: RecordingStream) -> None:
+    import rerun as rr
 
+    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    stream.log(entity, document, static=True)
+
+
+def _page_view(page: Page) -> rrb.Container:
     def view(graph: Graph) -> rrb.Spatial2DView:
         chart = graph.chart
         return chart_view(graph.title, chart.entity, (chart.width, chart.height))
 
-    contents = [chart_page(*map(view, page.graphs), name=page.title) for page in pages(analysis)]
-    tables = rrb.TextDocumentView(name=TABLES_PAGE, origin=TABLES)
-    return rrb.Tabs(*contents, tables, name=TITLE)
+    return chart_page(*map(view, page.graphs), name=page.title)
 
 
 def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
@@ -201,6 +237,8 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> Page:
                 (Curve("coherence", COHERENCE_KEY, coherence),),
             ),
         ),
+        response.frequency_hz,
+        band_hz,
     )
 
 
@@ -256,6 +294,8 @@ def _type_page(analysis: WelchAnalysis, name: str, magnitude: Axis, looks: dict[
                 ),
             ),
         ),
+        analysis.response.frequency_hz,
+        band_hz,
     )
 
 
@@ -264,9 +304,12 @@ def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
 
     It is the same on all pages, so that types can be compared at a glance.
     """
-    measured = analysis.response.response
-    responses = [measured, *(model.response for model in analysis.models)]
-    shown = [measured, *(measured - model.response for model in analysis.models)]
+    return _axis_of(analysis.response.response, [model.response for model in analysis.models])
+
+
+def _axis_of(measured: Complex, models: Sequence[Complex]) -> Axis:
+    responses = [measured, *models]
+    shown = [measured, *(measured - model for model in models)]
     return magnitude_axis(
         min(float(np.nanquantile(magnitude_db(values), 0.02)) for values in shown),
         max(float(np.nanmax(magnitude_db(values))) for values in responses) + 3.0,
@@ -278,6 +321,190 @@ def _plain(weighting: str) -> str:
     return "model_" + "".join(c if c.isalnum() else "_" for c in weighting)
 
 
+# Whole record
+
+_MOST_LABELS: Final = 5
+"""On either side of 0, in half the height of a window."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """Curves over the session's time, in one view.
+
+    Attributes
+    ----------
+    entity
+        Where Rerun keeps them.
+    title
+        Title of the view, with the unit.
+    names, colors, widths
+        Of each line, from the lowest to the topmost.
+    values
+        Makes of the torque the lines' values (n, lines).
+    """
+
+    entity: str
+    title: str
+    names: tuple[str, ...]
+    colors: tuple[Color, ...]
+    widths: tuple[float, ...]
+    values: Callable[[TorqueInBand], Real]
+
+
+_OVER_TIME: Final = (
+    Lines(
+        f"{RECORD}/torque",
+        "Coupling torque in the band of the fit (N·m)",
+        ("measured (N·m)", "model (N·m)"),
+        (SKY_BLUE, ORANGE),
+        (2.5, 1.0),
+        lambda torque: np.column_stack((torque.measured, torque.modelled)),
+    ),
+    Lines(
+        f"{RECORD}/residual",
+        "Residual, measured − model (mN·m)",
+        ("residual (mN·m)",),
+        (VERMILION,),
+        (1.0,),
+        lambda torque: 1e3 * torque.residual[:, None],
+    ),
+)
+
+
+def record_page(whole: WholeRecord) -> Page:
+    """Return response and residual of the fit that the numbers are of.
+
+    Measured is the ratio of the whole record's transforms, without the delay that was found.
+    """
+    from analysis.report._record_figures import measured_response
+
+    found = measured_response(whole)
+    grid_hz = found.frequency_hz
+    turned = np.exp(2j * np.pi * whole.fit.parameters["delay_s"] * grid_hz)
+    measured, model = found.response * turned, response_band(whole.fit, grid_hz).response
+    band_hz = float(grid_hz[0]), float(grid_hz[-1])
+    magnitude = _axis_of(measured, [model])
+    key, name = Key(f"model, type {whole.headline.name}", ORANGE, 2.0), "model"
+    short = replace(key, label="model")
+    entity = f"{RECORD}/response"
+    return Page(
+        "Response",
+        (
+            Graph(
+                f"Magnitude of torque over angle, whole record, type {whole.headline.name}",
+                response_chart(f"{entity}/magnitude", _WIDE, band_hz, magnitude, MEASURED_KEY, key),
+                (
+                    Curve("measured", MEASURED_KEY, magnitude_db(measured)),
+                    Curve(name, key, magnitude_db(model)),
+                ),
+            ),
+            Graph(
+                "Phase",
+                response_chart(f"{entity}/phase", _HALF, band_hz, PHASE_AXIS, MEASURED_KEY, short),
+                (
+                    Curve("measured", MEASURED_KEY, phase_deg(measured), dotted=True),
+                    Curve(name, key, phase_deg(model)),
+                ),
+            ),
+            Graph(
+                "Residual, measured − model",
+                response_chart(f"{entity}/residual", _HALF, band_hz, magnitude, _SIZE_DB, short),
+                (
+                    Curve("measured", _SIZE_DB, magnitude_db(measured)),
+                    Curve(name, key, magnitude_db(measured - model)),
+                ),
+            ),
+        ),
+        grid_hz,
+        band_hz,
+    )
+
+
+def draw_record(
+    whole: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
+) -> None:
+    """Draw what the whole record gave: verdict, response, and torque over time.
+
+    Parameters
+    ----------
+    whole
+        Whose selected fit is drawn.
+    torque
+        Torque of the record and of that fit.
+    tables
+        Its tables, as plain text.
+    stream
+        Takes the drawings.
+    """
+    said = [
+        *(f"**{sentence}**" for sentence in damping_sentences(whole.headline)),
+        *whole.verdict.sentences,
+        *(f"* {advice}" for advice in whole.verdict.experiments),
+    ]
+    _draw_text(VERDICT, "\n\n".join((*said, f"```\n{tables}\n```")), stream)
+    _draw_page(record_page(whole), stream)
+    t_ns = np.round(1e9 * whole.record.time_s).astype(np.int64)
+    for lines in _OVER_TIME:
+        send_columns(stream, lines.entity, t_ns, {_SCALARS: lines.values(torque)})
+
+
+def record_tab(whole: WholeRecord, torque: TorqueInBand) -> rrb.Container:
+    """Return the tab of the whole record, with a tab in it for each of these."""
+    import rerun.blueprint as rrb
+
+    end_s = float(whole.record.time_s[-1])
+    return rrb.Tabs(
+        rrb.TextDocumentView(name=VERDICT_PAGE, origin=VERDICT),
+        _page_view(record_page(whole)),
+        rrb.Vertical(
+            *(
+                _lines_view(each, end_s, float(np.abs(each.values(torque)).max()))
+                for each in _OVER_TIME
+            ),
+            name=TORQUE_PAGE,
+        ),
+        name=RECORD_TITLE,
+    )
+
+
+def _lines_view(lines: Lines, end_s: float, largest: float) -> rrb.TimeSeriesView:
+    """Return a view of the whole session, wherever its time stands."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    start = rrb.TimeRangeBoundary.absolute(seconds=0.0)
+    end = rrb.TimeRangeBoundary.absolute(seconds=end_s)
+    look = rr.SeriesLines(
+        names=lines.names,
+        colors=lines.colors,
+        widths=lines.widths,
+        # The default averages what falls on one pixel, and so understates peaks.
+        aggregation_policy="MinMax",
+    )
+    return rrb.TimeSeriesView(
+        name=lines.title,
+        origin=lines.entity,
+        overrides={lines.entity: look},
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(lines.names) > 1),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+        axis_y=rrb.ScalarAxis(range=_span(largest)),
+        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
+    )
+
+
+def _span(largest: float) -> tuple[float, float]:
+    """Return the ends of an axis about 0 on which Rerun labels more than that.
+
+    It labels multiples of a power of ten, where there is room for all of them.
+    """
+    step = 10.0 ** np.floor(np.log10(max(largest, 1e-12)))
+    end = 1.1 * largest if largest < _MOST_LABELS * step else 11.0 * step
+    return -end, end
+
+
+# File
+
+
 def check_rerun_file(path: Path) -> None:
     """Raise OutputExistsError if a path is taken, or is no name of such a file."""
     try:
@@ -287,12 +514,11 @@ def check_rerun_file(path: Path) -> None:
 
 
 def write_rerun_file(result: RecordResult, path: Path) -> None:
-    """Write the session in the layout of the live view, and its fits in front of it.
+    """Write the session in the layout of the live view, and in front of it what was found in it.
 
     Parameters
     ----------
     result : RecordResult
-        With Welch fits.
     path : Path
         A new file, ``….rrd``.
 
@@ -305,13 +531,22 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     """
     from rigd.view import draw_session
 
-    analysis = result.welch
-    assert analysis is not None
+    whole, welch, tabs = result.whole, result.welch, []
+    if whole is not None:
+        from analysis.report._signal_figures import torque_in_band
+
+        torque = torque_in_band(whole.record, whole.fit.plant, whole.band_hz[1])
+        tabs.append(record_tab(whole, torque))
+    if welch is not None:
+        tabs.append(tab(welch))
     session = read_session(result.record.path)
     timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
-            draw_session(stream, session, timings, front=[tab(analysis)])
-            draw(analysis, tables_text(result), stream)
+            draw_session(stream, session, timings, front=tabs)
+            if whole is not None:
+                draw_record(whole, torque, as_text(record_tables(whole)), stream)
+            if welch is not None:
+                draw(welch, as_text(analysis_tables(result)), stream)
     except RrdFileError as error:
         raise OutputError(str(error)) from None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import Measurement, Prediction
 from analysis.paper import band_limited, loudest_moment_s, modelled_torque
@@ -147,19 +148,13 @@ def signals_figure(record: Record, fit: RecordFit, highest_hz: float) -> Figure:
         for number, moment in enumerate(resonance_moments(found, max(modes, default=0)), start=1)
         if number in modes
     )
-    rms = float(np.sqrt(np.mean(torque.residual**2)))
-    share = rms / float(np.sqrt(np.mean(torque.measured**2)) or np.nan)
-    figure = style.new_figure(
-        11.0, 8.4, f"{record.path.name} — signals",
-        f"torque from 0 to {highest_hz:g} Hz  ·  model: type {fit.structure.name}, its response to "
-        f"the measured angle  ·  residual {1e3 * rms:.3g} mN·m rms, {100 * share:.3g} % of the "
-        "torque",
-    )  # fmt: skip
+    figure = style.new_figure(9.0, 6.8)
     grid = figure.add_gridspec(
-        4, len(moments) or 1, left=0.075, right=0.985, top=0.875, bottom=0.06, hspace=0.42,
-        wspace=0.2, height_ratios=(1.1, 1.3, 0.8, 1.2),
+        2, len(moments) or 1, left=0.095, right=0.985, top=0.91, bottom=0.07, hspace=0.3,
+        wspace=0.25, height_ratios=(4.0, 1.2),
     )  # fmt: skip
-    angle, whole, rest = (figure.add_subplot(grid[row, :]) for row in range(3))
+    upper = grid[0, :].subgridspec(3, 1, hspace=0.4, height_ratios=(1.1, 1.3, 0.8))
+    angle, whole, rest = (figure.add_subplot(upper[row]) for row in range(3))
     of_angle = (
         (1e3 * record.reference_rad, {"color": style.ORANGE, "label": "reference angle"}),
         (1e3 * record.angle_rad, _THIN | {"color": style.PURPLE, "label": "measured angle"}),
@@ -177,13 +172,14 @@ def signals_figure(record: Record, fit: RecordFit, highest_hz: float) -> Figure:
     mark(angle, moments)
     compared = (torque.measured, torque.modelled, torque.residual)
     for column, moment in enumerate(moments):
-        axes = figure.add_subplot(grid[3, column])
+        axes = figure.add_subplot(grid[1, column])
+        axes.xaxis.set_major_locator(MaxNLocator(4))
         _detail(axes, record, zip(compared, _CLOSE, strict=True), column, moment, _TORQUE)
         axes.set_xlabel("Time (s)", labelpad=1)
     handles = [handle for axes in (angle, whole, rest) for handle in axes.get_lines()]
     figure.legend(
         handles, [str(handle.get_label()) for handle in handles], loc="upper right",
-        bbox_to_anchor=(0.985, 0.93), ncols=5, borderaxespad=0.0,
+        bbox_to_anchor=(0.985, 0.995), ncols=5, borderaxespad=0.0,
     )  # fmt: skip
     return figure
 
@@ -245,7 +241,7 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
     ]
     if record.gaps.missing_ticks:
         parts.append(f"{record.gaps.missing_ticks} missing ticks interpolated")
-    figure = style.new_figure(13.0, 8.0, f"{record.path.name} — signals", "  ·  ".join(parts))
+    figure = style.new_figure(13.0, 8.0, "Signals", "  ·  ".join(parts))
     columns = max(len(moments), 1)
     grid = figure.add_gridspec(
         4, columns, left=0.06, right=0.985, top=0.88, bottom=0.065, hspace=0.58, wspace=0.17,
@@ -295,7 +291,7 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     residual = measured - modelled
     share = _rms(residual) / _rms(measured) if measured.any() else np.nan
     figure = style.new_figure(
-        13.0, 8.0, f"{record.path.name} — torque, measured and modelled",
+        13.0, 8.0, "Torque, measured and modelled",
         f"type {model.fit.structure.name}, weights {model.fit.weighting} (lowest WMSE)  ·  exact "
         f"model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  residual "
         f"{1e3 * _rms(residual):.3g} mN·m rms, {100 * share:.3g} % of the torque, the bias of "

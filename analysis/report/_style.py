@@ -6,10 +6,12 @@ lie on each other differ in dash as well as in colour.
 
 from __future__ import annotations
 
+import base64
 import io
 import logging
 import warnings
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -19,13 +21,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
 from analysis.report._folder import write_new
+from analysis.results import FIGURE_FORMATS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
+
+    from analysis.results import FigureFormat
 
 # Of its cache of fonts, which is slow to make or just being made by another process: no figure
 # suffers, and nobody who reads it in a log can tell.
@@ -43,8 +48,13 @@ SHADE: Final = "#F0E9D8"
 
 DPI: Final = 150
 _COMPRESSION: Final = 1
-_SVG: Final[dict[Any, Any]] = {"svg.fonttype": "none", "svg.hashsalt": "rigd"}
-_NO_METADATA: Final = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+_VECTOR: Final[dict[Any, Any]] = {
+    "svg.fonttype": "none", "svg.hashsalt": "rigd", "pdf.fonttype": 42,
+}  # fmt: skip
+_NO_METADATA: Final = {
+    "svg": dict.fromkeys(("Creator", "Date", "Format", "Type")),
+    "pdf": dict.fromkeys(("Creator", "CreationDate", "Producer")),
+}
 COLUMNS: Final = 1000
 """Columns into which a line is decimated: as many as a full-width panel has pixels on a screen."""
 
@@ -90,10 +100,15 @@ def styled() -> Iterator[None]:
         yield
 
 
-def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> Figure:
-    """Figure on the Agg canvas with a bold title and a grey line under it, small enough to fit."""
+def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str = "") -> Figure:
+    """Figure on the Agg canvas with a bold title and a grey line under it, small enough to fit.
+
+    A figure that goes into a paper has none of either: its caption says what is seen.
+    """
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
+    if not title:
+        return figure
     left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
     # A file name may hold dollar signs, which are not mathematics, and bytes that are no text.
     common: dict[str, Any] = {"va": "top", "parse_math": False}
@@ -109,8 +124,62 @@ def new_figure(width_in: float, height_in: float, title: str, subtitle: str) -> 
     return figure
 
 
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure of a page.
+
+    Attributes
+    ----------
+    name : str
+        Name of its file, without the ending.
+    description : str
+        What is seen in it, for those who do not see it, and as its caption.
+    png : bytes
+        Content of its file.
+    svg : bytes or None
+        The same as SVG, if there is one.
+    """
+
+    name: str
+    description: str
+    png: bytes
+    svg: bytes | None = None
+
+    @property
+    def source(self) -> str:
+        """The figure itself, in the place of an address.
+
+        SVG, which can be searched and is sharp on paper, but of a figure with very many strokes,
+        such as many sessions' responses.
+        """
+        kind, content = "png", self.png
+        if self.svg is not None and len(self.svg) < 2 * len(self.png):
+            kind, content = "svg+xml", self.svg
+        return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def rendered(figure: Figure, kind: FigureFormat) -> bytes:
+    """Render a figure as PNG, SVG or PDF; within `styled`.
+
+    Parameters
+    ----------
+    figure : Figure
+    kind : {"png", "svg", "pdf"}
+        SVG has its text as text, and the same identifiers each time; PDF embeds TrueType fonts,
+        as journals ask for.
+    """
+    buffer = io.BytesIO()
+    if kind == "png":
+        # Fast compression: a tenth more bytes for a quarter of the time.
+        figure.savefig(buffer, format=kind, dpi=DPI, pil_kwargs={"compress_level": _COMPRESSION})
+    else:
+        with rc_context(_VECTOR):
+            figure.savefig(buffer, format=kind, metadata=_NO_METADATA[kind])
+    return buffer.getvalue()
+
+
 def save(figure: Figure, path: Path) -> bytes:
-    """Write a figure as PNG; within `styled`.
+    """Write a figure in the format that the ending of its file names; within `styled`.
 
     Parameters
     ----------
@@ -128,20 +197,37 @@ def save(figure: Figure, path: Path) -> bytes:
     OutputError
         If it cannot be written, or is there already.
     """
-    buffer = io.BytesIO()
-    # Fast compression: a tenth more bytes for a quarter of the time.
-    figure.savefig(buffer, format="png", dpi=DPI, pil_kwargs={"compress_level": _COMPRESSION})
-    write_new(path, buffer.getvalue())
-    return buffer.getvalue()
+    (kind,) = (each for each in FIGURE_FORMATS if path.suffix == f".{each}")
+    content = rendered(figure, kind)
+    write_new(path, content)
+    return content
 
 
-def save_svg(figure: Figure, path: Path) -> bytes:
-    """Write a figure as SVG, likewise: text as text, and the same identifiers each time."""
-    buffer = io.BytesIO()
-    with rc_context(_SVG):
-        figure.savefig(buffer, format="svg", metadata=_NO_METADATA)
-    write_new(path, buffer.getvalue())
-    return buffer.getvalue()
+def save_picture(
+    figure: Figure, stem: Path, description: str, formats: Collection[FigureFormat]
+) -> Picture:
+    """Write a figure in several formats, and return it for a page; within `styled`.
+
+    Parameters
+    ----------
+    figure : Figure
+    stem : Path
+        New files without their endings.
+    description : str
+        What is seen in it.
+    formats : collection of str
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written, or is there already.
+    """
+    wanted: set[FigureFormat] = {"png", "svg", *formats}
+    content = {kind: rendered(figure, kind) for kind in FIGURE_FORMATS if kind in wanted}
+    for kind in formats:
+        # A name may have dots of its own.
+        write_new(stem.with_name(f"{stem.name}.{kind}"), content[kind])
+    return Picture(stem.name, description, content["png"], content["svg"])
 
 
 def envelope(

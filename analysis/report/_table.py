@@ -1,4 +1,4 @@
-"""A table, described once, and what it is on the terminal, in CSV and in JSON.
+"""A table, described once, and what it is on the terminal, in LaTeX, in CSV and in JSON.
 
 For a page the template's macro `table` makes it, from the same cells.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -221,6 +222,98 @@ def terminal_table(table: Table) -> rich.table.Table:
         ends = table.grouped and row[0].text != rows[min(place + 1, len(rows) - 1)][0].text
         shown.add_row(*cells, end_section=ends, style="bold" if place == table.selected else "")
     return shown
+
+
+_LETTERS: Final = {
+    "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "Δ": "Delta", "ε": "varepsilon",
+    "ζ": "zeta", "κ": "kappa", "λ": "lambda", "µ": "mu", "ξ": "xi", "π": "pi", "ρ": "rho",
+    "τ": "tau", "ω": "omega", "·": "cdot", "±": "pm", "∝": "propto", "‖": "Vert",
+    "ŷ": "hat{y}",
+}  # fmt: skip
+_ESCAPED: Final = {
+    **{each: f"\\{each}" for each in "&%#_{}$"},
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "†": r"\dag{}", "‡": r"\ddag{}",
+    "–": "--",
+}  # fmt: skip
+_RAISED: Final = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+_PIECES: Final = re.compile(
+    r"(?P<digits>\d+(?:\.\d+)?)e(?P<power>[+-]?\d+)|\^(?P<up>[^\W⁰¹²³⁴⁵⁶⁷⁸⁹]+)"
+    rf"|(?P<raised>[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+)|(?P<letter>[{''.join(_LETTERS)}])(?P<index>\d*)"
+    r"|(?P<minus>−)|(?P<stiffness>\bEI\b)|(?P<other>.)",
+    re.DOTALL,
+)
+
+
+def latex_text(text: str) -> str:
+    r"""Write a cell's text for LaTeX: letters of formulas as mathematics, the rest escaped.
+
+    Parameters
+    ----------
+    text : str
+
+    Examples
+    --------
+    >>> from analysis.report._table import latex_text
+    >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
+    $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
+    """
+    found = "".join(map(_latex_piece, _PIECES.finditer(text)))
+    return found.replace("$$", "")
+
+
+def _latex_piece(piece: re.Match[str]) -> str:
+    part = piece.groupdict()
+    if part["power"]:
+        digits = "" if part["digits"] == "1" else rf"{part['digits']} \cdot "
+        return f"${digits}10^{{{int(part['power'])}}}$"
+    if part["up"]:
+        up = "".join(f"\\{_LETTERS[each]} " if each in _LETTERS else each for each in part["up"])
+        return f"$^{{{up.rstrip()}}}$"
+    if part["raised"]:
+        return f"$^{{{part['raised'].translate(_RAISED)}}}$"
+    if part["letter"]:
+        index = f"_{{{part['index']}}}" if part["index"] else ""
+        return rf"$\{_LETTERS[part['letter']]}{index}$"
+    if part["minus"] or part["stiffness"]:
+        return "$-$" if part["minus"] else "$EI$"
+    return _ESCAPED.get(part["other"], part["other"])
+
+
+def latex_table(table: Table) -> str:
+    r"""Write a table as LaTeX's ``table``, with the rules of the package booktabs.
+
+    A column without an entry is left out; notes stand under the table.
+
+    Parameters
+    ----------
+    table : Table
+    """
+    filled = [
+        place
+        for place, _column in enumerate(table.shown_columns)
+        if any(row[place].text for row in table.shown_rows)
+    ]
+    columns = [table.shown_columns[place] for place in filled]
+    alignment = "".join("r" if column.numeric else "l" for column in columns)
+    lines = [
+        r"\begin{table}",
+        r"  \centering",
+        rf"  \caption{{{latex_text(table.caption)}}}",
+        rf"  \label{{tab:{table.name}}}",
+        rf"  \begin{{tabular}}{{@{{}}{alignment}@{{}}}}",
+        r"    \toprule",
+        f"    {' & '.join(latex_text(column.heading) for column in columns)} \\\\",
+        r"    \midrule",
+        *(
+            f"    {' & '.join(latex_text(row[place].text) for place in filled)} \\\\"
+            for row in table.shown_rows
+        ),
+        r"    \bottomrule",
+        r"  \end{tabular}",
+        *(rf"  \par\footnotesize {latex_text(note)}" for note in table.notes),
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def number(value: float | None, form: str = ".4g", factor: float = 1.0) -> Cell:

@@ -141,6 +141,13 @@ def record_text(whole: WholeRecord) -> RenderableType:
         Text(f"{whole.record.path.name}: verdict", style="italic"),
         *(Padding(sentence, (0, 0, 0, 2)) for sentence in said),
         "",
+        record_tables(whole),
+    )
+
+
+def record_tables(whole: WholeRecord) -> RenderableType:
+    """Return the modes, the sizes of the damping and the parameters of one record."""
+    return Group(
         *spaced(
             (
                 *(
@@ -149,7 +156,7 @@ def record_text(whole: WholeRecord) -> RenderableType:
                 ),
                 *tables.amplitude_tables(whole),
             )
-        ),
+        )
     )
 
 

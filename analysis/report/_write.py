@@ -7,22 +7,28 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
+from analysis.report._equation import equations, latex
 from analysis.report._folder import write_new
-from analysis.report._table import Table, csv_text
+from analysis.report._table import Table, csv_text, latex_table
 from analysis.report._text import tables_text
+from analysis.results import DEFAULT_FORMATS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from analysis.paper import WelchAnalysis
-    from analysis.results import RecordResult, WholeRecord
+    from analysis.report._style import Picture
+    from analysis.results import FigureFormat, RecordResult, WholeRecord
 
-_WELCH_FIGURE: Final = "frf"
 _WELCH_DESCRIPTION: Final = (
     "Frequency response by Welch's method, as in the paper, with the fits of each type and "
     "weighting, and the coherence."
 )
+
+
+_FOR_PAPERS: Final = ("modes", "parameters")
+"""Tables that are there for LaTeX, too."""
 
 
 def _write_page(
@@ -31,32 +37,26 @@ def _write_page(
     folder: Path,
     on_step: Callable[[str], None],
     made_at: datetime | None,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
+    paper_pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write ``report.html``, ``figures/*.png`` and ``.svg``, and ``tables/*.csv``.
-
-    The paper's figure ``frf.png`` is shown in the page if it is there.
-    """
+    """Write ``report.html``, ``figures/`` and ``tables/``."""
     from analysis.report import _style as style
-    from analysis.report._page import Picture
     from analysis.report._record_figures import illustrations
     from analysis.report._record_page import record_page
 
     pictures = []
     with style.styled():
         for shown in illustrations(whole):
-            target = folder / "figures" / f"{shown.name}.png"
-            png = style.save(shown.figure, target)
-            svg = style.save_svg(shown.figure, target.with_suffix(".svg"))
-            pictures.append(Picture(shown.name, shown.description, png, svg))
+            stem = folder / "figures" / shown.name
+            pictures.append(style.save_picture(shown.figure, stem, shown.description, formats))
             on_step(f"figure {shown.name}")
     modes, of_record, of_paper = report_tables(result)
     for table in (modes, *of_record, *of_paper):
         write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
-    welch = folder / f"{_WELCH_FIGURE}.png"
-    paper_pictures = []
-    if result.welch is not None and welch.exists():
-        name = f"welch_{_WELCH_FIGURE}"
-        paper_pictures = [Picture(name, _WELCH_DESCRIPTION, welch.read_bytes())]
+        if table.name in _FOR_PAPERS:
+            write_new(folder / "tables" / f"{table.name}.tex", latex_table(table))
+    write_new(folder / "tables" / "model.tex", latex(equations(whole)))
     made_at = made_at or datetime.now().astimezone()
     text = record_page(result, pictures, modes, of_record, made_at, paper_pictures, of_paper)
     write_new(folder / "report.html", text)
@@ -83,8 +83,8 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
     return tables.modes_table(whole), of_record, of_paper
 
 
-_FIGURES: Final = ("signals", "frf", "torque")
-_FIGURES_BESIDE_RECORD: Final = ("frf",)
+_FIGURES: Final = ("welch_signals", "welch_frf", "welch_torque")
+_FIGURES_BESIDE_RECORD: Final = ("welch_frf",)
 """Figures of the Welch fits where the whole-record fit has its own of signals and torque."""
 
 
@@ -93,11 +93,12 @@ def write_report(
     folder: Path,
     on_step: Callable[[str], None] = lambda _done: None,
     made_at: datetime | None = None,
+    formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
 ) -> None:
-    """Write figures, ``tables.txt``, ``analysis.json`` and, of a whole record, a page.
+    """Write ``figures/``, ``tables.txt``, ``analysis.json`` and, of a whole record, a page.
 
-    The page ``report.html`` comes with ``figures/*.png`` and ``.svg`` and ``tables/*.csv``, in the
-    place of ``signals.png`` and ``torque.png``.
+    The page ``report.html`` comes with ``tables/``. Every file's name is in lower case with
+    underscores: ``figures/NAME.png``, ``.svg``, ``.pdf``; ``tables/NAME.csv``, ``.tex``.
 
     Parameters
     ----------
@@ -108,6 +109,8 @@ def write_report(
         Called with a few words after each figure.
     made_at : datetime, optional
         What the page calls its time; by default now.
+    formats : sequence of str
+        Formats of the figures.
 
     Raises
     ------
@@ -115,12 +118,13 @@ def write_report(
         If a file exists, or cannot be written.
     """
     whole = result.whole
+    pictures: list[Picture] = []
     if result.welch is not None:
         names = figures_of_paper(paper=True, whole_record=whole is not None)
-        _draw(result.welch, names, folder, on_step)
+        pictures = _draw(result.welch, names, folder / "figures", on_step, formats)
     write_new(folder / "tables.txt", tables_text(result))
     if whole is not None:
-        _write_page(result, whole, folder, on_step, made_at)
+        _write_page(result, whole, folder, on_step, made_at, formats, pictures)
     write_new(folder / "analysis.json", document_text(document([result])))
 
 
@@ -140,14 +144,21 @@ def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
 
 
 def _draw(
-    analysis: WelchAnalysis, names: Collection[str], folder: Path, on_step: Callable[[str], None]
-) -> None:
+    analysis: WelchAnalysis,
+    names: Sequence[str],
+    folder: Path,
+    on_step: Callable[[str], None],
+    formats: Sequence[FigureFormat],
+) -> list[Picture]:
     from analysis.report import _style as style
     from analysis.report._frf_figure import frf_figure
     from analysis.report._signal_figures import paper_signals_figure, torque_figure
 
-    drawn = {"signals": paper_signals_figure, "frf": frf_figure, "torque": torque_figure}
+    drawn = dict(zip(_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True))
+    pictures = []
     for name in names:
         with style.styled():
-            style.save(drawn[name](analysis), folder / f"{name}.png")
+            figure = drawn[name](analysis)
+            pictures.append(style.save_picture(figure, folder / name, _WELCH_DESCRIPTION, formats))
         on_step(f"figure {name}")
+    return pictures

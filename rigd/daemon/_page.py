@@ -111,6 +111,8 @@ class PageProcess:
                 env=os.environ | SINGLE_THREADED,
             )
         self._process = process
+        if self._closing.is_set():
+            process.kill()
         assert process.stdin is not None
         assert process.stdout is not None
         with process:

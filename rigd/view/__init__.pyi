@@ -33,8 +33,10 @@ from ._plots import OF_REAL_TIME as OF_REAL_TIME
 from ._plots import ORANGE as ORANGE
 from ._plots import PURPLE as PURPLE
 from ._plots import SKY_BLUE as SKY_BLUE
+from ._plots import TIMELINE as TIMELINE
 from ._plots import VERMILION as VERMILION
 from ._plots import Color as Color
+from ._plots import send_columns as send_columns
 from ._recorded import draw_session as draw_session
 from ._recorded import recorded_blueprint as recorded_blueprint
 from ._rrd_file import SUFFIX as SUFFIX

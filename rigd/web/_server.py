@@ -39,7 +39,6 @@ _LINGERING_S: Final = 1.0
 _GAUGES_S: Final = 0.095
 _RESPONSE_S: Final = 1.0
 _GRACE_S: Final = 0.3
-_NICENESS: Final = 5
 _AT_WORK: Final = ("running", "stopping")
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
@@ -312,7 +311,6 @@ def run_page() -> None:
     Standard output gets one line: the port, or why there is no page.
     """
     ignore()
-    os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
         asyncio.run(_run(job))

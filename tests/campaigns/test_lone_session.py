@@ -50,7 +50,7 @@ def test_a_file_given_twice_is_called_that(run_here, short_sessions, tmp_path):
     result = run_here("ok.mcap", "./ok.mcap", "--method", "welch", "--report", "r")
     assert result.returncode == 1
     assert errors(result) == ["Error: ok.mcap: the file is given more than once, and counts once."]
-    assert (tmp_path / "r" / "frf.png").exists()
+    assert (tmp_path / "r" / "figures" / "welch_frf.png").exists()
 
 
 def test_one_whole_record_of_several_sessions_is_ranked_by_itself(make_estimate, make_session):

@@ -92,7 +92,7 @@ def test_every_how_to_from_a_session_to_what_becomes_of_it_runs_as_written(start
             assert_went_well(process)
     assert len(list((tmp_path / "sessions").glob("*.mcap"))) == 6
     for report in ("one_look", "another_look"):
-        assert (tmp_path / report / "frf.png").stat().st_size > 50_000
+        assert (tmp_path / report / "figures" / "welch_frf.png").stat().st_size > 50_000
 
     (hold,) = (tmp_path / "sessions").glob("*-hold.mcap")
     tear(hold, tmp_path / "torn" / re.search(r"rigd recover (\S+)", recover)[1])

@@ -50,9 +50,9 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert result.stderr == ""
     report = tmp_path / "session.report"
     assert sorted(path.name for path in report.iterdir()) == [
-        "SHA256SUMS", "analysis.json", "figures", "frf.png", "report.html", "tables", "tables.txt",
+        "SHA256SUMS", "analysis.json", "figures", "report.html", "tables", "tables.txt",
     ]  # fmt: skip
-    for picture in (report / "frf.png", *(report / "figures").glob("*.png")):
+    for picture in (report / "figures").glob("*.png"):
         assert np.asarray(Image.open(picture).convert("L")).std() > 10
     content = json.loads((tmp_path / "fits.json").read_text())
     assert content == json.loads((report / "analysis.json").read_text())
@@ -97,7 +97,7 @@ def test_json_on_standard_output_is_alone_there(session, tmp_path):
         (t, w, "hv") for t in ("VI", "III") for w in ("omega", "omega^-0.5")
     ]  # fmt: skip
     assert "Fits to Welch's estimate" in result.stderr
-    assert (tmp_path / "out" / "signals.png").exists()
+    assert (tmp_path / "out" / "figures" / "welch_signals.png").exists()
 
 
 def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
@@ -118,8 +118,8 @@ def test_several_files_with_one_that_fails(session, tmp_path, analyze_here):
     # A report never lands on one that is there.
     assert (before / "frf.png").read_text() == "mine"
     assert [path.name for path in before.iterdir()] == ["frf.png"]
-    assert (tmp_path / "session.report-2" / "frf.png").stat().st_size > 10_000
-    assert (tmp_path / "other.report" / "frf.png").stat().st_size > 10_000
+    assert (tmp_path / "session.report-2" / "figures" / "welch_frf.png").stat().st_size > 10_000
+    assert (tmp_path / "other.report" / "figures" / "welch_frf.png").stat().st_size > 10_000
 
 
 def broken_file(kind, path, good):
@@ -191,7 +191,6 @@ def test_nan_in_the_record_is_refused(write_session, short_signals, tmp_path, an
         (("--weights", "omega^1e308"), ("omega^1e308",)),
         (("--method", "recrod"), ("there is no 'recrod'; choose from welch, record, all.",)),
         (("--method", "record", "b.mcap"), ("--method", "Tables 3 to 5", "add --each")),
-        (("--method", "record", "--rerun", "a.rrd"), ("--rerun", "take --method all")),
         (("--frf", "h3"), ("there is no 'h3'; choose from h1, h2, hv, iv, fft.",)),
         (("--band", "nan,50"), ("--band", "nan,50")),
         (("--band", "50,1"), ("--band", "0 <= F0 < F1")),
@@ -373,15 +372,17 @@ def test_help_and_wrong_options_import_nothing_heavy(tmp_path):
 
 
 @pytest.mark.parametrize("files", [["a.mcap"], ["a.mcap", "b.mcap"]])
-def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, files):
-    fixed = []
+def test_options_of_one_record_hold_in_a_campaign_too(monkeypatch, files):
+    fixed, formats = [], []
 
     def run(_files, routes, *_):
         fixed.append(routes.fixed)
+        formats.append(routes.figures)
         return 0
 
     def campaign(*_, **options):
         fixed.append(options["fixed"])
+        formats.append(options["formats"])
         return 0
 
     monkeypatch.setattr("analysis.cli.app.session_command", run)
@@ -389,6 +390,13 @@ def test_what_is_fixed_is_fixed_in_one_record_and_in_a_campaign(monkeypatch, fil
     result = CliRunner().invoke(app, [*files, "--fix", "tool_inertia_kg_m2, delay_s"])
     assert result.exit_code == 0, result.output
     assert fixed == [("delay_s", "tool_inertia_kg_m2")]
+    assert formats == [("png", "svg")]
+    result = CliRunner().invoke(app, [*files, "--figures", "pdf, png"])
+    assert formats[1:] == [("png", "pdf")], result.output
+    for wrong in ("tiff", ","):
+        result = CliRunner().invoke(app, [*files, "--figures", wrong])
+        assert result.exit_code == 2
+        assert "choose from png, svg, pdf" in result.output
     result = CliRunner().invoke(app, [*files, "--fix", "inertia"])
     assert result.exit_code == 2
     assert "there is no inertia; choose from density_over_stiffness" in result.output

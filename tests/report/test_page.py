@@ -17,9 +17,9 @@ from analysis.identify._headline import Simpler
 from analysis.report import _style as style
 from analysis.report._document import finite, record_entries
 from analysis.report._folder import OutputExistsError
-from analysis.report._page import Picture
 from analysis.report._record_figures import FIGURES, illustrations
 from analysis.report._record_page import record_page
+from analysis.report._style import Picture
 from analysis.report._text import damping_sentences
 from analysis.report._write import _write_page, report_tables
 
@@ -88,7 +88,7 @@ def test_it_is_one_well_formed_document(source, read_page):
     identifiers = [a["id"] for _, a in read_page.attributes if "id" in a]
     assert len(identifiers) == len(set(identifiers))
     used = {a["href"].removeprefix("#") for _, a in read_page.attributes if "href" in a}
-    assert used == {"verdict", "figures", "tables", "paper", "how"}
+    assert used == {"verdict", "figures", "model", "tables", "paper", "how"}
     assert used <= set(identifiers)
 
 
@@ -136,9 +136,10 @@ def test_figures_of_the_page_are_the_files_and_their_text_is_text(report, read_p
     assert {"Coupling torque", "Frequency (Hz)", "total", "Mode 1"} <= words
 
 
-def test_a_figure_stands_in_the_page_in_its_smaller_format():
-    assert Picture("name", "seen", b"png", b"longer").source == "data:image/png;base64,cG5n"
-    assert Picture("name", "seen", b"longer", b"svg").source == "data:image/svg+xml;base64,c3Zn"
+def test_a_figure_stands_in_the_page_as_svg_unless_that_is_far_larger():
+    longer = b"twice or more"
+    assert Picture("name", "seen", b"png", longer).source == "data:image/png;base64,cG5n"
+    assert Picture("name", "seen", b"png", b"svg").source == "data:image/svg+xml;base64,c3Zn"
 
 
 def test_the_verdict_comes_first_with_its_intervals(read_page, record_result):
@@ -190,7 +191,7 @@ def open_table(report, name):
 
 def test_csv_and_page_hold_the_same_numbers(report, read_page, record_result):
     modes, tables, of_paper = report_tables(record_result)
-    assert {path.stem for path in (report / "tables").iterdir()} == {
+    assert {path.stem for path in (report / "tables").glob("*.csv")} == {
         table.name for table in (modes, *tables, *of_paper)
     }
     for table in (modes, *tables, *of_paper):
@@ -209,9 +210,9 @@ def test_what_is_shown_is_the_number_rounded(record_result):
         for cell, factor in zip(row, shown["modes"], strict=True):
             assert float(cell.text) == pytest.approx(factor * cell.value, rel=0.06)
     (zeta, alpha, *_) = tables[1].rows
-    assert zeta["value_si"].text == f"{1e5 * zeta['value_si'].value:.2f}"
-    assert alpha["value_si"].text == f"{alpha['value_si'].value:.4f}"
-    assert len(alpha["std_si"].text.lstrip("0.")) == 2  # significant digits of a deviation
+    assert zeta["value"].text == f"{1e5 * zeta['value'].value:.2f}"
+    assert alpha["value"].text == f"{alpha['value'].value:.4f}"
+    assert len(alpha["std"].text.lstrip("0.")) == 2  # significant digits of a deviation
     welch = {(row["type"], row["weighting"]): row for row in of_paper[0].rows}
     for model in record_result.welch.models:
         row = welch[model.fit.structure.name, model.fit.weighting]
@@ -266,9 +267,9 @@ def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
     _modes, tables, _ = report_tables(retold(record_result, headline=told))
     (table,) = [table for table in tables if table.name == "on_condition"]
     assert "If α = 1 is taken for granted: type VII" in table.caption
-    row = {row["parameter"]: row for row in table.rows}["ζ"]
-    assert row["value_si"].value == record_result.whole.fits["VII"].parameters["zeta"]
-    assert row["free_value_si"].value == record_result.whole.fits["VI"].parameters["zeta"]
+    row = {row["parameter"].text: row for row in table.rows}["ζ"]
+    assert row["value"].value == record_result.whole.fits["VII"].parameters["zeta"]
+    assert row["free_value"].value == record_result.whole.fits["VI"].parameters["zeta"]
 
 
 def test_a_band_that_begins_beyond_a_mode_is_drawn(record_result):

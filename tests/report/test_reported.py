@@ -15,9 +15,9 @@ from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._bands import excited_band_hz, supported_band_hz
 from analysis.report._document import document
-from analysis.report._page import Picture
 from analysis.report._record_figures import illustrations
 from analysis.report._record_page import record_page
+from analysis.report._style import Picture
 from analysis.report._table import MARK, Cell, csv_text, unreported
 from analysis.report._text import damping_sentences, record_text, tables_text
 from analysis.report._write import report_tables
@@ -47,15 +47,15 @@ def test_an_order_takes_its_coefficient_with_it():
 
 def test_tables_mark_every_such_number_and_no_other(careful):
     modes, (_sizes, parameters, _correlations, structures), (welch, _peaks) = report_tables(careful)
-    shown = {row["parameter"]: row for row in parameters.rows}
+    shown = {row["parameter"].text: row for row in parameters.rows}
     for symbol, name in (("ζ", "zeta"), ("α", "alpha")):
-        number = shown[symbol]["value_si"]
+        number = shown[symbol]["value"]
         assert (number.value, number.doubtful) == (careful.whole.fit.parameters[name], True)
         assert MARK in number.text
         assert shown[symbol]["remark"] == REASON
-    assert [shown["α"][end].value for end in ("low_si", "high_si")] == [0.9, 1.2]
-    assert shown["λ"]["value_si"].value == careful.whole.fit.parameters["lambda"]
-    assert MARK not in shown["λ"]["value_si"].text
+    assert [shown["α"][end].value for end in ("low_95", "high_95")] == [0.9, 1.2]
+    assert shown["λ"]["value"].value == careful.whole.fit.parameters["lambda"]
+    assert MARK not in shown["λ"]["value"].text
     unsupported = ("zeta", "zeta_std", "alpha", "alpha_std")
     for table in (structures, welch):
         for row in table.rows:

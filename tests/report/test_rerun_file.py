@@ -1,5 +1,6 @@
 """`analyze --rerun`: the session as `rigd replay` shows it, and the fits on charts."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +8,13 @@ import pytest
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
+from analysis.identify import ResponseGrid
 from analysis.models import WelchSettings
 from analysis.paper._route import analyse
 from analysis.record import load_record
 from analysis.report import _rerun_file as fit_charts
 from analysis.report._folder import OutputError
+from analysis.report._record_figures import measured_response
 from analysis.report._rerun_file import write_rerun_file
 from analysis.results import RecordResult
 from rigd.cli.app import app as rigd
@@ -158,8 +161,6 @@ def test_the_estimate_of_the_fits_is_shown_with_its_coherence(paper_analysis, wr
 
 
 def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper_file, written):
-    from rerun.chunk import RrdReader
-
     chunks, path = written
     assert sum(b.num_rows for b in chunks["/signals"]) == len(read_session(paper_file).samples)
     text = value(chunks["/fits/tables"], "TextDocument:text")[0]
@@ -169,16 +170,79 @@ def test_it_has_the_session_the_numbers_and_a_tab_for_each(paper_analysis, paper
         if (m.fit.structure.name, m.fit.weighting) == ("VI", "omega")
     )
     assert f"{best.indices.wmse:.4g}" in text
+    tabs = titles(path)
+    assert {"Fits", "Measured", "Type I", "Type III", "Type VI", "Tables", "Overview"} <= tabs
+    assert any(f"WMSE {best.indices.wmse:.3g}" in tab for tab in tabs)
+
+
+@pytest.fixture(scope="module")
+def of_record(record_result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("rerun") / "record.rrd"
+    write_rerun_file(replace(record_result, welch=None), path)
+    return read(path), path
+
+
+def test_the_whole_record_s_model_and_residual_lie_over_the_measured_response(
+    record_result, of_record
+):
+    chunks, _ = of_record
+    whole = record_result.whole
+    found = measured_response(whole)
+    grid_hz, delay_s = found.frequency_hz, whole.fit.parameters["delay_s"]
+    measured = found.response * np.exp(2j * np.pi * delay_s * grid_hz)
+    plant = replace(whole.fit.plant, delay_s=0.0)
+    model = ResponseGrid(2j * np.pi * grid_hz).evaluate(plant, ())[0]
+    for chart, name, expected, tolerance in (
+        ("magnitude", "measured", decibels(measured), 1.0),
+        ("magnitude", "model", decibels(model), 0.2),
+        ("phase", "model", degrees(model), 2.0),
+        ("residual", "model", decibels(measured - model), 1.0),
+    ):
+        entity = f"/whole_record/response/{chart}"
+        assert_on_curve(chunks, entity, name, grid_hz, expected, tolerance)
+
+
+def test_torque_model_and_residual_run_over_the_session(record_result, of_record):
+    chunks, _ = of_record
+    record = record_result.record
+    torque, residual = (
+        np.concatenate(
+            [b.column("Scalars:scalars").to_pylist() for b in chunks[f"/whole_record/{name}"]]
+        )
+        for name in ("torque", "residual")
+    )
+    assert torque.shape == (record.time_s.size, 2)
+    np.testing.assert_allclose(residual[:, 0], 1e3 * (torque[:, 0] - torque[:, 1]), atol=1e-9)
+    # Noise is left, and the model explains the rest.
+    assert residual.std() < 0.1 * 1e3 * torque[:, 0].std()
+    times = np.concatenate(
+        [b.column("session_time").to_numpy() for b in chunks["/whole_record/torque"]]
+    )
+    np.testing.assert_allclose(times.astype(np.int64), 1e9 * record.time_s, atol=1)
+
+
+def test_the_verdict_is_read_first(record_result, of_record):
+    chunks, path = of_record
+    text = value(chunks["/whole_record/verdict"], "TextDocument:text")[0]
+    for sentence in record_result.whole.verdict.sentences:
+        assert sentence in text
+    assert "Modes with locked hub" in text
+    assert [name for name in titles(path) if name in ("Whole record", "Fits")] == ["Whole record"]
+
+
+def titles(path):
+    """Titles of tabs and views in the layout of a recording."""
+    from rerun.chunk import RrdReader
+
     reader = RrdReader(path)
     (layout,) = reader.blueprints()
-    tabs = set()
+    found = set()
     for chunk in reader.stream(store=layout):
         batch = chunk.to_record_batch()
         for name in ("ContainerBlueprint:display_name", "ViewBlueprint:display_name"):
             if name in batch.schema.names:
-                tabs |= {title for row in batch.column(name).to_pylist() for title in row or ()}
-    assert {"Fits", "Measured", "Type I", "Type III", "Type VI", "Tables", "Overview"} <= tabs
-    assert any(f"WMSE {best.indices.wmse:.3g}" in tab for tab in tabs)
+                found |= {title for row in batch.column(name).to_pylist() for title in row or ()}
+    return found
 
 
 def test_weightings_of_ones_own_and_an_estimate_without_coherence(paper_file, tmp_path):
@@ -217,7 +281,7 @@ def run(application, *arguments):
 
 def test_the_command_writes_it_and_never_over_another(session, tmp_path, monkeypatch):
     # The figures take longer than all the rest, and are tested elsewhere.
-    monkeypatch.setattr("analysis.report.write_report", lambda *_: None)
+    monkeypatch.setattr("analysis.report.write_report", lambda *_, **__: None)
     out = tmp_path / "new" / "fits.rrd"
     quick = ("--types", "I", "--weights", "const", "--method", "welch", "--segment", "1000")
     done = run(app, session, *quick, "--rerun", out)

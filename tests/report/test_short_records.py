@@ -39,7 +39,9 @@ def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
     assert {fit["estimator"] for fit in content["fits"]} == {"welch", "record"}
     assert "cut short" in " ".join(content["files"][0]["warnings"])
     figures = {path.name for path in (tmp_path / "r" / "figures").glob("*.png")}
-    assert figures == {"record_frf.png", "loss_factor.png", "residual.png", "record_signals.png"}
+    assert figures == {
+        "record_frf.png", "loss_factor.png", "residual.png", "record_signals.png", "welch_frf.png",
+    }  # fmt: skip
 
 
 def test_too_short_for_the_whole_record_is_told(cut, analyze_here):

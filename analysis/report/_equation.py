@@ -1,0 +1,258 @@
+"""The model of a record as an equation with the terms that were selected, as MathML and LaTeX."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from analysis.models import STRUCTURES
+from analysis.report._table import ABSENT, WORDS, Column, Table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from analysis.identify import RecordFit
+    from analysis.models import Structure
+    from analysis.results import WholeRecord
+
+
+class Formula(NamedTuple):
+    """One formula in two languages: presentation MathML without its root, and LaTeX."""
+
+    mathml: str
+    tex: str
+
+    def __add__(self, other: object) -> Formula:
+        """Set one behind the other."""
+        if not isinstance(other, Formula):
+            return NotImplemented
+        return Formula(self.mathml + other.mathml, f"{self.tex} {other.tex}")
+
+    @property
+    def row(self) -> Formula:
+        """The formula as one argument of another."""
+        return Formula(f"<mrow>{self.mathml}</mrow>", f"{{{self.tex}}}")
+
+
+def _name(letter: str, tex: str = "") -> Formula:
+    return Formula(f"<mi>{letter}</mi>", tex or letter)
+
+
+def _sign(text: str, tex: str = "") -> Formula:
+    return Formula(f"<mo>{text}</mo>", tex or text)
+
+
+def _number(text: str) -> Formula:
+    return Formula(f"<mn>{text}</mn>", text)
+
+
+def _power(base: Formula, exponent: Formula) -> Formula:
+    up = exponent.row
+    return Formula(f"<msup>{base.row.mathml}{up.mathml}</msup>", f"{base.tex}^{up.tex}")
+
+
+def _indexed(base: Formula, index: Formula) -> Formula:
+    down = index.row
+    return Formula(f"<msub>{base.row.mathml}{down.mathml}</msub>", f"{base.tex}_{down.tex}")
+
+
+def _over(above: Formula, below: Formula) -> Formula:
+    a, b = above.row, below.row
+    return Formula(f"<mfrac>{a.mathml}{b.mathml}</mfrac>", rf"\frac{a.tex}{b.tex}")
+
+
+def _of(function: str, argument: Formula) -> Formula:
+    """Apply a function whose name has several letters to an argument in brackets."""
+    word = Formula(f"<mi>{function}</mi><mo>&#x2061;</mo>", rf"\{function}")
+    return _joined(word, _OPEN, argument, _CLOSE)
+
+
+def _joined(*parts: Formula) -> Formula:
+    return reduce(Formula.__add__, parts)
+
+
+_S: Final = _name("s")
+_L: Final = _name("L")
+_G: Final = _name("G")
+_EI: Final = _name("E") + _name("I")
+_BETA: Final = _name("β", r"\beta")
+_ZETA, _ALPHA = _name("ζ", r"\zeta"), _name("α", r"\alpha")
+_GAMMA, _LAMBDA = _name("γ", r"\gamma"), _name("λ", r"\lambda")
+_PLUS, _MINUS, _IS = _sign("+"), _sign("−", "-"), _sign("=")
+_OPEN, _CLOSE = _sign("("), _sign(")")
+_ONE, _TWO = _number("1"), _number("2")
+_OF_S: Final = _OPEN + _S + _CLOSE
+
+
+def _term(coefficient: Formula, order: Formula, *, integer: bool) -> Formula:
+    return coefficient + (_S if integer else _power(_S, order))
+
+
+def _elastic(structure: Structure) -> Formula | None:
+    """``1 + zeta s^alpha`` with what the structure has of it; None without internal damping."""
+    if not structure.internal:
+        return None
+    return _joined(_ONE, _PLUS, _term(_ZETA, _ALPHA, integer="alpha" not in structure.free))
+
+
+def _inertial(structure: Structure) -> Formula:
+    inertia = _over(_name("ρ", r"\rho"), _EI) + _power(_S, _TWO)
+    if not structure.external:
+        return inertia
+    return _joined(inertia, _PLUS, _term(_GAMMA, _LAMBDA, integer="lambda" not in structure.free))
+
+
+def _of_beam(structure: Structure) -> tuple[Formula, Formula]:
+    """Eq. 25 with its beta."""
+    elastic, z = _elastic(structure), _BETA + _L
+    sin, cos, sinh, cosh = (_of(name, z) for name in ("sin", "cos", "sinh", "cosh"))
+    stiffness = _EI if elastic is None else _joined(_EI, _OPEN, elastic, _CLOSE)
+    above = _joined(sin, cosh, _MINUS, cos, sinh)
+    below = _joined(_ONE, _PLUS, cos, cosh)
+    response = _joined(_G, _OF_S, _IS, _MINUS, stiffness, _BETA, _over(above, below))
+    inertial = _inertial(structure)
+    loaded = (_OPEN + inertial + _CLOSE) if elastic is None else _over(inertial, elastic)
+    return response, _joined(_power(_BETA, _number("4")), _IS, _MINUS, loaded)
+
+
+def _measured(fit: RecordFit) -> Formula:
+    """Torque over angle as measured: beam, clamp and channels."""
+    beam = _G + _OF_S
+    names = fit.parameters
+    if any(name.startswith("stiffness_offset") for name in names):
+        i = _name("i")
+        some = Formula(
+            f"<munder><mo>∑</mo>{i.row.mathml}</munder>", rf"\sum_{i.row.tex}"
+        ) + _indexed(_G, i)
+        beam = _joined(_OPEN, beam, _PLUS, some, _OF_S, _CLOSE)
+    if "root_compliance_rad_per_nm" in names:
+        beam = _over(beam, _joined(_ONE, _PLUS, _name("c"), beam))
+    inside = _joined(beam, _PLUS, _name("J"), _power(_S, _TWO))
+    late = _power(_name("e"), _joined(_MINUS, _name("τ", r"\tau"), _S))
+    found = _joined(_sign("[", r"\left["), inside, _sign("]", r"\right]"), late)
+    time = _name("T") + _S
+    if "filter_time_constant_s" in names:
+        found += _over(_ONE, _joined(_ONE, _PLUS, time))
+    if "second_order_filter_time_constant_s" in names:
+        root = Formula(f"<msqrt>{_TWO.mathml}</msqrt>", r"\sqrt{2}")
+        square = _power(_name("T"), _TWO) + _power(_S, _TWO)
+        found += _over(_ONE, _joined(_ONE, _PLUS, root, time, _PLUS, square))
+    torque = _indexed(_name("Γ", r"\Gamma"), Formula("<mtext>coup</mtext>", r"\mathrm{coup}"))
+    angle = _indexed(_name("Θ", r"\Theta"), _name("m"))
+    return _joined(_over(torque + _OF_S, angle + _OF_S), _IS, found)
+
+
+def equations(whole: WholeRecord) -> tuple[Formula, ...]:
+    """Write the model of the fit that the headline is of.
+
+    Parameters
+    ----------
+    whole : WholeRecord
+
+    Returns
+    -------
+    tuple of Formula
+        What was measured, Eq. 25 of the paper, and its beta: with the terms that the structure has.
+    """
+    return _measured(whole.fit), *_of_beam(whole.fit.structure)
+
+
+_EXTRAS: Final = {
+    "stiffness_offset": "Gᵢ replaces mode i by one whose stiffness is 1 + δᵢ times as large",
+    "root_compliance_rad_per_nm": "c is the compliance of the clamp",
+    "tip_mass_kg": "G is that of a beam with the mass m at its tip",
+    "filter_time_constant_s": "T is the time constant of the torque channel's filter",
+    "second_order_filter_time_constant_s": "T is the reciprocal corner of the torque channel's "
+    "filter (Butterworth)",
+    "clock_rate_difference": "the torque with the time stamp t is that of t (1 + ε)",
+    "drag": "the drag ½ ρ_air C_D d v |v| per length acts on the beam besides (ρ_air 1.2 kg/m³)",
+}
+
+
+def definitions(whole: WholeRecord) -> str:
+    """Say what the letters of the equations are that no table has.
+
+    Parameters
+    ----------
+    whole : WholeRecord
+    """
+    parts = [
+        "On the left coupling torque over motor angle, as transforms of Laplace",
+        f"L = {whole.record.beam.length_m:g} m is the length from the axis to the tip",
+        "powers of s are principal values",
+    ]
+    names = whole.headline.parameters
+    parts += [
+        words
+        for start, words in _EXTRAS.items()
+        if any(name == start or name.startswith(f"{start}_") for name in names)
+    ]
+    return f"{'; '.join(parts)}. The numbers are in the table of the parameters."
+
+
+def types_table(whole: WholeRecord) -> Table:
+    """Say what damping each type has: the terms, and how many parameters that is.
+
+    Parameters
+    ----------
+    whole : WholeRecord
+    """
+    words = {False: "fractional", True: "integer"}
+
+    def rows() -> Iterator[tuple[str, str, str, str]]:
+        for structure in STRUCTURES.values():
+            told, terms = [], []
+            for present, what, coefficient, order, symbol in (
+                (structure.internal, "internal", "ζ", "alpha", "α"),
+                (structure.external, "external", "γ", "lambda", "λ"),
+            ):
+                integer = order not in structure.free
+                terms.append(
+                    f"{coefficient} s{'' if integer else '^' + symbol}" if present else ABSENT
+                )
+                if present:
+                    told.append(f"{what} of {words[integer]} order")
+            yield structure.name, terms[0], terms[1], ", ".join(told)
+
+    return Table.of(
+        "types",
+        "Types of damping",
+        (
+            Column("Type", "type", WORDS),
+            Column("Internal", "internal", WORDS),
+            Column("External", "external", WORDS),
+            Column("Damping", "damping", WORDS),
+        ),
+        rows(),
+        (
+            "Internal damping multiplies EI by 1 + the term, external damping adds the term to "
+            'ρ/EI s². I to VI as in the paper, VII as its conclusions propose. "Modes free": each '
+            "mode with a stiffness of its own. The marked type is the one that the numbers are of.",
+        ),
+        selected=list(STRUCTURES).index(whole.fit.structure.name),
+    )
+
+
+def mathml(formula: Formula) -> str:
+    """Write a formula for a page, with its LaTeX as annotation.
+
+    Parameters
+    ----------
+    formula : Formula
+    """
+    return (
+        f'<math display="block"><semantics><mrow>{formula.mathml}</mrow>'
+        f'<annotation encoding="application/x-tex">{formula.tex}</annotation></semantics></math>'
+    )
+
+
+def latex(formulas: tuple[Formula, ...]) -> str:
+    r"""Write formulas as a block ``align`` of LaTeX's amsmath.
+
+    Parameters
+    ----------
+    formulas : tuple of Formula
+    """
+    lines = (each.tex.replace(" = ", " &= ", 1) for each in formulas)
+    body = " \\\\\n  ".join(lines)
+    return f"\\begin{{align}}\n  {body}\n\\end{{align}}\n"

@@ -1,0 +1,103 @@
+"""The model as an equation: the terms that were selected, in both languages, and what they mean."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from matplotlib.mathtext import MathTextParser
+
+from analysis.models import STRUCTURES
+from analysis.report._equation import definitions, equations, latex, mathml, types_table
+
+
+@pytest.fixture
+def told(record_result):
+    """Whole record whose numbers are of one type, and maybe of more parameters."""
+
+    def made(name, **extras):
+        whole = record_result.whole
+        fit = replace(
+            whole.fit,
+            structure=STRUCTURES[name],
+            parameters={**whole.fit.parameters, **extras},
+        )
+        headline = SimpleNamespace(parameters=fit.parameters)
+        return SimpleNamespace(fit=fit, headline=headline, record=whole.record)
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("name", "elastic", "inertial"),
+    [
+        ("I", r"( 1 + \zeta s )", ""),
+        ("II", "", r"+ \gamma s"),
+        ("III", r"( 1 + \zeta s )", r"+ \gamma s"),
+        ("IV", r"( 1 + \zeta s^{\alpha} )", ""),
+        ("V", "", r"+ \gamma s^{\lambda}"),
+        ("VI", r"( 1 + \zeta s^{\alpha} )", r"+ \gamma s^{\lambda}"),
+        ("VII", r"( 1 + \zeta s )", r"+ \gamma s^{\lambda}"),
+    ],
+)
+def test_the_terms_are_those_of_the_type(told, name, elastic, inertial):
+    _, response, beta = (each.tex for each in equations(told(name)))
+    assert response.startswith(f"G ( s ) = - E I {elastic}".rstrip() + r" \beta \frac{\sin")
+    assert (r"\zeta" in response) == (r"\zeta" in beta) == bool(elastic)
+    assert (r"\gamma" in beta) == bool(inertial)
+    assert rf"\frac{{\rho}}{{E I}} s^{{2}} {inertial}".rstrip() in beta
+
+
+@pytest.mark.parametrize(
+    ("extra", "tex", "words"),
+    [
+        ("root_compliance_rad_per_nm", r"\frac{G ( s )}{1 + c G ( s )}", "compliance of the clamp"),
+        ("stiffness_offset_2", r"\sum_{i} G_{i}", "1 + δᵢ times"),
+        ("filter_time_constant_s", r"\frac{1}{1 + T s}", "torque channel's filter"),
+        (
+            "second_order_filter_time_constant_s",
+            r"\frac{1}{1 + \sqrt{2} T s + T^{2} s^{2}}",
+            "Butterworth",
+        ),
+        ("tip_mass_kg", "G ( s )", "mass m at its tip"),
+        ("clock_rate_difference", "G ( s )", "t (1 + ε)"),
+        ("drag", "G ( s )", "½ ρ_air C_D d"),
+    ],
+)
+def test_what_was_fitted_beside_the_beam_stands_in_it(told, extra, tex, words):
+    found = told("VI", **{extra: 1e-3})
+    assert tex in equations(found)[0].tex
+    assert words in definitions(found)
+    assert words not in definitions(told("VI"))
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_both_languages_can_be_read(told, name):
+    extras = dict.fromkeys(("root_compliance_rad_per_nm", "stiffness_offset_2"), 1e-3)
+    for whole in (told(name), told(name, **extras)):
+        found = equations(whole)
+        for formula in found:
+            root = ET.fromstring(mathml(formula))
+            assert root.find("semantics/annotation").text == formula.tex
+            fractions = [len(each) for each in root.iter("mfrac")]
+            assert set(fractions) <= {2}
+            assert len(fractions) == formula.tex.count(r"\frac")
+            MathTextParser("path").parse(f"${formula.tex}$")
+        assert latex(found).count("&=") == 3
+
+
+def test_every_type_is_defined_and_the_selected_one_marked(record_result):
+    table = types_table(record_result.whole)
+    rows = {row["type"]: row for row in table.rows}
+    assert list(rows) == list(STRUCTURES)
+    assert (rows["I"]["internal"], rows["I"]["external"]) == ("ζ s", "–")
+    assert (rows["VI"]["internal"], rows["VI"]["external"]) == ("ζ s^α", "γ s^λ")
+    assert rows["VII"]["damping"] == "internal of integer order, external of fractional order"
+    assert table.rows[table.selected]["type"] == "VI"
+
+
+def test_the_page_shows_the_equations(report, record_result):
+    source = (report / "report.html").read_text(encoding="utf-8")
+    for formula in equations(record_result.whole):
+        assert mathml(formula) in source
+    assert (report / "tables" / "model.tex").read_text() == latex(equations(record_result.whole))
