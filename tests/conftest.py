@@ -129,6 +129,27 @@ def runtime_folder(monkeypatch):
     shutil.rmtree(folder, ignore_errors=True)
 
 
+BRIEF_LOOK = """
+import json, pathlib, sys
+
+session = pathlib.Path(sys.argv[1])
+look = {"file": session.name, "text": [f"Quick look at {session.stem}", "  mode 1"]}
+session.with_suffix(".look.json").write_text(json.dumps(look))
+"""
+
+
+@pytest.fixture
+def brief_looks(tmp_path_factory, monkeypatch):
+    """Have quick looks made, by a program that takes no time; returns its file, to be changed."""
+    folder = tmp_path_factory.mktemp("brief") / "analysis"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "quick_look.py").write_text(BRIEF_LOOK)
+    monkeypatch.setenv("PYTHONPATH", str(folder.parent))
+    monkeypatch.delenv("RIGD_NO_LOOK")
+    return folder / "quick_look.py"
+
+
 @pytest.fixture
 def rigd(tmp_path):
     """Run `rigd` in an empty folder; returns the completed process."""

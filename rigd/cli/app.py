@@ -44,7 +44,7 @@ _SECTIONS: Final = {
     "Sessions": ("run", "serve", "start", "status", "stop"),
     "Rig": ("check", "tare", "zero", "reset", "live"),
     "Session files": ("list", "info", "replay", "recover"),
-    "Set-up": ("profiles", "identify", "bench"),
+    "Set-up": ("profiles", "specimens", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
 """Commands by what they are for, as the help lists them."""
@@ -59,14 +59,11 @@ class RigdGroup(TyperGroup):
         """Write the list of commands, in sections."""
         listed = {name for names in _SECTIONS.values() for name in names}
         others = tuple(name for name in self.list_commands(ctx) if name not in listed)
-        width = formatter.width - 6 - max(map(len, self.commands))
         for title, names in {**_SECTIONS, _OTHERS: others}.items():
-            rows = [
-                (name, self.commands[name].get_short_help_str(width))
-                for name in names
-                if name in self.commands
-            ]
-            if rows:
+            known = [name for name in names if name in self.commands]
+            if known:
+                width = formatter.width - 6 - max(map(len, known))
+                rows = [(name, self.commands[name].get_short_help_str(width)) for name in known]
                 with formatter.section(title):
                     formatter.write_dl(rows)
 

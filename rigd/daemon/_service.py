@@ -464,7 +464,7 @@ class Service:
     async def _check_rig(self) -> Document:
         if self.state in (State.RUNNING, State.STOPPING):
             raise CommandError(
-                "check is for a rig on which no session runs: wait for the session to end, or end "
+                "check needs a rig without a running session: wait for the session to end, or end "
                 "it with rigd stop."
             )
         self._refuse_if_busy()

@@ -231,10 +231,11 @@ def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    lines = [
-        f"**{1e-9 * note.t_ns:.1f} s** {_SYMBOLS.get(note.level, '')}{plain(note.message)}"
-        for note in reversed(notes[-_MOST_RECENT:])
-    ]
+    lines = []
+    for note in reversed(notes[-_MOST_RECENT:]):
+        time_s = max(0.0, 1e-9 * note.t_ns)  # the first one may come a tick early
+        symbol = _SYMBOLS.get(note.level, "")
+        lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
     stream.log(RECENT_EVENTS, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
 
 
@@ -260,7 +261,7 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
         ("late ticks", _number(health.late_ticks), not health.late_ticks),
         ("lost ticks", _number(health.lost_ticks), not health.lost_ticks),
         ("recorder backlog", _number(health.recorder_lag_ticks, "{:.0f} samples"), True),
-        ("not shown here", _number(health.view_dropped, "{:.0f} samples"), True),
+        ("dropped by the viewer", _number(health.view_dropped, "{:.0f} samples"), True),
         ("bus load", _number(health.bus_load_percent, "{:.0f} %"), True),
         ("bus errors", _number(health.bus_errors), not health.bus_errors),
         ("sensor status", _status(health.sensor_status), not health.sensor_status),
