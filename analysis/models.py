@@ -60,7 +60,7 @@ QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
         "lambda": ("λ", "its order", "1", 1.0),
         "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
         "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
-        "delay_s": ("τ", "torque older than angle", "µs", 1e6),
+        "delay_s": ("τ", "torque-channel delay", "µs", 1e6),
         "tool_inertia_kg_m2": ("J", "inertia of the clamp", "1e-6 kg·m²", 1e6),
         "root_compliance_rad_per_nm": ("c", "compliance of the clamp", "1e-3 rad/(N·m)", 1e3),
         "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),

@@ -131,9 +131,9 @@ def _stated(found: Sequence[StatedSpecimen]) -> list[str]:
     )
     first = ", ".join(f"{key} {told(key, found[0].facts[key])}" for key in keys)
     return [
-        f"The files are not of one specimen, they state {len(found)}: {each}. Nothing is pooled "
-        f"over different specimens: all that follows is of {first}. Give analyze the files of "
-        "each of the others by themselves, or correct the metadata where they are wrong."
+        f"The files are not of one specimen, they state {len(found)}: {each}. Specimens are never "
+        f"pooled: all that follows is of {first}. Run analyze on the files of each of the others, "
+        "or correct the metadata where they are wrong."
     ]
 
 
@@ -146,10 +146,9 @@ def _differing(found: Homogeneity, leading: Heterogeneity) -> list[str]:
     also = f" The same holds of {', '.join(others)}." if others else ""
     return [
         f"The sessions are not of one specimen in one state: {_scatter(leading)}.{also}",
-        f"{_where(leading)} So what is pooled here is the mean of a mixture (marked "
-        f"{MIXTURE_MARK} where sessions differ in it so), and may belong to none of them: analyse "
-        "the sessions of each specimen by themselves, or find what changed between sessions "
-        f"(clamp, temperature, wear).{_slight(found)}",
+        f"{_where(leading)} Pooled values are then means of a mixture (marked {MIXTURE_MARK}) that "
+        "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
+        f"find what changed between sessions (clamp, temperature, wear).{_slight(found)}",
     ]
 
 
@@ -160,7 +159,7 @@ def _slight(found: Homogeneity) -> str:
     if not mixed or any(each.between_std > _SLIGHT * each.mean for each in mixed):
         return ""
     return (
-        f" Frequencies scatter by less than {100 * _SLIGHT:g} %: one beam may do so whose "
+        f" Frequencies scatter by less than {100 * _SLIGHT:g} %, as those of one beam may when its "
         "temperature or clamp changes."
     )
 
@@ -219,7 +218,6 @@ def _files(names: Sequence[str]) -> str:
 
 _OF: Final = {"alpha": "internal damping (of the material)", "lambda": "external damping"}
 _ORDERS: Final[tuple[Order, ...]] = ("alpha", "lambda")
-_SIZES: Final = {"internal": "material", "external": "surroundings"}
 _WRONG: Final = 1.5
 """Residual, in units of the noise, from which a structure is called wrong."""
 
@@ -240,19 +238,18 @@ def headline(freest: PooledEstimate, best: PooledEstimate) -> str:
     given = [name for name in _ORDERS if STRUCTURES[freest.structure].fixed.get(name) == 1.0]
     are = "is" if len(given) == 1 else "are"
     so = (
-        f", and takes for granted that {' and '.join(given)} {are} 1."
+        f"; it assumes that {' and '.join(given)} {are} 1."
         if given
-        else ", so its intervals hold whichever simpler one is true."
+        else ", so its intervals hold for any simpler one, too."
     )
     said = (
-        f"The numbers are those of type {freest.name}: damping {_damping(freest.structure)}"
+        f"The numbers are those of type {freest.name}: {_damping(freest.structure)}"
         f"{_on_beam(freest)}. It is the freest structure that the sessions determine{so}"
     )
     if best.name != freest.name:
         said += (
-            f" Of all together type {best.name} has the lowest BIC (damping "
-            f"{_damping(best.structure)}{_on_beam(best)}); what it gives is narrower and holds on "
-            "that condition only."
+            f" Type {best.name} has the lowest BIC ({_damping(best.structure)}{_on_beam(best)}); "
+            "its intervals are narrower, and valid only if it is true."
         )
     return said
 
@@ -265,7 +262,7 @@ def sizes(freest: PooledEstimate) -> list[str]:
             continue
         low, high = each.interval
         said.append(
-            f"{each.value:.4g} by the {_SIZES[each.damping]} (95 %: {low:.4g} to {high:.4g}) at "
+            f"{each.damping} {each.value:.4g} (95 %: {low:.4g} to {high:.4g}) at "
             f"{each.omega_rad_s / (2 * np.pi):.3g} Hz"
         )
     return (
@@ -285,21 +282,21 @@ def selected(
     if close:
         names = " or ".join(f"type {each.name}" for each in close)
         said += (
-            f" All sessions together cannot tell it from {names} (ΔBIC "
+            f" All sessions together do not distinguish it from {names} (ΔBIC "
             f"{close[0].bic - best.bic:.1f}; 10 = decisive)."
         )
     elif len(ranked) > 1:
         margin = ranked[1].bic - best.bic
         said += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
-    return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions, 'select')}"
+    return f"{said} {_alone({f'type {name}': n for name, n in alone.items()}, sessions)}"
 
 
 def left_over(best: PooledEstimate, adequate: int, sessions: int) -> str:
     """Say whether what the structure leaves is noise."""
     if best.misfit > _WRONG:
         return (
-            f"Its residual is {best.misfit:.3g} times the noise: no structure tried describes "
-            "the beam, and standard deviations mean little."
+            f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
+            "beam, and standard deviations are meaningless."
         )
     if adequate == sessions:
         return "The residual is noise in every session; no unmodelled effect found."
@@ -314,7 +311,7 @@ def modes(best: PooledEstimate, *, mixed: bool) -> list[str]:
     if not best.modes:
         return []
     said = "; ".join(map(_mode, best.modes))
-    of = "the sessions, which are a mixture" if mixed else "the sessions"
+    of = "the sessions, a mixture" if mixed else "the sessions"
     return [f"Modes: {said} (± 95 % of the mean over {of})."]
 
 
@@ -322,11 +319,11 @@ def order(found: PooledOrder) -> str:
     """Say what is known of one order."""
     name, of = found.order, _OF[found.order]
     counts = {f"“{status}”": count for status, count in found.alone.items()}
-    alone = " " + _alone(counts, sum(counts.values()), "say")
+    alone = f" {_alone(counts, sum(counts.values()))}"
     if found.status == "absent":
-        return f"No {of} shows, so its order {name} means nothing here.{alone}"
+        return f"No {of} was found, so its order {name} has no meaning.{alone}"
     if found.status == "compatible" and found.interval is None:
-        return f"The order {name} of the {of} is taken to be 1, as it may be.{alone}"
+        return f"The order {name} of the {of} is fixed at 1, with which it is compatible.{alone}"
     if found.value is None or found.interval is None:
         return f"The order {name} of the {of} is not identifiable: {found.reason}.{alone}"
     low, high = found.interval
@@ -336,7 +333,7 @@ def order(found: PooledOrder) -> str:
     )
     if found.reason is not None:
         would = is_.replace(" is ", " would be ", 1)
-        return f"{would}, but {found.reason}; it is not reported.{alone}"
+        return f"{would}, but {found.reason}; do not interpret it.{alone}"
     said = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
@@ -352,8 +349,8 @@ def dissenting(who: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str
     names = ", ".join(f"{file} (type {structure})" for file, structure in who[:_MANY])
     more = f" and {len(who) - _MANY} more" if len(who) > _MANY else ""
     return [
-        f"Type {best.name} is dismissed by {len(who)} session{'s' if len(who) > 1 else ''} alone: "
-        f"{names}{more}. Look at their reports (analyze --each) before you trust the mean."
+        f"Type {best.name} is excluded by {len(who)} single session{'s' if len(who) > 1 else ''}: "
+        f"{names}{more}. Check their reports (analyze --each) before relying on the mean."
     ]
 
 
@@ -362,15 +359,11 @@ def scatter(best: PooledEstimate) -> str:
     level = _SIGNIFICANT / max(len(best.parameters), 1)
     moved = [label(each.name)[0] for each in best.parameters if each.chance < level]
     if not moved:
-        return (
-            "No between-session variance: sessions differ by no more than their own uncertainties "
-            "(p: Cochran's Q)."
-        )
+        return "No between-session variance (Cochran's Q)."
     return (
-        f"Sessions differ by more than their own uncertainties in {', '.join(moved)} (p: "
-        "probability of so much scatter by these alone): something changes between sessions, "
-        "such as clamp, temperature or motor, and the interval of one session alone is too "
-        "narrow for the specimen."
+        f"Between-session variance in {', '.join(moved)} (Cochran's Q): something changes between "
+        "sessions, such as clamp, temperature or motor, and the interval of a single session is "
+        "too narrow for the specimen."
     )
 
 
@@ -384,7 +377,7 @@ def foresight(best: PooledEstimate, validation: Sequence[LeftOutError], sessions
     verdict = (
         "the others predict a session as well as its own fit"
         if error <= _AS_GOOD * alone
-        else "the others predict a session worse than its own fit, for the parameters wander"
+        else "the others predict a session worse than its own fit, as the parameters vary"
     )
     fewer = f"; mean of {len(own)} of {sessions} sessions" if len(own) < sessions else ""
     return [
@@ -421,22 +414,21 @@ def _on_beam(estimate: PooledEstimate) -> str:
     return f"{modes}, with {more}" if more else modes
 
 
-def _alone(counts: Mapping[str, int], sessions: int, do: str) -> str:
-    """Say how many sessions select or say what when each is looked at by itself."""
+def _alone(counts: Mapping[str, int], sessions: int) -> str:
+    """Say what single sessions find, and how many of them."""
     (first, count), *others = counts.items()
-    verb = do if count > 1 else f"{do}s"
-    more = "".join(f", {n} {what}" for what, n in others)
-    return f"By themselves, {count} of {sessions} sessions {verb} {first}{more}."
+    more = "".join(f", {what} in {n}" for what, n in others)
+    return f"Single sessions: {first} in {count} of {sessions}{more}."
 
 
 def _damping(structure: str) -> str:
     """Say which kinds of damping a structure has, and of which orders."""
     shape = STRUCTURES[structure]
     kinds = [
-        f"by the {what} ({'order free' if order in shape.free else 'of order 1'})"
+        f"{what} damping ({order} {'free' if order in shape.free else '= 1'})"
         for what, order, present in (
-            ("material", "alpha", shape.internal),
-            ("surroundings", "lambda", shape.external),
+            ("internal", "alpha", shape.internal),
+            ("external", "lambda", shape.external),
         )
         if present
     ]

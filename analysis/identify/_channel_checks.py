@@ -49,8 +49,8 @@ def clipping(measurement: Measurement) -> Iterator[Finding]:
     yield Finding(
         kind="clipping",
         sentence=(
-            f"The torque is clipped at {limits}: {count} values lie exactly there, none beyond, "
-            "and no flag says so. What it would have been is not known."
+            f"The torque is clipped at {limits}: {count} values lie exactly there and none "
+            "beyond, and no flag says so."
         ),
         value=max(abs(limit) for limit, _ in flat),
         unit="N·m",
@@ -78,13 +78,12 @@ def stops(measurement: Measurement) -> Iterator[Finding]:
     yield Finding(
         kind="stop",
         sentence=(
-            f"The motor stands still from {first * _STILL_S:.1f} to "
-            f"{(first + count) * _STILL_S:.1f} s of the "
-            "record, though it is asked to move."
+            f"The motor does not move from {first * _STILL_S:.1f} to "
+            f"{(first + count) * _STILL_S:.1f} s of the record, although its reference does."
         ),
         value=count * _STILL_S,
         unit="s",
-        remedy="Look for what held the shaft or switched the drive off, and sweep again.",
+        remedy="Find what held the shaft or switched the drive off, and sweep again.",
     )
 
 
@@ -133,8 +132,8 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
         yield Finding(
             kind="sign",
             sentence=(
-                "Torque or angle has the wrong sign: the torque opposes what the beam asks for at "
-                "nearly all frequencies. No number here is the antenna's."
+                "Torque or angle has the wrong sign: the torque is opposite to that of the beam at "
+                "nearly all frequencies. No number here is valid for the antenna."
             ),
             remedy=(
                 "Reverse the sign of one channel: the torque is positive where the motor pushes "
@@ -154,13 +153,13 @@ def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
     which = (
         f"which is the factor of {named[0]}: a wrong unit"
         if named
-        else "more than any beam is off its data: a wrong unit or gain, or the data of another beam"
+        else "more than a beam may deviate from its data: a wrong unit or gain, or another beam"
     )
     yield Finding(
         kind="unit",
         sentence=(
             f"Torque over angle is {factor:.3g} times what the beam in the file gives, {which}. "
-            "No number here is the antenna's."
+            "No number here is valid for the antenna."
         ),
         value=factor,
         remedy="Check the units of angle and torque, and import the record again.",

@@ -89,7 +89,7 @@ def at_edges(field: CandidateSet) -> Iterator[Finding]:
                 kind="implausible",
                 sentence=(
                     f"{words} would have to be {factor * value:.4g} {unit} or go farther, which is "
-                    "the edge of what is searched: the record and its file do not fit each other. "
+                    "the edge of the range searched: the record contradicts its file. "
                     "No number here is the antenna's."
                 ),
                 value=value,
@@ -119,10 +119,9 @@ def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Fi
         yield Finding(
             kind="delay",
             sentence=(
-                f"The torque comes {1e3 * abs(value):.3f} ms "
-                f"{'later' if value > 0 else 'earlier'} than the file says "
-                f"({1e3 * low:.3f} to {1e3 * high:.3f} ms; 95 %): a delay between the channels "
-                "that nobody declared. It was fitted, and is not damping."
+                f"The torque is {1e3 * abs(value):.3f} ms {'later' if value > 0 else 'earlier'} "
+                f"than the file states ({1e3 * low:.3f} to {1e3 * high:.3f} ms; 95 %): an "
+                "undeclared delay between the channels. It was fitted and is not damping."
             ),
             value=value,
             interval=(low, high),
@@ -137,8 +136,8 @@ def _of_instruments(field: CandidateSet, differing: set[Setting]) -> Iterator[Fi
         yield Finding(
             kind="tool inertia",
             sentence=(
-                f"Between torque sensor and beam turns {value:.3g} kg·m² more than the file says "
-                f"({low:.3g} to {high:.3g}; 95 %): clamp or flange."
+                f"The inertia between torque sensor and beam is {value:.3g} kg·m² larger than the "
+                f"file states ({low:.3g} to {high:.3g}; 95 %): clamp or flange."
             ),
             value=value,
             interval=(low, high),
@@ -163,7 +162,7 @@ def _of_beam(field: CandidateSet, differing: set[Setting]) -> Iterator[Finding]:
             kind="beam data",
             sentence=(
                 f"{words} is {abs(share):.2f} % {'higher' if share > 0 else 'lower'} than the "
-                f"file says ({low:+.2f} to {high:+.2f} %; 95 %){_or_else(field, name)}."
+                f"file states ({low:+.2f} to {high:+.2f} %; 95 %){_or_else(field, name)}."
             ),
             value=share / 100,
             interval=(low / 100, high / 100),
@@ -193,8 +192,8 @@ def _of_start(field: CandidateSet) -> Iterator[Finding]:
     yield Finding(
         kind="ringing start",
         sentence=(
-            f"The beam already rang when the record began ({1e3 * loudest:.3g} mN·m); its free "
-            "decay was fitted beside the response and spoils nothing."
+            f"The beam was ringing when the record began ({1e3 * loudest:.3g} mN·m); its free "
+            "decay was fitted and biases nothing."
         ),
         value=loudest,
         unit="N·m",
@@ -294,43 +293,43 @@ def unexplained(
     if related.related:
         where = f"near {related.at_hz:.1f} Hz" if related.local else "all through the band"
         what = (
-            f"Unmodelled linear dynamics {where}: part of the torque follows the motor as it does "
-            "with no uniform or nearly uniform beam."
+            f"Unmodelled linear dynamics {where}: part of the torque follows the motor as with no "
+            "uniform or nearly uniform beam."
         )
         remedy = (
-            "Fasten clamp, motor mount and sensor cable, and sweep again; then without the beam: "
-            "what stays belongs to the rig."
+            "Fasten clamp, motor mount and sensor cable, and sweep again; then sweep without the "
+            "beam: what remains belongs to the rig."
         )
     elif white.loud and at_mode:
         what = (
-            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise at mode "
-            f"{at_mode[0]} ({low:.2f} to {high:.2f} Hz): steps of the encoder, which the resonance "
-            "magnifies, or something of that mode that the model lacks."
+            f"The residual is {white.loudest_ratio:.1f} times the noise at mode {at_mode[0]} "
+            f"({low:.2f} to {high:.2f} Hz): encoder quantisation amplified by the resonance, or an "
+            "unmodelled effect in that mode."
         )
-        remedy = "Sweep again at twice the amplitude: steps of the encoder then weigh half as much."
+        remedy = "Sweep again at twice the amplitude, which halves the effect of quantisation."
     elif white.loud and high < _SLOW_HZ:
         what = (
-            f"What remains below {high:.2f} Hz is {white.loudest_ratio:.1f} times as loud as the "
-            "noise and does not follow the motor: drift of the torque sensor's zero."
+            f"The residual below {high:.2f} Hz is {white.loudest_ratio:.1f} times the noise and "
+            "does not follow the motor: zero drift of the torque sensor."
         )
         remedy = ""
     else:
         near = mains((low + high) / 2)
         what = (
-            f"What remains is {white.loudest_ratio:.1f} times as loud as the noise from "
-            f"{low:.2f} to {high:.2f} Hz, and does not follow the motor: a disturbance"
-            f"{', as of the mains that come and go' if near else ''}."
+            f"The residual is {white.loudest_ratio:.1f} times the noise from {low:.2f} to "
+            f"{high:.2f} Hz and does not follow the motor: a disturbance"
+            f"{', such as intermittent mains interference' if near else ''}."
             if white.loud
-            else "What remains is not spread over the frequencies as the noise is (most from "
-            f"{low:.2f} to {high:.2f} Hz), and does not follow the motor."
+            else "The residual is not white (most power from "
+            f"{low:.2f} to {high:.2f} Hz) and does not follow the motor."
         )
         remedy = (
-            "Record for as long with the motor held (rigd run hold): if it is there as well, look "
-            "for what else runs near by, and at the sensor's shield and earth."
+            "Record for as long with the motor held (rigd run hold). If it is there too, look for "
+            "machines near by, and check shield and earth of the sensor's cable."
         )
     return Finding(
         kind="unexplained",
-        sentence=f"{what} Until it is known, take intervals and orders with care.",
+        sentence=f"{what} Until this is explained, do not rely on intervals and orders.",
         value=white.loudest_ratio,
         remedy=remedy,
     )
@@ -353,19 +352,19 @@ def _hum(field: CandidateSet) -> Iterator[Finding]:
         yield Finding(
             kind="hum",
             sentence=(
-                f"The torque holds a line at {line.frequency_hz:.2f} Hz{source}, with "
-                f"{1e3 * line.amplitude_nm:.3g} mN·m all through the record. "
+                f"Narrow-band disturbance of the torque at {line.frequency_hz:.2f} Hz{source}: "
+                f"{1e3 * line.amplitude_nm:.3g} mN·m throughout the record. "
                 + (
-                    f"The drive repeats every {period_s:.4g} s, and so does this line: the motor "
-                    "may cause it, as a harmonic of what is not linear. It was left out."
+                    f"The excitation repeats every {period_s:.4g} s, and so does this line: it may "
+                    "be a harmonic due to a nonlinearity. It was left out of the fit."
                     if with_drive
-                    else "The motor did not cause it; it was taken out."
+                    else "The motor did not cause it; it was removed."
                 )
             ),
             value=line.amplitude_nm,
             unit="N·m",
             remedy=(
-                "Repeat with half the amplitude: a line that shrinks is the motor's doing."
+                "Repeat with half the amplitude: a line that shrinks is caused by the motor."
                 if with_drive
                 else "Check shield and earth of the torque sensor's cable."
             ),
@@ -376,8 +375,8 @@ def _drift(size_nm: float) -> Finding:
     return Finding(
         kind="sensor drift",
         sentence=(
-            f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m in the "
-            "course of the record. That is slower than anything the beam does."
+            f"The zero of the torque sensor drifts by about {1e3 * size_nm:.2g} mN·m over the "
+            "record, more slowly than the beam responds."
         ),
         value=size_nm,
         unit="N·m",
@@ -392,15 +391,14 @@ def _air(field: CandidateSet) -> Iterator[Finding]:
     yield Finding(
         kind="air drag",
         sentence=(
-            f"The air brakes the beam: C_D d = {1e3 * drag.value_m:.4g} mm ({low:.4g} to "
-            f"{high:.4g} mm; 95 %) at {drag.speed_m_s:.2g} m/s. The damping therefore grows "
-            "with the amplitude; the drag was fitted beside the beam, whose parameters are those "
-            "without air."
+            f"Air drag acts on the beam: C_D d = {1e3 * drag.value_m:.4g} mm ({low:.4g} to "
+            f"{high:.4g} mm; 95 %) at {drag.speed_m_s:.2g} m/s, so damping grows with the "
+            "amplitude. Drag was fitted too; the beam's parameters are those without air."
         ),
         value=drag.value_m,
         interval=drag.interval_95_m,
         unit="m",
-        remedy="Sweep at a quarter of the amplitude, where drag all but vanishes, or in vacuum.",
+        remedy="Sweep at a quarter of the amplitude, where drag is negligible, or in vacuum.",
     )
 
 
@@ -417,8 +415,7 @@ def _force(force: NonlinearForce) -> Finding:
         sentence = (
             f"The beam is not linear: the stiffness of mode {mode} "
             f"{'rises' if size > 0 else 'falls'} by {percent} up to its largest deflection (a "
-            "cubic force). It is neither a mode nor an order of the damping, and was fitted beside "
-            "the beam."
+            "cubic force). It was fitted too, and affects neither modes nor orders."
         )
     else:
         sentence = (
@@ -430,7 +427,7 @@ def _force(force: NonlinearForce) -> Finding:
         sentence=sentence,
         value=size,
         interval=(size - NORMAL_95 * std, size + NORMAL_95 * std),
-        remedy="Repeat the sweep at half the amplitude: what is not linear all but vanishes.",
+        remedy="Repeat the sweep at half the amplitude, where nonlinear effects are far smaller.",
     )
 
 
@@ -441,9 +438,9 @@ def _harmonics(multiples: tuple[Harmonic, ...]) -> Iterator[Finding]:
             yield Finding(
                 kind="harmonics",
                 sentence=(
-                    f"What remains follows the sweep at {harmonic.multiple} times its frequency, "
-                    f"most with the drive at {harmonic.drive_hz:.1f} Hz: an {parity} harmonic, "
-                    "which nothing linear makes."
+                    f"The residual follows the sweep at {harmonic.multiple} times its frequency, "
+                    f"most with the sweep at {harmonic.drive_hz:.1f} Hz: an {parity} harmonic, "
+                    "which only a nonlinearity produces."
                 ),
                 value=harmonic.deviate,
                 unit="standard deviations",

@@ -27,18 +27,16 @@ if TYPE_CHECKING:
     from analysis.identify._verdict import OrderVerdict
 
 UNEXPLAINED: Final = "part of the record is unexplained"
-MISREAD: Final = "the record and its file do not fit each other"
+MISREAD: Final = "the record contradicts its file"
 _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
-_NOT_DETERMINED: Final = "the record does not determine it"
-_AT_EDGE: Final = "at the edge of what is searched"
+_NOT_DETERMINED: Final = "not identifiable from this record"
+_AT_EDGE: Final = "at the edge of the range searched"
 
 _MODES_TO_TELL_DAMPINGS: Final = 2
-ONE_MODE: Final = (
-    "one mode alone does not tell damping of the material from that of the surroundings"
-)
+ONE_MODE: Final = "one mode alone does not separate internal from external damping"
 
 _LAW_ASSUMED: Final = (
-    "the stiffness depends on the deflection, by a law of which only the lowest power was fitted"
+    "the stiffness depends on the deflection, and only its lowest power was fitted"
 )
 _OF_FREQUENCIES: Final = ("density_over_stiffness", "stiffness_offset")
 

@@ -37,11 +37,11 @@ def of_rig(field: CandidateSet) -> Iterator[Finding]:
         kind="rival explanations",
         sentence=(
             "The record is not that of a uniform beam on a rigid clamp with ideal channels; it is "
-            f"explained equally well by {' or by '.join(map(_about, (freest, *others)))}."
+            f"fitted equally well by {' or by '.join(map(_about, (freest, *others)))}."
         ),
         remedy=(
             "Check clamp, tip and signal conditioning for these; a sweep that reaches one more "
-            "mode tells them apart."
+            "mode distinguishes them."
         ),
     )
 
@@ -59,10 +59,10 @@ def _beside_a_uniform_beam(others: tuple[Candidate, ...]) -> Iterator[Finding]:
     yield Finding(
         kind="rival explanations",
         sentence=(
-            "A uniform beam with its orders free explains the record, and so does, as well, one "
-            f"with {' or with '.join(named)}. What they put elsewhere is flagged."
+            "A uniform beam with free orders fits the record, and equally well one with "
+            f"{' or with '.join(named)}. Numbers in which they differ are flagged."
         ),
-        remedy="A sweep that reaches one more mode tells them apart.",
+        remedy="A sweep that reaches one more mode distinguishes them.",
     )
 
 
@@ -106,8 +106,8 @@ def _not_uniform(candidate: Candidate) -> Finding:
     return Finding(
         kind="not uniform",
         sentence=(
-            "The modes do not lie where those of a uniform beam do; in stiffness, relative to "
-            f"mode 1: {', '.join(offsets)}."
+            "The modes are not those of a uniform beam; stiffness relative to mode 1: "
+            f"{', '.join(offsets)}."
         ),
         remedy="Look for an added mass or a section that varies along the link.",
     )
@@ -120,7 +120,7 @@ def _elastic_clamp(value: float, interval: tuple[float, float]) -> Finding:
         kind="elastic clamp",
         sentence=(
             f"The clamp is elastic: {stiffness:.3g} N·m/rad "
-            f"({low:.3g} to {high:.3g} N·m/rad; 95 %). It was fitted beside the beam."
+            f"({low:.3g} to {high:.3g} N·m/rad; 95 %). It was fitted too."
         ),
         value=stiffness,
         interval=(low, high),
@@ -135,7 +135,7 @@ def _tip_mass(value: float, interval: tuple[float, float]) -> Finding:
         kind="tip mass",
         sentence=(
             f"The beam carries a mass at its tip: {1e3 * value:.3g} g ({1e3 * low:.3g} to "
-            f"{1e3 * high:.3g} g; 95 %). It was fitted beside the beam."
+            f"{1e3 * high:.3g} g; 95 %). It was fitted too."
         ),
         value=value,
         interval=interval,

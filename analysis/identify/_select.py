@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 _CLIPPED: Final = "the torque is clipped"
 _MISREAD_KINDS: Final = frozenset({"sign", "unit", "implausible"})
 _OF_CHANNELS: Final = _MISREAD_KINDS | {"clipping", "stop"}
-"""All that is said where the record and its file do not fit each other."""
+"""All that is said where the record contradicts its file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,9 +304,9 @@ def _table(field: CandidateSet) -> tuple[Row, ...]:
 # Sentences of the verdict
 
 _DAMPING: Final = {
-    "I": "Damping by the material only",
-    "II": "Damping by the surroundings only",
-    "III": "Damping by material and surroundings",
+    "I": "Internal damping only",
+    "II": "External damping only",
+    "III": "Internal and external damping",
     "IV": "Damping by the material only",
     "V": "Damping by the surroundings only",
     "VI": "Damping by material and surroundings",
@@ -339,8 +339,7 @@ def of_headline(
         said = [f"{ONE_MODE.capitalize()}, and nothing of orders."]
     else:
         said = [
-            f"{_DAMPING[free.name]}{beam}: the numbers are those of type {told.name}, every order "
-            "free."
+            f"{_DAMPING[free.name]}{beam}. Numbers are those of type {told.name}, all orders free."
         ]
         excluded = told.with_status("excluded")
         if told.explained and excluded:
@@ -352,7 +351,7 @@ def of_headline(
         said.append(
             "The residual is noise; no unmodelled effect found."
             if alone
-            else "The residual is noise, but another model explains the record as well."
+            else "The residual is noise, but another model fits the record equally well."
         )
     return said
 
@@ -369,21 +368,21 @@ def order(verdict: OrderVerdict) -> str:
     name, of = verdict.order, _OF[verdict.order]
     value = f"{profile.estimate:.3f} (95 %: {low:.3f} to {high:.3f})"
     if verdict.status == "absent":
-        return f"No {of} shows, so its order {name} means nothing here."
+        return f"No {of} was found, so its order {name} has no meaning."
     if verdict.status == "not identifiable":
         return f"The order {name} of the {of} is not identifiable: {_why_not(verdict)}."
     if verdict.reason is not None:
         return (
-            f"The order {name} of the {of} stays open: {value} would fit, but {verdict.reason}. It "
-            "must not be taken for a property of the beam."
+            f"The order {name} of the {of} is not established: {value} fits, but {verdict.reason}. "
+            "Do not interpret it."
         )
     if verdict.status == "compatible":
         return f"The order {name} of the {of} is {value}, consistent with 1."
     if verdict.status == "fractional":
         return f"The order {name} of the {of} is {value}; 1 is excluded."
     return (
-        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (chance would "
-        f"be as far off in one record of {_one_in(deviance_of_one(profile))})."
+        f"The order {name} of the {of} is {value}: 1 is doubtful, but not excluded (p = "
+        f"{math.erfc(math.sqrt(deviance_of_one(profile) / 2)):.1g})."
     )
 
 
@@ -411,10 +410,9 @@ def _condition(simpler: Simpler) -> str:
         for name in ("zeta", "alpha", "gamma", "lambda")
         if name in simpler.parameters
     ]
-    they = "it is" if len(simpler.fixed) == 1 else "they are"
     return (
-        f"{taken[0].upper()}{taken[1:]} {'is' if they == 'it is' else 'are'} not excluded (type "
-        f"{simpler.name}); only if {they} true, {', '.join(numbers)}."
+        f"{taken[0].upper()}{taken[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} not excluded; "
+        f"if true (type {simpler.name}): {', '.join(numbers)}."
     )
 
 
@@ -441,7 +439,7 @@ def _why_not(verdict: OrderVerdict) -> str:
     if len(profile.valleys) > 1:
         equal = " and ".join(f"{value:.3f}" for value in sorted(profile.valleys))
         return (
-            f"{equal} explain the record equally well, each with a damping of its own "
+            f"{equal} fit the record equally well, each with another damping "
             f"(95 %: {low:.3f} to {high:.3f}, with all that lies between)"
         )
     return (
@@ -453,11 +451,6 @@ def _why_not(verdict: OrderVerdict) -> str:
         if profile.open_above
         else f"anything from {low:.2f} to {high:.2f} fits"
     )
-
-
-def _one_in(deviance: float) -> int:
-    """Return of how many records chance gives one with such a deviance (1 degree of freedom)."""
-    return 10 * round(0.1 / math.erfc(math.sqrt(deviance / 2)))
 
 
 # Advice on experiments
@@ -482,11 +475,11 @@ def experiments(
     if unknown:
         names = " and ".join(o.order for o in unknown)
         if len(visible) < _ENOUGH:
-            advice.append(f"To find {names}, {_for_two_modes(field, visible)}")
+            advice.append(f"To determine {names}, {_for_two_modes(field, visible)}")
         else:
             advice.append(
-                f"To find {names}, measure longer where it counts: narrow, slow sweeps round "
-                "the modes, or a wider sweep that reaches one more mode."
+                f"To determine {names}, run narrow, slow sweeps round the modes, or a wider sweep "
+                "that reaches one more mode."
             )
     unexplained = any(finding.kind == "unexplained" for finding in found)
     if close or (not unexplained and any(o.status == "open" for o in orders)):
@@ -516,7 +509,7 @@ def _for_two_modes(field: CandidateSet, visible: tuple[int, ...]) -> str:
             else f"from below {0.7 * at_hz[1]:.1f} Hz."
         )
     return (
-        f"let the {_ORDINALS[missing]} mode stand out of the noise: the motor was driven at its "
-        f"{at_hz[missing]:.1f} Hz, so sweep louder (twice the amplitude), slower, or several "
-        "times, not wider."
+        f"raise the {_ORDINALS[missing]} mode above the noise: it was driven at its "
+        f"{at_hz[missing]:.1f} Hz, so increase the amplitude (twice), sweep slower or repeat; a "
+        "wider band does not help."
     )

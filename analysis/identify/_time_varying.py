@@ -325,9 +325,9 @@ def changing(changes: tuple[Change, ...]) -> Iterator[Finding]:
             yield replace(
                 finding,
                 sentence=(
-                    f"{_NAMES[change.what]} would explain the record "
-                    + ("as well as anything else does" if alone else "as well as the others named")
-                    + f" ({_size(change)}): in one sweep, time and frequency go together."
+                    f"{_NAMES[change.what]} ({_size(change)}) would fit the record as well as "
+                    + ("any other model" if alone else "the others named")
+                    + ": in one sweep, time and frequency vary together."
                 ),
                 value=None,
                 interval=None,
@@ -347,8 +347,8 @@ def _finding(change: Change) -> Finding:
     return Finding(
         kind=_KINDS[change.what],
         sentence=(
-            f"{_NAMES[change.what]} shows: {_size(change)} (± {scale * half:.1g}; 95 %). It was "
-            "fitted beside the beam"
+            f"{_NAMES[change.what]}: {_size(change)} (± {scale * half:.1g}; 95 %). It was fitted "
+            "too"
             + (
                 ", to first order in its size."
                 if of_play
@@ -359,9 +359,9 @@ def _finding(change: Change) -> Finding:
         interval=(change.size - half, change.size + half),
         unit="rad" if of_play else "1",
         remedy=(
-            "Take the play out of gear and clamp."
+            "Remove the play in gear and clamp."
             if of_play
-            else "Repeat with the sweep from high to low frequency: that tells a change with time "
-            "from one with frequency."
+            else "Repeat with the sweep from high to low frequency, which separates changes with "
+            "time from those with frequency."
         ),
     )

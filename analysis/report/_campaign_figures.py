@@ -52,8 +52,8 @@ def index_figure(campaign: CampaignResult) -> Figure:
     width_in, height_in = 13.0, 4.9
     figure = style.new_figure(
         width_in, height_in,
-        f"{len(campaign.sessions)} sessions — how far each is from the nominal models",
-        "boxes: quartiles over the sessions, whiskers to 1.5 times their distance",
+        f"{len(campaign.sessions)} sessions — distance from the nominal models",
+        "boxes: quartiles over the sessions, whiskers to 1.5 times the interquartile range",
     )  # fmt: skip
     grid = figure.add_gridspec(
         1, 3, left=0.055, right=0.99, top=1 - 1.2 / height_in, bottom=0.45 / height_in, wspace=0.2
@@ -114,7 +114,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
     assert estimate is not None
     withheld = campaign.verdict.withheld if campaign.verdict else ()
     doubtful = unreported(STRUCTURES[estimate.structure], withheld)
-    note = f"  ·  {MARK} not reported: the data do not support it" if doubtful else ""
+    note = f"  ·  {MARK} not reported: not supported by the data" if doubtful else ""
     if any(campaign.homogeneity.is_mixed(each.name) for each in estimate.parameters):
         note += f"  ·  {MIXTURE_MARK} mean of a mixture"
     rows = -(-len(estimate.parameters) // _COLUMNS)
@@ -126,7 +126,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
             campaign.homogeneity,
         ),
         f"freest type that the sessions support, residual {estimate.misfit:.3g} times the noise ·  "
-        "p: probability of so much scatter if sessions differed by their own uncertainty alone"
+        "p: p-value of Cochran's Q"
         f"{note}",
     )  # fmt: skip
     grid = figure.add_gridspec(
@@ -347,7 +347,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
     colors = {w: look["color"] for w, look in line_styles(weightings).items()}
     width_in, height_in = 9.0, _ROW_IN * len(models) + 1.75
     figure = style.new_figure(
-        width_in, height_in, f"{_predicted(campaign)} sessions — each predicted from the others",
+        width_in, height_in, f"{_predicted(campaign)} sessions — leave-one-out validation",
         "rms of predicted minus measured torque over that of the measured torque, "
         f"{campaign.record_band_hz[0]:g} to {campaign.record_band_hz[1]:g} Hz",
     )  # fmt: skip

@@ -235,7 +235,11 @@ def sessions_table(campaign: CampaignResult) -> Table:
     groups = leading.groups if leading else ()
     group_of = {name: f"{place}" for place, names in enumerate(groups, 1) for name in names}
     name = campaign.headline.name if campaign.headline else None
-    tried = {each.path: each for each in campaign.validation if each.name == name}
+    tried = {
+        each.path: each
+        for each in campaign.validation
+        if (each.method, each.name) == ("record", name)
+    }
 
     def row(session: SessionResult) -> tuple[Entry, ...]:
         verdict, trial = session.verdict, tried.get(session.path)

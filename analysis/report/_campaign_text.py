@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult
 
 _NO_VERDICT: Final = (
-    "No verdict on the whole records: it takes two sessions that determine a structure's damping."
+    "No verdict on the whole records: two sessions are needed that determine a structure's damping."
 )
 
 
@@ -54,7 +54,7 @@ def campaign_tables(
         first, *others = said
         parts += [Text(first, style="bold"), *map(Text, others)]
         if campaign.verdict is not None and campaign.verdict.experiments:
-            parts.append(Text("What would tell more:"))
+            parts.append(Text("Further experiments:"))
             parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]
         parts.append("")
     parts += spaced(shown_tables(campaign) if verbose else main_tables(campaign))

@@ -33,7 +33,7 @@ def write_campaign(
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     on_step: Callable[[str], None] = lambda _done: None,
 ) -> None:
-    """Write the page ``report.html``, every figure and every table.
+    """Write the page ``report.html``, ``figures/``, ``tables/*.csv``, text and JSON.
 
     Parameters
     ----------
@@ -59,10 +59,12 @@ def write_campaign(
     for name, (draw, description) in _figures(campaign).items():
         with style.styled():
             figure = draw()
-            pictures.append(style.save_picture(figure, folder / name, description, formats))
+            pictures.append(
+                style.save_picture(figure, folder / "figures" / name, description, formats)
+            )
         on_step(f"figure {name}")
     for name, table in all_tables(campaign, with_paper=with_paper).items():
-        write_new(folder / f"{name}.csv", csv_text(table))
+        write_new(folder / "tables" / f"{name}.csv", csv_text(table))
     text = document_text(campaign_document(campaign, with_paper=with_paper))
     write_new(folder / "campaign.json", text)
     write_new(folder / "tables.txt", campaign_text(campaign, with_paper=with_paper))

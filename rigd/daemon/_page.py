@@ -111,9 +111,11 @@ class PageProcess:
                 env=os.environ | SINGLE_THREADED,
             )
         self._process = process
+        if self._closing.is_set():
+            process.kill()
         assert process.stdin is not None
         assert process.stdout is not None
-        with process.stdout:
+        with process:
             try:
                 process.stdin.write(json.dumps(self._job).encode() + b"\n")
                 process.stdin.flush()

@@ -247,8 +247,8 @@ class _Shown:
             self.backlog.owe(picture.events([Note(t_ns, "error", state.reason)]))
         elif end.outcome:
             self.backlog.owe(picture.events([outcome_note(t_ns, end.outcome, end.reason)]))
-        self.backlog.owe(picture.finish())
-        self.backlog.owe(picture.state(t_ns, state))
+        # Behind all that waits, which says that the session goes on; nothing comes after it.
+        self.backlog.put([*picture.finish(), *picture.state(t_ns, state)], 0)
         self.over = True
         self._take_look()
 

@@ -84,7 +84,7 @@ def subject_of_session(session: Session, timings: Records | None = None) -> Subj
         excitation=session.metadata.get("excitation", ""),
         sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
         specimen=session.metadata.get("specimen", ""),
-        limits=_stated_limits(session.attachments.get("profile.toml", b"")),
+        limits=_stated_limits(attached[-1]),
         absent=_absent(session, timings),
         recorded=True,
     )

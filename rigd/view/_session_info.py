@@ -231,10 +231,11 @@ def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    lines = [
-        f"**{1e-9 * note.t_ns:.1f} s** {_SYMBOLS.get(note.level, '')}{plain(note.message)}"
-        for note in reversed(notes[-_MOST_RECENT:])
-    ]
+    lines = []
+    for note in reversed(notes[-_MOST_RECENT:]):
+        time_s = max(0.0, 1e-9 * note.t_ns)  # the first one may come a tick early
+        symbol = _SYMBOLS.get(note.level, "")
+        lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
     stream.log(RECENT_EVENTS, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN))
 
 

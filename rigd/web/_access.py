@@ -95,7 +95,9 @@ class Access:
     def may_act(self, request: web.Request) -> bool:
         """Whether a request has the token."""
         scheme, _, given = request.headers.get("Authorization", "").partition(" ")
-        return scheme == "Bearer" and hmac.compare_digest(given.encode(), self._token)
+        return scheme == "Bearer" and hmac.compare_digest(
+            given.encode(errors="surrogateescape"), self._token
+        )
 
     def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
         """Whether a command of the control socket may be passed on.

@@ -20,7 +20,7 @@ from rigd.daemon import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.excitation import FROM_THE_RIG, KINDS
 from rigd.profile import specimen_files
 from rigd.runtime import ignore
-from rigd.units import unit_of
+from rigd.units import UNITS, unit_of
 from rigd.view import Subject
 from rigd.web._access import Access, Connections, object_of, refused
 from rigd.web._jobs import Jobs
@@ -38,8 +38,7 @@ _KEEP_ALIVE_S: Final = 15.0
 _LINGERING_S: Final = 1.0
 _GAUGES_S: Final = 0.095
 _RESPONSE_S: Final = 1.0
-_GRACE_S: Final = 1.0
-_NICENESS: Final = 5
+_GRACE_S: Final = 0.3
 _AT_WORK: Final = ("running", "stopping")
 _STATIC_NAME: Final = re.compile(r"[a-z0-9_]+\.(html|css|js|svg|png|ico|webmanifest)")
 
@@ -131,6 +130,7 @@ class PageServer:
             "excitations": self._excitations,
             "specimens": self._specimens,
             "required_meta": self._job["required_meta"],
+            "units": dict(UNITS),
         }
         known = (
             *(hello, self._lost, self._status, self._gauges, self._strips.last()),
@@ -311,7 +311,6 @@ def run_page() -> None:
     Standard output gets one line: the port, or why there is no page.
     """
     ignore()
-    os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
         asyncio.run(_run(job))

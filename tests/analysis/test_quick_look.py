@@ -166,9 +166,7 @@ def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps)
     }
     assert found
     told, found = freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
-    assert {mode.frequency_hz.flag for mode in told.modes} == {
-        "the record and its file do not fit each other"
-    }
+    assert {mode.frequency_hz.flag for mode in told.modes} == {"the record contradicts its file"}
     assert [finding.kind for finding in found] == ["sign"]
 
 

@@ -45,9 +45,10 @@ def test_the_whole_records_are_pooled_and_nothing_else(found, truth):
 
 def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
     write_campaign(found, tmp_path)
-    names = {path.name for path in tmp_path.iterdir()}
-    assert {"pooled.png", "pooled.csv", "session_list.csv", "tables.txt"} <= names
-    assert not [name for name in names if name.startswith(("figure", "table3", "table4"))]
+    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
+    wanted = {"figures/pooled.png", "figures/pooled_response.png", "tables/pooled.csv"}
+    assert wanted | {"tables/session_list.csv", "tables.txt"} <= names
+    assert not [name for name in names if "/figure" in name or "/table" in name]
     assert "Table 3" not in (tmp_path / "tables.txt").read_text()
     page = (tmp_path / "report.html").read_text()
     assert 'id="paper"' not in page

@@ -61,5 +61,5 @@ def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
     verdict = order_verdict(without_delay, found, (1,), doubt=None)
     assert (verdict.status, verdict.value, verdict.interval) == ("not identifiable", None, None)
     said = order_sentence(verdict)
-    assert "0.657 and 1.235 explain the record equally well" in said
+    assert "0.657 and 1.235 fit the record equally well" in said
     assert "not identifiable" in said

@@ -134,7 +134,7 @@ class Served:
             given.setdefault("Content-Length", str(len(body)))
         lines = [f"{method} {target} HTTP/1.1"]
         lines += [f"{name}: {value}" for name, value in given.items() if value is not None]
-        answer = self.send("\r\n".join(lines).encode() + b"\r\n\r\n" + body)
+        answer = self.send("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + body)
         head, _, rest = answer.partition(b"\r\n\r\n")
         return (int(head.split()[1]) if head else 0), head.decode("latin-1"), rest
 

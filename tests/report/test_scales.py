@@ -8,7 +8,6 @@ import pytest
 
 from analysis.identify import with_scales
 from analysis.report._document import (
-    combined_parameters,
     document,
     finite,
     record_entries,
@@ -86,7 +85,7 @@ def test_what_is_held_leaves_no_combined_interval(stated):
         selection=replace(whole.selection, headline=headline),
         fixed=("bending_stiffness_n_m2",),
     )
-    assert combined_parameters(held) == {}
+    assert held.combined == {}
     (note,) = scale_notes(held)
     assert "the file's values of EI, which were held" in note
 

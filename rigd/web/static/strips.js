@@ -87,7 +87,7 @@ class Strip {
     return runs.filter((run) => run.length);
   }
 
-  #drawBand(context, x, y, { low, high, colour, width }) {
+  #drawBand(context, x, y, { low, high, colour, width, filled = 1 }) {
     context.fillStyle = this.#surface.colour(colour);
     context.strokeStyle = this.#surface.colour(colour);
     context.lineWidth = width;
@@ -97,7 +97,9 @@ class Strip {
       context.beginPath();
       for (const [t, value] of [...upper, ...[...lows[k]].reverse()]) context.lineTo(x(t), y(value));
       context.closePath();
+      context.globalAlpha = filled;
       context.fill();
+      context.globalAlpha = 1;
       context.stroke();
     });
   }
@@ -121,7 +123,7 @@ export class Strips {
     name: "Angle", unit: "rad", least: LEAST.angle,
     // The reference behind what is measured: a rim where both agree, a band where they do not.
     bands: [
-      { low: 2, high: 3, colour: "reference", width: 3.5 },
+      { low: 2, high: 3, colour: "reference", width: 2.5, filled: 0.35 },
       { low: 0, high: 1, colour: "measured", width: 1.4 },
     ],
   });
