@@ -736,6 +736,7 @@ class _Told:
     def ended(self, result: SessionResult) -> None:
         series = self._series
         series.results.append(result)
+        line = result_line(result.as_dict())
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
             "series %d: session %d of %d, %s: %s",
@@ -743,8 +744,10 @@ class _Told:
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            result_line(result.as_dict()),
+            line,
         )
+        # For lists of events, in the words of the terminal.
+        self._publish({"event": "message", "level": "info", "text": line})
         self._publish({"event": "session", "number": series.session, **result.as_dict()})
 
     def _tell(self, level: str, text: str) -> None:
