@@ -115,7 +115,7 @@ def _how(result: RecordResult, whole: WholeRecord, made_at: datetime) -> list[Fa
             [(key, value) for key, value in record.metadata.items() if key not in _SHOWN_ALREADY],
         ),
         ("Whole-record fits", _record_fit_facts(whole)),
-        *([] if welch is None else [("The paper's route", _welch_facts(welch))]),
+        *([] if welch is None else [("Welch method (as in the paper)", _welch_facts(welch))]),
         versions(made_at),
     ]
 
